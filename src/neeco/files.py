@@ -1,0 +1,66 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from neeco.errors import NeecoError
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write(temporary_path)` produce a file beside `path`, sync it to disk and rename it to `path`.
+
+    On any failure the temporary file is removed and `path` is left as it was.
+    Raises NeecoError naming `path` when the disk refuses.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # keep the suffix: some writers choose the format by it
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot write here: {error.strerror or error}") from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        with open(temporary, "rb") as stream:
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` to `path` atomically (see `write_atomically`)."""
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such numbers."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise NeecoError(f"{path}: no such file") from None
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    except UnicodeDecodeError:
+        raise NeecoError(f"{path}: not a text file; expected JSON") from None
+    except json.JSONDecodeError as error:
+        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}") from None

@@ -1,0 +1,86 @@
+"""What goes into `rasterize` and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Headlight:
+    """A light that sits at the camera, as an endoscope's does: it dims with distance and off the optical axis.
+
+    A Gaussian's colour is multiplied by
+    `(distance / 100 mm) ** -falloff * exp(vignette[0] * t + vignette[1] * t**2)`,
+    distance and t taken at its mean, in the camera frame: distance = |p|, t = (p_x^2 + p_y^2) / p_z^2.
+    """
+
+    falloff: Tensor  # [N] exponent
+    vignette: Tensor  # [2]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Posed Gaussians, ready to draw (world frame, lengths in mm).
+
+    Colour is `max(0, sh . basis(direction) + 0.5)`, direction = from the camera centre to the mean, unit, turned into
+    the Gaussian's SH frame when `sh_frames` is given; then the headlight. No gradient flows into `sh_frames`.
+    """
+
+    means: Tensor  # [N, 3] mm
+    quats: Tensor  # [N, 4] wxyz, world_from_gaussian; need not be unit
+    scales: Tensor  # [N, 3] mm, standard deviations, > 0
+    opacities: Tensor  # [N] in (0, 1)
+    sh: Tensor  # [N, K, 3], K = 1, 4, 9 or 16
+    sh_frames: Tensor | None = None  # [N, 4] wxyz unit, world_from_sh
+    headlight: Headlight | None = None
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose."""
+
+    world_from_camera: Tensor  # [4, 4] rigid, mm
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One drawn image, and what density control wants to know of it."""
+
+    color: Tensor  # [H, W, 3]
+    alpha: Tensor  # [H, W]
+    depth: Tensor  # [H, W] mm, expected depth (accumulated z / alpha; 0 where nothing was drawn)
+    channels: Tensor | None  # [H, W, C] composited like colour, background 0
+    radii: Tensor  # [N] px, 3-sigma-like extent of the drawn ellipse, 0 where not drawn; no gradient
+    center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward is d loss / d centre
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] bool: which Gaussians touched the image."""
+        return self.radii > 0
+
+
+def to_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
+    """The same Gaussians in another floating type."""
+    light = gaussians.headlight
+    return Gaussians(
+        means=gaussians.means.to(dtype),
+        quats=gaussians.quats.to(dtype),
+        scales=gaussians.scales.to(dtype),
+        opacities=gaussians.opacities.to(dtype),
+        sh=gaussians.sh.to(dtype),
+        sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames.to(dtype),
+        headlight=None if light is None else Headlight(light.falloff.to(dtype), light.vignette.to(dtype)),
+    )
