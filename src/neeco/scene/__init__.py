@@ -1,1 +1,6 @@
+"""The learned model and how it is posed."""
 
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.scene import Recording, Scene
+
+__all__ = ["CanonicalGaussians", "Recording", "Scene"]

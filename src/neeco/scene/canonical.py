@@ -1,0 +1,103 @@
+"""The canonical Gaussians: what is learned, before any deformation poses it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814
+SH_COEFFICIENTS = 16  # degree 3
+
+
+@dataclass(frozen=True)
+class CanonicalGaussians:
+    """Raw (unactivated) parameters, ordered by body: tissue first, then instrument 1, 2, ...
+
+    `extras` holds whatever per-Gaussian parameters a deformation adds ([N, ...] each); density control carries them along.
+    """
+
+    means: Tensor  # [N, 3] mm; tissue in the world frame, an instrument in the frame its deformation says
+    quats: Tensor  # [N, 4] wxyz, any length
+    log_scales: Tensor  # [N, 3]
+    opacity_logits: Tensor  # [N]
+    sh_dc: Tensor  # [N, 1, 3]
+    sh_rest: Tensor  # [N, 15, 3]
+    counts: tuple[int, ...]  # Gaussians per body; sums to N
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def body(self, index: int) -> slice:
+        """Rows of one body."""
+        start = sum(self.counts[:index])
+        return slice(start, start + self.counts[index])
+
+    @property
+    def bodies(self) -> Tensor:
+        """[N] int64, the body of each row."""
+        return torch.repeat_interleave(torch.arange(len(self.counts)), torch.tensor(self.counts))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every learned tensor by name; extras as `extras.NAME`."""
+        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counts", "extras")}
+        return named | {f"extras.{name}": tensor for name, tensor in self.extras.items()}
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
+        """The inverse of `tensors`."""
+        plain = {name: tensor for name, tensor in tensors.items() if not name.startswith("extras.")}
+        extras = {
+            name.removeprefix("extras."): tensor for name, tensor in tensors.items() if name.startswith("extras.")
+        }
+        return CanonicalGaussians(**plain, counts=counts, extras=extras)
+
+    def map(self, function: Callable[[Tensor], Tensor], counts: tuple[int, ...] | None = None) -> CanonicalGaussians:
+        """Apply `function` to every learned tensor."""
+        mapped = {name: function(tensor) for name, tensor in self.tensors().items()}
+        return CanonicalGaussians.from_tensors(mapped, self.counts if counts is None else counts)
+
+    def with_extras(self, **extras: Tensor) -> CanonicalGaussians:
+        """The same Gaussians with further per-Gaussian parameters."""
+        return replace(self, extras={**self.extras, **extras})
+
+    def spherical_harmonics(self, degree: int) -> Tensor:
+        """[N, (degree + 1)^2, 3]."""
+        if degree == 0:
+            return self.sh_dc
+        return torch.cat([self.sh_dc, self.sh_rest[:, : (degree + 1) ** 2 - 1]], 1)
+
+
+def seed_gaussians(positions: Tensor, colors: Tensor, spacing: Tensor, *, opacity: float = 0.1) -> CanonicalGaussians:
+    """Round Gaussians of one body at `positions` [N, 3] mm with `colors` [N, 3] and standard deviation `spacing` [N] mm (3DGS)."""
+    count = positions.shape[0]
+    return CanonicalGaussians(
+        means=positions.float().clone(),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=spacing.float().clamp_min(1e-4).log()[:, None].repeat(1, 3),
+        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
+        sh_dc=((colors.float() - 0.5) / SH_C0)[:, None, :].clone(),
+        sh_rest=torch.zeros(count, SH_COEFFICIENTS - 1, 3),
+        counts=(count,),
+    )
+
+
+def neighbour_spacing(positions: np.ndarray) -> Tensor:
+    """Mean distance to the three nearest neighbours [N] mm, the initial size of 3DGS; at most the 99th percentile."""
+    if len(positions) < 4:
+        return torch.full((len(positions),), 1.0)
+    distance, _ = cKDTree(positions).query(positions, k=4, workers=1)
+    spacing = np.sqrt((distance[:, 1:] ** 2).mean(1))
+    return torch.from_numpy(np.clip(spacing, 1e-4, np.percentile(spacing, 99))).float()
+
+
+def join_bodies(bodies: list[CanonicalGaussians]) -> CanonicalGaussians:
+    """One set out of several single bodies, in order. All must carry the same extras."""
+    tensors = {name: torch.cat([body.tensors()[name] for body in bodies]) for name in bodies[0].tensors()}
+    return CanonicalGaussians.from_tensors(tensors, tuple(len(body) for body in bodies))

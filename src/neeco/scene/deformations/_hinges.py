@@ -1,0 +1,95 @@
+"""One instrument's shaft and hinges, in its own tracked frame: what `kinematic` learns about how it moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from neeco.scene.rotations import axis_angle_quat, quat_multiply, rotate_about
+
+
+class Hinges(nn.Module):
+    """A straight shaft and joints whose hinge axes cross it at right angles.
+
+    The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer, instrument_from_shaft with z
+    along the shaft) by two learned tilts (rad) and two shifts (mm). Joint j turns two parts about the axis at `hinge_angle[j]`
+    (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns by `offsets[j, k] + gains[j, k] * reading`.
+    Parts are soft: a Gaussian turns by its part weights times the parts' angles.
+    """
+
+    base: Tensor
+
+    def __init__(self, joint_names: tuple[str, ...]) -> None:
+        super().__init__()
+        count = len(joint_names)
+        self.joint_names = joint_names
+        self.register_buffer("base", torch.eye(4))
+        self.register_buffer(
+            "wrist_start", torch.tensor(-math.inf)
+        )  # mm along the shaft; rotational symmetry ends here
+        self.register_buffer("extent", torch.zeros(2))  # mm along the shaft, first and last solid Gaussian
+        self.shaft_tilt = nn.Parameter(torch.zeros(2))
+        self.shaft_shift = nn.Parameter(torch.zeros(2))
+        self.hinge_angle = nn.Parameter(torch.zeros(count))
+        self.hinge_depth = nn.Parameter(torch.zeros(count))
+        self.offsets = nn.Parameter(torch.zeros(count, 2))
+        self.gains = nn.Parameter(torch.tensor([0.5, -0.5]).repeat(count, 1))
+
+    @property
+    def part_count(self) -> int:
+        """Body plus two parts per joint."""
+        return 1 + 2 * len(self.joint_names)
+
+    def shaft(self) -> tuple[Tensor, Tensor]:
+        """(origin [3] mm, unit direction [3] towards the jaws), instrument frame."""
+        one, zero = torch.ones(1), torch.zeros(1)
+        direction = nn.functional.normalize(self.base[:3, :3] @ torch.cat([self.shaft_tilt, one]), dim=0)
+        origin = self.base[:3, :3] @ torch.cat([self.shaft_shift, zero]) + self.base[:3, 3]
+        return origin, direction
+
+    def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
+        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
+        origin, direction = self.shaft()
+        angle = self.hinge_angle[joint]
+        around = self.base[:3, :3] @ torch.stack([angle.cos(), angle.sin(), torch.zeros(())])
+        axis = nn.functional.normalize(around - (around @ direction) * direction, dim=0)
+        return origin + self.hinge_depth[joint] * direction, axis
+
+    def along_shaft(self, points: Tensor) -> Tensor:
+        """Position [M] mm of points [M, 3] along the shaft."""
+        origin, direction = self.shaft()
+        return (points - origin) @ direction
+
+    def spin(self, points: Tensor, quats: Tensor, roll: float) -> tuple[Tensor, Tensor]:
+        """Turn everything behind the wrist by `roll` rad about the shaft."""
+        origin, direction = self.shaft()
+        angle = (self.along_shaft(points.detach()) < self.wrist_start).to(points.dtype) * roll
+        return rotate_about(points, direction, origin, angle), quat_multiply(axis_angle_quat(direction, angle), quats)
+
+    def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
+        """Move points [M, 3] by the joints; returns them and each one's turn as a quaternion [M, 4] (None without joints).
+
+        weights [M, part_count] sum to 1 over parts: body, then two per joint.
+        """
+        turn = None
+        for index, name in enumerate(self.joint_names):
+            pivot, axis = self.hinge(index)
+            part_angles = self.offsets[index] + self.gains[index] * joints[name]
+            angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ part_angles
+            points = rotate_about(points, axis, pivot, angle)
+            quat = axis_angle_quat(axis, angle)
+            turn = quat if turn is None else quat_multiply(quat, turn)
+        return points, turn
+
+    def left_part(self, joint: int) -> int:
+        """Which of a joint's two parts (0 or 1) is the left one.
+
+        The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left part opens
+        towards (shaft direction x axis).
+        """
+        _, axis = self.hinge(joint)
+        sign = torch.sign(axis[axis.abs().argmax()])
+        return int((sign * self.gains[joint]).argmin())

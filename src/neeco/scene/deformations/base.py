@@ -1,0 +1,82 @@
+"""What every deformation does: map (canonical Gaussians, state) to posed ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import State
+from neeco.scene.canonical import CanonicalGaussians
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Geometry in the world frame; colour and opacity stay canonical (the paper never deforms opacity)."""
+
+    means: Tensor  # [N, 3] mm
+    quats: Tensor  # [N, 4] wxyz
+    scales: Tensor  # [N, 3] mm
+    sh_frames: Tensor | None = None  # [N, 4] world_from_sh
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """What training may disturb on purpose; drawing never does.
+
+    `shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution looks the
+    same). `state_noise`: standard deviation added to the encoded state (the paper's compensation).
+    """
+
+    shaft_roll: float = 0.0
+    state_noise: float = 0.0
+
+
+UNPERTURBED = Perturbation()
+
+
+@dataclass(frozen=True)
+class Deltas:
+    """Change of each Gaussian between two states of the scene, or from canonical to posed (the paper's d_mu, d_r, d_s)."""
+
+    means: Tensor  # [N, 3] mm
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3] mm
+
+
+class Deformation(nn.Module):
+    """Base class. A method is one subclass in one file, with its own small config.
+
+    `label_names` lists (instrument, part) for each label column; a deformation that cannot tell parts returns one part,
+    "instrument", per instrument.
+    """
+
+    label_names: tuple[tuple[str, str], ...] = ()
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        """Posed geometry of `canonical` in `state`."""
+        raise NotImplementedError
+
+    def config(self) -> dict[str, Any]:
+        """JSON-able keyword arguments that make an equal deformation."""
+        return {}
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        """Soft membership [N, len(label_names)] in [0, 1]; what is left to 1 is tissue."""
+        return torch.zeros(len(canonical), len(self.label_names))
+
+    def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
+        """Change from canonical to posed."""
+        posed = self.pose(canonical, state)
+        quats = nn.functional.normalize(posed.quats, dim=-1) - nn.functional.normalize(canonical.quats, dim=-1)
+        return Deltas(posed.means - canonical.means, quats, posed.scales - canonical.log_scales.exp())
+
+    def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
+        """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
+        return {}
+
+    def learning_rates(self) -> dict[str, float]:
+        """Adam learning rate of each of this module's parameters, by name."""
+        return {}

@@ -1,0 +1,201 @@
+"""The paper's network (NeeCo, "neural pose-state" field F), method `neeco`.
+
+G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to changes of
+mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised head (the untrained
+scene is the canonical one), rotation added to the unit quaternion and scale to its logarithm, means detached (Deformable-3DGS).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Instrument, State
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.rotations import matrix_to_quat
+
+MEMBERSHIP = "membership"
+
+
+def encode(values: Tensor, frequencies: int, *, identity: bool = False) -> Tensor:
+    """gamma: [..., D] to [..., D * 2L (+ D)], (sin(2^k pi x), cos(2^k pi x)) for k < L (paper; NeRF)."""
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype)
+    angles = (values[..., None] * octaves).flatten(-2)
+    parts = [angles.sin(), angles.cos()] + ([values] if identity else [])
+    return torch.cat(parts, -1)
+
+
+class NPS(Deformation):
+    """Fields: depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
+
+    `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
+    `half`: evaluate hidden layers in bfloat16. `chunk`: Gaussians per evaluation when no gradient is wanted.
+    """
+
+    state_center: Tensor
+    state_halfwidth: Tensor
+    mean_center: Tensor
+    mean_halfwidth: Tensor
+    first_quats: Tensor
+
+    def __init__(
+        self,
+        instruments: tuple[Instrument, ...],
+        depth: int = 12,
+        width: int = 256,
+        L_mean: int = 10,
+        L_state: int = 10,
+        identity: bool = False,
+        state: str = "full",
+        half: bool = True,
+        chunk: int = 65536,
+    ) -> None:
+        super().__init__()
+        self.instruments = instruments
+        self._config = {
+            "depth": depth,
+            "width": width,
+            "L_mean": L_mean,
+            "L_state": L_state,
+            "identity": identity,
+            "state": state,
+            "half": half,
+            "chunk": chunk,
+        }
+        self.L_mean, self.L_state, self.identity, self.state_kind = L_mean, L_state, identity, state
+        self.half_precision, self.chunk = half, chunk
+        size = self.state_size()
+        self.register_buffer("state_center", torch.zeros(size))
+        self.register_buffer("state_halfwidth", torch.ones(size))
+        self.register_buffer("mean_center", torch.zeros(3))
+        self.register_buffer("mean_halfwidth", torch.ones(()))
+        self.register_buffer("first_quats", torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(max(len(instruments), 1), 1))
+        mean_inputs = 3 * (2 * L_mean + identity)
+        state_inputs = size * (2 * L_state + identity)
+        # gamma(mu) and gamma(p) enter through separate weights of one linear layer: the state's share is computed once
+        self.skip = depth // 2 if depth >= 8 else -1
+        self.mean_in = nn.Linear(mean_inputs, width)
+        self.state_in = nn.Linear(state_inputs, width, bias=False)
+        self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(depth - 1))
+        if self.skip > 0:
+            self.mean_skip = nn.Linear(mean_inputs, width, bias=False)
+            self.state_skip = nn.Linear(state_inputs, width, bias=False)
+        self.head = nn.Linear(width, 10)
+        self._initialise()
+        self.label_names = (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
+
+    def _initialise(self) -> None:
+        """He initialisation throughout, so that twelve layers carry gradient; the head starts at zero."""
+        layers = [*self.hidden, self.mean_in, self.state_in]
+        layers += [self.mean_skip, self.state_skip] if self.skip > 0 else []
+        for layer in layers:
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        with torch.no_grad():
+            for layer in layers[-4:] if self.skip > 0 else layers[-2:]:
+                layer.weight.mul_(math.sqrt(0.5))  # two inputs are summed
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def config(self) -> dict[str, Any]:
+        return dict(self._config)
+
+    def state_size(self) -> int:
+        """Numbers in the state vector p."""
+        per_instrument = 4 if self.state_kind == "rotation_jaw" else 7
+        return sum(per_instrument + len(instrument.joints) for instrument in self.instruments)
+
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Normalise p by the recorded range and mu by the points' extent, both to [-1, 1]."""
+        if self.instruments:
+            first = states[0].instruments
+            self.first_quats = torch.stack(
+                [matrix_to_quat(first[i.name].pose[:3, :3]) for i in self.instruments]
+            ).float()
+            vectors = torch.stack([self._raw_state(state) for state in states])
+            low, high = vectors.min(0).values, vectors.max(0).values
+            self.state_center = (low + high) / 2
+            self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
+        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
+        self.mean_center = (low + high) / 2
+        self.mean_halfwidth = (high - low).max() / 2
+
+    def _raw_state(self, state: State) -> Tensor:
+        """p before normalisation [S]: position mm, sign-continuous quaternion, joints rad."""
+        parts = []
+        for index, instrument in enumerate(self.instruments):
+            given = state.instruments[instrument.name]
+            pose = given.pose.float()
+            quat = matrix_to_quat(pose[:3, :3])
+            quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
+            parts += [quat] if self.state_kind == "rotation_jaw" else [pose[:3, 3], quat]
+            parts.append(torch.tensor([given.joints[name] for name in instrument.joints], dtype=torch.float32))
+        return torch.cat(parts)
+
+    def state_vector(self, state: State) -> Tensor:
+        """p [S], each number in [-1, 1] over the recording."""
+        return (self._raw_state(state) - self.state_center) / self.state_halfwidth
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        if not self.instruments:
+            return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
+        change = self.network(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
+        quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
+        means = canonical.means + change[:, :3] * self.mean_halfwidth
+        return Posed(means, quats, (canonical.log_scales + change[:, 7:]).exp())
+
+    def _encoded_state(self, state: State, noise: float) -> Tensor:
+        """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""
+        encoded = encode(self.state_vector(state), self.L_state, identity=self.identity)
+        return encoded + noise * torch.randn_like(encoded) if noise > 0 else encoded
+
+    def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
+        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean / halfwidth, quaternion, log scale)."""
+        if not torch.is_grad_enabled() and means.shape[0] > self.chunk:
+            return torch.cat([self.network(part, encoded_state) for part in means.split(self.chunk)])
+        encoded = encode((means - self.mean_center) / self.mean_halfwidth, self.L_mean, identity=self.identity)
+        state = encoded_state[None]
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.half_precision and means.device.type == "cpu"):
+            features = torch.relu(self.mean_in(encoded) + self.state_in(state))
+            for index, layer in enumerate(self.hidden, start=1):
+                summed = layer(features)
+                if index == self.skip:
+                    summed = summed + self.mean_skip(encoded) + self.state_skip(state)
+                features = torch.relu(summed)
+        return nn.functional.linear(features.float(), self.head.weight, self.head.bias)
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        """The moving Gaussians as found by `mark_moving`; nothing before that."""
+        if MEMBERSHIP not in canonical.extras or not self.label_names:
+            return torch.zeros(len(canonical), len(self.label_names))
+        return canonical.extras[MEMBERSHIP][:, None]
+
+    def learning_rates(self) -> dict[str, float]:
+        return {name: 8e-4 for name, _ in self.named_parameters()}
+
+
+@torch.no_grad()
+def mark_moving(deformation: NPS, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its logarithm."""
+    moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
+    spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
+    threshold = otsu(spread.clamp_min(1e-6).log())
+    return canonical.with_extras(**{MEMBERSHIP: (spread.clamp_min(1e-6).log() > threshold).float()})
+
+
+def otsu(values: Tensor, bins: int = 256) -> float:
+    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979)."""
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return high
+    counts = torch.histc(values.float(), bins, low, high)
+    centers = low + (torch.arange(bins) + 0.5) * (high - low) / bins
+    weight = counts.cumsum(0) / counts.sum()
+    mean = (counts * centers).cumsum(0) / counts.sum()
+    between = (mean[-1] * weight - mean).square() / (weight * (1 - weight)).clamp_min(1e-9)
+    return float(centers[between[:-1].argmax()] + (high - low) / (2 * bins))

@@ -1,0 +1,126 @@
+"""Scenes on disk: one safetensors file, complete in itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from neeco import __version__
+from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.files import write_atomically
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.methods import make_deformation
+from neeco.scene.scene import Recording, Scene
+
+SCHEMA = "neeco-scene/1"
+
+
+def save_scene(scene: Scene, path: Path) -> None:
+    """Write `scene` atomically. The same scene gives the same bytes."""
+    tensors, header = pack_scene(scene)
+    write_atomically(
+        path, lambda temporary: save_file(tensors, temporary, {"neeco": json.dumps(header, sort_keys=True)})
+    )
+
+
+def load_scene(path: Path) -> Scene:
+    """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
+    path = Path(path)
+    if not path.is_file():
+        raise NeecoError(f"{path}: no such scene; has training finished?")
+    try:
+        with safe_open(path, framework="pt") as stream:
+            header = json.loads((stream.metadata() or {})["neeco"])
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise NeecoError(f"{path}: not a readable neeco scene ({error}); train again") from None
+    if header.get("schema") != SCHEMA:
+        raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
+    try:
+        return unpack_scene(tensors, header)
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise NeecoError(f"{path}: damaged scene ({error}); train again") from None
+
+
+def pack_scene(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """(tensors, JSON-able header) from which `unpack_scene` makes the scene again."""
+    recorded = scene.recorded
+    tensors = {f"canonical.{name}": tensor for name, tensor in scene.canonical.tensors().items()}
+    tensors |= {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
+    if recorded.states:
+        tensors["recorded.cameras"] = torch.stack([camera.world_from_camera for camera in recorded.cameras])
+        names = [instrument.name for instrument in scene.instruments]
+        if names:
+            poses = [torch.stack([state.instruments[name].pose for name in names]) for state in recorded.states]
+            tensors["recorded.poses"] = torch.stack(poses)
+    header = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "method": scene.method,
+        "deformation": scene.deformation.config(),
+        "counts": list(scene.canonical.counts),
+        "sh_degree": scene.sh_degree,
+        "diagnostics": scene.diagnostics,
+        "instruments": [
+            {"name": instrument.name, "joints": {name: limits for name, limits in instrument.joints.items()}}
+            for instrument in scene.instruments
+        ],
+        "recorded": [
+            {
+                "name": name,
+                "split": split,
+                "time": state.time,
+                "joints": {key: dict(value.joints) for key, value in state.instruments.items()},
+                "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near],
+            }
+            for name, split, state, camera in zip(
+                recorded.names, recorded.splits, recorded.states, recorded.cameras, strict=True
+            )
+        ],
+    }
+    return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, header
+
+
+def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
+    """The inverse of `pack_scene`."""
+    instruments = tuple(
+        Instrument(
+            entry["name"],
+            {name: tuple(limits) if limits is not None else None for name, limits in entry["joints"].items()},
+        )
+        for entry in header["instruments"]
+    )
+    states, cameras = [], []
+    for index, entry in enumerate(header["recorded"]):
+        moved = {
+            instrument.name: InstrumentState(tensors["recorded.poses"][index, k], entry["joints"][instrument.name])
+            for k, instrument in enumerate(instruments)
+        }
+        states.append(State(moved, entry["time"]))
+        fx, fy, cx, cy, width, height, near = entry["intrinsics"]
+        cameras.append(Camera(tensors["recorded.cameras"][index], fx, fy, cx, cy, int(width), int(height), near))
+    recorded = Recording(
+        tuple(entry["name"] for entry in header["recorded"]),
+        tuple(entry["split"] for entry in header["recorded"]),
+        tuple(states),
+        tuple(cameras),
+    )
+    canonical = CanonicalGaussians.from_tensors(
+        {name.removeprefix("canonical."): t for name, t in tensors.items() if name.startswith("canonical.")},
+        tuple(header["counts"]),
+    )
+    deformation = make_deformation(header["method"], instruments, header["deformation"])
+    scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
+    scene.sh_degree = int(header["sh_degree"])
+    scene.diagnostics = header["diagnostics"]
+    module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
+    scene.load_state_dict(module)
+    scene.requires_grad_(False)
+    return scene

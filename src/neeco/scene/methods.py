@@ -1,0 +1,22 @@
+"""Method names and the deformation class behind each. A new method is one file in `deformations/` and one line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from neeco.capture.model import Instrument
+from neeco.errors import NeecoError
+from neeco.scene.deformations.base import Deformation
+from neeco.scene.deformations.kinematic import Kinematic
+from neeco.scene.deformations.nps import NPS
+from neeco.scene.deformations.static import Static
+
+METHODS: dict[str, Callable[..., Deformation]] = {"kinematic": Kinematic, "neeco": NPS, "3dgs": Static}
+
+
+def make_deformation(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Deformation:
+    """The deformation of `method` with its own config. Raises NeecoError for an unknown name."""
+    if method not in METHODS:
+        raise NeecoError(f"method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
+    return METHODS[method](instruments, **config)

@@ -1,0 +1,109 @@
+"""Rotations and rigid transforms, differentiable. Quaternions are wxyz."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of quaternions [..., 4]: rotate by `b`, then by `a`."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def quat_to_matrix(quats: Tensor) -> Tensor:
+    """Unit quaternions [..., 4] to rotation matrices [..., 3, 3]."""
+    w, x, y, z = quats.unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def matrix_to_quat(rotation: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] to unit quaternions [..., 4] with w >= 0; differentiable.
+
+    Picks, per matrix, the best conditioned of the four classic formulas (Shepperd 1978).
+    """
+    m = rotation.flatten(-2)
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
+    candidates = torch.stack(
+        [
+            torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1),
+            torch.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1),
+            torch.stack([m02 - m20, m01 + m10, 1 - m00 + m11 - m22, m12 + m21], -1),
+            torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1),
+        ],
+        -2,
+    )  # [..., 4, 4]
+    best = candidates.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    quat = torch.nn.functional.normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
+    return torch.where(quat[..., :1] < 0, -quat, quat)
+
+
+def skew(vector: Tensor) -> Tensor:
+    """[..., 3] to the matrix [..., 3, 3] with skew(v) @ x = v x x."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape[:-1], 3, 3)
+
+
+def rotation_from_vector(vector: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] (axis * angle, rad) to matrices [..., 3, 3]; differentiable at zero."""
+    return torch.linalg.matrix_exp(skew(vector))
+
+
+def vector_from_rotation(rotation: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] to rotation vectors [..., 3], angle in [0, pi]."""
+    quat = matrix_to_quat(rotation)
+    axis = quat[..., 1:]
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, quat[..., :1])
+    return axis * torch.where(sine > 1e-8, angle / sine.clamp_min(1e-12), torch.full_like(sine, 2.0))
+
+
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Assemble [..., 4, 4] from rotations [..., 3, 3] and translations [..., 3]."""
+    top = torch.cat([rotation, translation[..., None]], -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return torch.cat([top, bottom], -2)
+
+
+def rigid_from_vector(vector: Tensor) -> Tensor:
+    """[..., 6] (rotation vector in rad, translation in mm) to [..., 4, 4]."""
+    return rigid(rotation_from_vector(vector[..., :3]), vector[..., 3:])
+
+
+def rotate_about(points: Tensor, axis: Tensor, pivot: Tensor, angle: Tensor) -> Tensor:
+    """Turn points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along the unit `axis` [3] (Rodrigues)."""
+    arm = points - pivot
+    cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
+    along = (arm @ axis)[:, None] * axis
+    across = torch.linalg.cross(axis.expand_as(arm), arm)
+    return pivot + arm * cosine + across * sine + along * (1 - cosine)
+
+
+def axis_angle_quat(axis: Tensor, angle: Tensor) -> Tensor:
+    """Unit `axis` [3] and `angle` [M] rad to quaternions [M, 4]."""
+    half = angle[:, None] / 2
+    return torch.cat([half.cos(), half.sin() * axis], -1)
