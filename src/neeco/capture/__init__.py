@@ -1,1 +1,16 @@
+"""Captures: what was recorded, how it is read, written and checked."""
 
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.capture.reader import read_capture
+from neeco.capture.writer import write_capture
+
+__all__ = [
+    "Capture",
+    "Frame",
+    "Instrument",
+    "InstrumentState",
+    "PointCloud",
+    "State",
+    "read_capture",
+    "write_capture",
+]

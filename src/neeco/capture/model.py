@@ -45,6 +45,7 @@ class Frame:
     state: State
     split: str
     mask_path: Path | None = None  # black pixels are ignored by the loss
+    background: float = 1.0  # what shows through transparent pixels: 0 black, 1 white
 
     @property
     def name(self) -> str:
@@ -55,7 +56,7 @@ class Frame:
         """float32 [H, W, 3] in [0, 1], sRGB as stored. Raises NeecoError when unreadable or of another size."""
         from neeco.capture.images import read_image
 
-        return read_image(self.image_path, (self.camera.width, self.camera.height))
+        return read_image(self.image_path, (self.camera.width, self.camera.height), self.background)
 
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
@@ -72,6 +73,7 @@ class PointCloud:
 
     positions: np.ndarray  # [P, 3] float32, mm
     colors: np.ndarray  # [P, 3] float32 in [0, 1]
+    measured: bool = True  # False: random points, because the capture has none
 
 
 @dataclass(frozen=True)

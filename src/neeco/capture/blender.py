@@ -1,0 +1,40 @@
+"""Read Blender / D-NeRF captures: transforms_{train,val,test}.json with `camera_angle_x`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.images import EXTENSIONS
+from neeco.capture.parsed import Parsed, Place
+from neeco.capture.points import random_points
+from neeco.capture.problems import Report
+from neeco.capture.transforms import load_document, parse_frames, parse_points, parses_as_json, relative_name
+
+HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
+
+
+def is_blender_file(file: Path) -> bool:
+    """Whether a transforms file gives the field of view instead of intrinsics, as Blender's exporters do."""
+    document = parses_as_json(file)
+    return "camera_angle_x" in document and "fl_x" not in document and "instruments" not in document
+
+
+def parse_blender(files: list[Path], root: Path, report: Report, background: float = 1.0) -> Parsed:
+    """Read the files of a Blender capture, one split each, named by the file; problems go to `report`.
+
+    Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used.
+    """
+    parsed = Parsed(root)
+    for file in files:
+        document = load_document(file, root, report)
+        _, _, split = file.stem.rpartition("_")
+        split_name = split if split in ("train", "val", "test") else None
+        parse_frames(document, file.parent, parsed, background=background, split=split_name, extensions=EXTENSIONS)
+        if parsed.points is None:
+            parse_points(document, file.parent, parsed)
+    if parsed.points is None:
+        parsed.points = random_points(np.zeros(3), HALF_SIZE)
+        parsed.points_place = Place(relative_name(files[0], root), "ply_file_path")
+    return parsed

@@ -1,0 +1,110 @@
+"""Images and masks, read as tensors and written whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.files import write_atomically
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None, background: float = 1.0) -> Tensor:
+    """An image as float32 [H, W, 3] in [0, 1], sRGB as stored (EXIF orientation is not applied).
+
+    Grey, 16-bit and palette images become RGB; transparent pixels show `background` (0 black, 1 white).
+    `size`: (width, height) the image must have. Raises NeecoError when unreadable, damaged or of another size.
+    """
+    return torch.from_numpy(_to_rgb(_decode(Path(path), size), background))
+
+
+def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+    """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
+    grey = _to_rgb(_decode(Path(path), size), background=0.0).mean(axis=2)
+    return torch.from_numpy(grey >= 0.5)
+
+
+def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+    """Part ids as uint8 [H, W] from an 8-bit grey or palette PNG. Raises NeecoError."""
+    image = _decode(Path(path), size)
+    if image.mode not in ("L", "P"):
+        raise NeecoError(f"{path}: expected an 8-bit image of part ids, found mode {image.mode}; save it as grey PNG")
+    return torch.from_numpy(np.array(image, dtype=np.uint8))
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from an image file's header. Raises NeecoError."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether an image file has transparency. Raises NeecoError."""
+    try:
+        with Image.open(path) as image:
+            return _is_transparent(image)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def write_image(path: Path, image: Tensor) -> None:
+    """Write an image [H, W, 3] in [0, 1] (clipped, rounded to 8 bits) as PNG, atomically. Raises NeecoError."""
+    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    write_atomically(Path(path), lambda temporary: Image.fromarray(pixels, "RGB").save(temporary, format="PNG"))
+
+
+def write_labels(path: Path, labels: Tensor) -> None:
+    """Write part ids (or a 0/255 mask), uint8 [H, W], as grey PNG, atomically. Raises NeecoError."""
+    if labels.dtype != torch.uint8 or labels.ndim != 2:
+        raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
+    pixels = labels.detach().cpu().numpy()
+    write_atomically(Path(path), lambda temporary: Image.fromarray(pixels, "L").save(temporary, format="PNG"))
+
+
+def _decode(path: Path, size: tuple[int, int] | None) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+    # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    if size is not None and image.size != tuple(size):
+        found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
+        raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
+    return image
+
+
+def _unreadable(path: Path, error: Exception) -> NeecoError:
+    if isinstance(error, FileNotFoundError):
+        return NeecoError(f"{path}: no such file")
+    if isinstance(error, Image.UnidentifiedImageError):
+        return NeecoError(f"{path}: not an image file; expected PNG or JPEG")
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return NeecoError(f"{path}: image cannot be decoded ({reason}); the file is damaged, replace it or drop its frame")
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+
+
+def _to_rgb(image: Image.Image, background: float) -> np.ndarray:
+    """float32 [H, W, 3] in [0, 1]."""
+    if image.mode.startswith("I"):  # 16 bits in 16 or 32
+        grey = np.asarray(image).astype(np.float32) / 65535.0
+        return np.repeat(np.clip(grey, 0, 1)[:, :, None], 3, axis=2)
+    if image.mode == "F":
+        return np.repeat(np.clip(np.asarray(image, dtype=np.float32), 0, 1)[:, :, None], 3, axis=2)
+    if _is_transparent(image):
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
+        alpha = rgba[:, :, 3:]
+        return rgba[:, :, :3] * alpha + np.float32(background) * (1 - alpha)
+    return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)

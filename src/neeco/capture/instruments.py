@@ -1,0 +1,102 @@
+"""Read instrument states and declarations from a transforms file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from neeco.capture.model import Frame, Instrument, InstrumentState
+from neeco.capture.problems import Node, shown
+
+Limits = tuple[float, float] | None
+
+
+def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
+    """The instrument states of one frame ({} where it lists none), or None when one of them could not be read."""
+    if not frame.has("instruments"):
+        return {}
+    node = frame.child("instruments")
+    states: dict[str, InstrumentState] = {}
+    good = isinstance(node.value, list)
+    for item in node.items():
+        if not item.is_object():
+            good = False
+            continue
+        name = item.child("name").text()
+        pose = item.child("pose").rigid()
+        joints = _joints(item)
+        if name is not None and name in states:
+            item.child("name").error(f"{shown(name)} is listed twice in this frame", "keep one state per instrument")
+            good = False
+        if name is None or pose is None or joints is None:
+            good = False
+            continue
+        states[name] = InstrumentState(torch.from_numpy(pose), joints)
+    return states if good else None
+
+
+def declared_instruments(document: Node) -> tuple[Instrument, ...]:
+    """The instruments of the header, with their joints' limits; () where the header lists none."""
+    if not document.has("instruments"):
+        return ()
+    instruments: dict[str, Instrument] = {}
+    for item in document.child("instruments").items():
+        if not item.is_object():
+            continue
+        name = item.child("name").text()
+        joints = _declared_joints(item)
+        if name is None:
+            continue
+        if name in instruments:
+            item.child("name").error(f"{shown(name)} is declared twice", "give every instrument its own name")
+        instruments[name] = Instrument(name, joints)
+    return tuple(instruments.values())
+
+
+def seen_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -> tuple[Instrument, ...]:
+    """Declared instruments, then those that only frames name; joints likewise."""
+    joints: dict[str, dict[str, Limits]] = {item.name: dict(item.joints) for item in declared}
+    for frame in frames:
+        for name, state in frame.state.instruments.items():
+            known = joints.setdefault(name, {})
+            for joint in state.joints:
+                known.setdefault(joint, None)
+    return tuple(Instrument(name, limits) for name, limits in joints.items())
+
+
+def _joints(item: Node) -> dict[str, float] | None:
+    if not item.has("joints"):
+        return {}
+    node = item.child("joints")
+    if not node.is_object():
+        return None
+    values = {name: node.child(name).number() for name in node.value}
+    if any(value is None for value in values.values()):
+        return None
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _declared_joints(item: Node) -> dict[str, Limits]:
+    if not item.has("joints"):
+        return {}
+    node = item.child("joints")
+    if not node.is_object():
+        return {}
+    joints: dict[str, Limits] = {}
+    for name in node.value:
+        joint = node.child(name)
+        joints[name] = _limits(joint.child("limits")) if joint.value is not None and joint.is_object() else None
+    return joints
+
+
+def _limits(node: Node) -> Limits:
+    if node.value is None:
+        return None
+    values = [item.number() for item in node.items()]
+    if not isinstance(node.value, list) or any(value is None for value in values):
+        return None
+    if len(values) != 2 or not values[0] < values[1]:  # type: ignore[operator]
+        node.error(f"expected [lower, upper], found {values}", "give two numbers in rad, the lower first")
+        return None
+    return (values[0], values[1])  # type: ignore[return-value]

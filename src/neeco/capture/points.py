@@ -1,0 +1,121 @@
+"""Sparse points: PLY files read and written, and random points where there are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.model import PointCloud
+from neeco.errors import NeecoError
+from neeco.files import write_atomically
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read a PLY file's vertices: x y z and, where present, red green blue (grey otherwise). Other data is ignored.
+
+    Positions may hold NaN. Raises NeecoError when the file is missing, damaged or has no usable vertices.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise NeecoError(f"{path}: no such file") from None
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    encoding, count, properties, body = _parse_header(Path(path), content)
+    vertices = _vertices(Path(path), encoding, count, properties, body)
+    if not {"x", "y", "z"} <= vertices.keys():
+        raise NeecoError(f"{path}: vertex: has no x, y, z; write a point cloud with positions")
+    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    for names in _COLORS:
+        if set(names) <= vertices.keys():
+            return PointCloud(positions, np.stack([_unit(vertices[name]) for name in names], axis=1))
+    return PointCloud(positions, np.full_like(positions, 0.5))
+
+
+def write_ply(path: Path, points: PointCloud) -> None:
+    """Write points as binary PLY, xyz float32 and rgb 8 bit, atomically. Raises NeecoError."""
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    vertices = np.empty(len(points.positions), dtype=fields)
+    for column, axis in enumerate("xyz"):
+        vertices[axis] = points.positions[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        vertices[name] = np.clip(np.rint(points.colors[:, column] * 255), 0, 255)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name, _ in fields] + ["end_header", ""]
+    content = "\n".join(header).encode("ascii") + vertices.tobytes()
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content) and None)
+
+
+def random_points(center: np.ndarray, half_size: float, count: int = 20_000, seed: int = 0) -> PointCloud:
+    """Grey points spread evenly in a cube, as 3DGS starts where SfM gave nothing. center [3]. Seeded."""
+    generator = np.random.default_rng(seed)
+    positions = np.asarray(center) + generator.uniform(-half_size, half_size, (count, 3))
+    colors = np.full((count, 3), 0.5, dtype=np.float32)
+    return PointCloud(positions.astype(np.float32), colors, measured=False)
+
+
+def _parse_header(path: Path, content: bytes) -> tuple[str, int, list[tuple[str, str]], bytes]:
+    """The encoding, number of vertices, (name, type) of each vertex property, and what follows the header."""
+    end = content.find(b"end_header")
+    line_end = content.find(b"\n", end)
+    if not content.startswith(b"ply") or end < 0 or line_end < 0:
+        raise NeecoError(f"{path}: not a PLY file (no complete header)")
+    encoding, count, element, properties = "", -1, "", []
+    for line in content[:end].decode("ascii", errors="replace").splitlines():
+        match line.split():
+            case ["format", name, *_]:
+                encoding = name
+            case ["element", name, number] if number.isdecimal() and len(number) < 12:
+                if name != "vertex" and count < 0 and int(number) > 0:
+                    raise NeecoError(f"{path}: element {name!r} before the vertices; write the vertices first")
+                element, count = name, int(number) if name == "vertex" else count
+            case ["property", kind, name] if element == "vertex" and kind in _TYPES:
+                properties.append((name, _TYPES[kind]))
+            case ["property", *_] if element == "vertex":
+                raise NeecoError(f"{path}: vertex property {line.strip()!r} is not understood; write plain numbers")
+    if encoding not in _ORDERS:
+        raise NeecoError(f"{path}: format {encoding!r} is not understood; write ascii or binary_little_endian")
+    if count < 0:
+        raise NeecoError(f"{path}: has no vertices; expected a point cloud")
+    if len({name for name, _ in properties}) != len(properties):
+        raise NeecoError(f"{path}: two vertex properties have one name; write each once")
+    return encoding, count, properties, content[line_end + 1 :]
+
+
+def _vertices(
+    path: Path, encoding: str, count: int, properties: list[tuple[str, str]], body: bytes
+) -> dict[str, np.ndarray]:
+    """Each vertex property as an array [count]."""
+    short = NeecoError(f"{path}: holds fewer than the {count} vertices its header promises; it is truncated")
+    if encoding == "ascii":
+        # every value needs a digit and a separator, so this bounds what a lying header can make us allocate
+        words = body.split() if count * len(properties) <= len(body) else []
+        if len(words) < count * len(properties):
+            raise short
+        try:
+            table = np.array(words[: count * len(properties)], dtype=np.float64).reshape(count, len(properties))
+        except ValueError:
+            raise NeecoError(f"{path}: a vertex value is not a number; repair the file") from None
+        with np.errstate(all="ignore"):
+            return {name: table[:, column].astype(kind) for column, (name, kind) in enumerate(properties)}
+    dtype = np.dtype([(name, _ORDERS[encoding] + kind) for name, kind in properties])
+    if len(body) < count * dtype.itemsize:
+        raise short
+    vertices = np.frombuffer(body, dtype=dtype, count=count)
+    return {name: vertices[name] for name, _ in properties}
+
+
+def _unit(channel: np.ndarray) -> np.ndarray:
+    """A colour channel as float32 in [0, 1]."""
+    if channel.dtype.kind == "u":
+        return (channel / np.iinfo(channel.dtype).max).astype(np.float32)
+    return np.clip(np.nan_to_num(channel), 0, 1).astype(np.float32)

@@ -1,0 +1,88 @@
+"""Read a capture, whatever kind of folder holds it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.blender import is_blender_file, parse_blender
+from neeco.capture.colmap import find_model, parse_colmap
+from neeco.capture.model import Capture, Frame, PointCloud
+from neeco.capture.parsed import Parsed
+from neeco.capture.paths import inside
+from neeco.capture.points import random_points
+from neeco.capture.problems import Report
+from neeco.capture.transforms import parse_transforms
+from neeco.errors import NeecoError
+
+UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
+
+
+def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
+    """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, or a COLMAP model.
+
+    path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
+    background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
+    Raises NeecoError with the first problem found; `check_capture` tells all of them.
+    """
+    report = Report()
+    parsed = parse_capture(path, report, transforms, background)
+    if not parsed.frames:
+        report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
+    report.raise_first(parsed.root)
+    points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
+    return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered)
+
+
+def parse_capture(
+    path: Path | str, report: Report, transforms: str = "transforms.json", background: float = 1.0
+) -> Parsed:
+    """Read as much of a capture as can be read; what is wrong with it goes to `report`."""
+    path = Path(path)
+    if os.path.isfile(path):
+        path, transforms = path.parent, path.name
+    if not os.path.isdir(path):
+        report.error(str(path), "", "no such folder", "give the folder of a capture")
+        return Parsed(path)
+    try:
+        file = inside(path, path, transforms)
+    except NeecoError as error:
+        report.error(transforms, "", *str(error).split("; ", 1))
+        return Parsed(path)
+    if file.is_file():
+        if is_blender_file(file):
+            return parse_blender([file], path, report, background)
+        return parse_transforms(file, path, report, background)
+    if transforms != "transforms.json":
+        report.error(transforms, "", "no such file", "name a transforms file of the capture")
+        return Parsed(path)
+    if blender_files := [file for file in _blender_files(path) if file.is_file()]:
+        return parse_blender(blender_files, path, report, background)
+    if (model := find_model(path)) is not None:
+        return parse_colmap(model, path, report)
+    report.error("transforms.json", "", "no such file, nor transforms_train.json or a COLMAP model", "is it a capture?")
+    return Parsed(path)
+
+
+def stand_in_points(frames: Sequence[Frame]) -> PointCloud:
+    """Random points where the cameras look, for captures that bring none.
+
+    A cube about the point nearest to all optical axes, as wide as the cameras are far from it.
+    """
+    poses = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])  # [F, 4, 4]
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along each axis
+    normal = across.sum(axis=0)
+    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(frames):  # parallel axes meet nowhere
+        meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
+    else:
+        meeting = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    distance = float(np.median(np.linalg.norm(centers - meeting, axis=1)))
+    return random_points(meeting, 0.5 * max(distance, 1e-3))
+
+
+def _blender_files(root: Path) -> list[Path]:
+    return [root / f"transforms_{split}.json" for split in ("train", "val", "test")]

@@ -1,0 +1,309 @@
+"""Read `transforms.json`: neeco-capture/1 and what nerfstudio writes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.capture.images import image_size
+from neeco.capture.instruments import declared_instruments, parse_instruments, seen_instruments
+from neeco.capture.model import Frame, State
+from neeco.capture.parsed import Parsed, Place
+from neeco.capture.paths import inside
+from neeco.capture.points import read_ply
+from neeco.capture.problems import Node, Report, shown
+from neeco.errors import NeecoError
+from neeco.files import read_json
+from neeco.raster.types import Camera
+
+SCHEMA = "neeco-capture/1"
+TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
+_PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
+    """Turn a camera pose [4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or back.
+
+    The only place where the two conventions meet.
+    """
+    return world_from_camera * _FLIP_YZ
+
+
+def load_document(file: Path, root: Path, report: Report) -> Node:
+    """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
+    name = relative_name(file, root)
+    try:
+        value = read_json(file)
+    except NeecoError as error:
+        report.error(name, "", str(error).removeprefix(f"{file}: "))
+        value = {}
+    except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
+        report.error(name, "", "not usable JSON: a number or the nesting is beyond all measure")
+        value = {}
+    node = Node(value, name, "", report)
+    return node if node.is_object() else Node({}, name, "", report)
+
+
+def relative_name(file: Path, root: Path) -> str:
+    """How messages call a file of the capture."""
+    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
+
+
+def parse_transforms(file: Path, root: Path, report: Report, background: float = 1.0) -> Parsed:
+    """Read one transforms file of the capture at `root`; problems go to `report`. Relative paths start at the file."""
+    document = load_document(file, root, report)
+    parsed = Parsed(root)
+    parse_header(document, parsed)
+    parse_frames(document, file.parent, parsed, background=background)
+    parse_points(document, file.parent, parsed)
+    parsed.instruments = seen_instruments(parsed.frames, declared_instruments(document))
+    return parsed
+
+
+def parse_header(document: Node, parsed: Parsed) -> None:
+    """Check what holds for the whole file: schema, units, camera model, and read `instrument_frame`."""
+    value = document.value
+    schema = value.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        document.child("schema").error(f"is {shown(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it")
+    if value.get("units", "mm") not in ("mm", "millimeter", "millimetre", "millimeters", "millimetres"):
+        document.child("units").error(f"is {shown(value['units'])}; lengths must be mm", "convert all poses and points")
+    registration = value.get("instrument_frame", "world")
+    if registration not in ("world", "unregistered"):
+        document.child("instrument_frame").error(f"is {shown(registration)}", "write 'world' or 'unregistered'")
+    parsed.registered = registration != "unregistered"
+
+
+def parse_frames(
+    document: Node,
+    folder: Path,
+    parsed: Parsed,
+    *,
+    background: float,
+    split: str | None = None,
+    extensions: tuple[str, ...] = (),
+) -> None:
+    """Append the file's frames. `split` names them all where given; `extensions` are tried on paths without one."""
+    nodes = document.child("frames")
+    if nodes.value is None:
+        nodes.error("is missing", "list the images and their cameras there")
+        return
+    splits = _Splits(document, split)
+    timed = 0
+    for index, node in enumerate(nodes.items()):
+        if not node.is_object():
+            continue
+        image_path = _image_path(node, folder, parsed.root, extensions)
+        name = splits.of(node, index)
+        pose = node.child("transform_matrix").rigid()
+        mask_path = _optional_file(node, "mask_path", folder, parsed.root)
+        time = node.child("time").number() if node.has("time") else float(index)
+        timed += node.has("time")
+        instruments = parse_instruments(node)
+        if image_path is None or name is None or pose is None or time is None or instruments is None:
+            continue
+        camera = _camera(node, document, pose, image_path)
+        if camera is None:
+            continue
+        state = State(instruments, time)
+        parsed.frames.append(Frame(image_path, camera, state, name, mask_path, background))
+        parsed.places.append(Place(node.file, node.field))
+    parsed.timed = parsed.timed and timed == len(nodes.value if isinstance(nodes.value, list) else ())
+    if isinstance(nodes.value, list) and not nodes.value:
+        nodes.error("is empty", "list the images and their cameras there")
+
+
+def parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
+    """Read the point cloud that `ply_file_path` names, if it names one."""
+    parsed.points_place = Place(document.file, "ply_file_path")
+    path = _optional_file(document, "ply_file_path", folder, parsed.root)
+    if path is None:
+        return
+    parsed.points_place = Place(relative_name(path, parsed.root), "vertex")
+    try:
+        parsed.points = read_ply(path)
+    except NeecoError as error:
+        document.report.error(relative_name(path, parsed.root), "", str(error).removeprefix(f"{path}: "))
+        return
+    bad = int((~np.isfinite(parsed.points.positions).all(axis=1)).sum())
+    if bad:
+        place = parsed.points_place
+        document.report.error(place.file, place.field, f"{bad} points are NaN or infinite", "remove them from the file")
+        parsed.points = None
+
+
+class _Splits:
+    """Which split each frame belongs to: its own word, else nerfstudio's lists, else every 8th is test."""
+
+    def __init__(self, document: Node, split: str | None) -> None:
+        self.fixed = split
+        self.listed: dict[str, str] | None = None
+        lists = [(name, document.child(f"{name}_filenames")) for name in ("train", "val", "test")]
+        if any(node.value is not None for _, node in lists):
+            self.listed = {}
+            for name, node in lists:
+                for item in node.items() if node.value is not None else ():
+                    text = item.text()
+                    self.listed.update({} if text is None else {text: name})
+        frames = document.value.get("frames")
+        frames = frames if isinstance(frames, list) else []
+        self.some_say = any(isinstance(frame, dict) and frame.get("split") is not None for frame in frames)
+
+    def of(self, frame: Node, index: int) -> str | None:
+        if self.fixed is not None:
+            return self.fixed
+        if frame.has("split"):
+            return frame.child("split").text()
+        if self.listed is not None:
+            name = self.listed.get(str(frame.value.get("file_path")))
+            if name is None:
+                frame.warning("is in none of train_filenames, val_filenames, test_filenames and is left out")
+            return name
+        if self.some_say:
+            frame.child("split").error("is missing while other frames have one", "name the frame's split")
+            return None
+        return "test" if index % TEST_EVERY == 0 else "train"
+
+
+def _image_path(frame: Node, folder: Path, root: Path, extensions: tuple[str, ...]) -> Path | None:
+    node = frame.child("file_path")
+    if node.value is None:
+        node.error("is missing", "name the frame's image")
+        return None
+    return _file(node, folder, root, extensions)
+
+
+def _optional_file(parent: Node, key: str, folder: Path, root: Path) -> Path | None:
+    return _file(parent.child(key), folder, root) if parent.has(key) else None
+
+
+def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
+    """The existing file inside the capture that a node names."""
+    text = node.text()
+    if text is None:
+        return None
+    try:
+        path = inside(root, folder, text)
+        candidates = [path, *(inside(root, folder, text + extension) for extension in extensions)]
+    except NeecoError as error:
+        message, _, remedy = str(error).partition("; ")
+        node.error(message, remedy)
+        return None
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    node.error(f"no such file: {shown(text)}", "put it there or correct the path")
+    return None
+
+
+def _camera(frame: Node, document: Node, pose: np.ndarray, image_path: Path) -> Camera | None:
+    """The frame's pinhole camera, intrinsics from the frame or else from the top level. `pose` has OpenGL axes."""
+    numbers = _Intrinsics(frame, document)
+    if not numbers.is_pinhole():
+        return None
+    size = numbers.size(image_path)
+    if size is None:
+        return None
+    width, height = size
+    fx = numbers.focal("fl_x", "camera_angle_x", width)
+    fy = numbers.focal("fl_y", "camera_angle_y", height) if numbers.has("fl_y", "camera_angle_y") else fx
+    cx, cy = numbers.center("cx", width), numbers.center("cy", height)
+    if fx is None or fy is None or cx is None or cy is None:
+        return None
+    world_from_camera = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
+    return Camera(world_from_camera, fx, fy, cx, cy, width, height)
+
+
+class _Intrinsics:
+    """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
+
+    def __init__(self, frame: Node, document: Node) -> None:
+        self.frame, self.document = frame, document
+
+    def has(self, *keys: str) -> bool:
+        return any(self.frame.has(key) or self.document.has(key) for key in keys)
+
+    def node(self, key: str) -> Node:
+        return (self.frame if self.frame.has(key) or not self.document.has(key) else self.document).child(key)
+
+    def is_pinhole(self) -> bool:
+        """False (and reported) for distorted images: undistorting belongs before the capture."""
+        model = self.node("camera_model")
+        if model.value is not None and model.value not in _PINHOLE_MODELS:
+            model.error(f"is {shown(model.value)}; only PINHOLE is drawn", "undistort the images first")
+            return False
+        for key in _DISTORTION:
+            node = self.node(key)
+            if node.value is None:
+                continue
+            value = node.number()
+            if value is None:
+                return False
+            if value != 0:
+                node.error(f"is {value:g}: the images are distorted", "undistort them first, then write 0")
+                return False
+        return True
+
+    def size(self, image_path: Path) -> tuple[int, int] | None:
+        """(width, height), from the image itself where not stated."""
+        if not (self.has("w") or self.has("h")):
+            try:
+                return image_size(image_path)
+            except NeecoError as error:
+                message = str(error).removeprefix(f"{image_path}: ")
+                self.frame.child("file_path").error(f"{shown(image_path.name)}: {message}")
+                return None
+        width, height = (self._positive(key) for key in ("w", "h"))
+        if width is None or height is None:
+            return None
+        if width % 1 or height % 1 or max(width, height) > 65_535:
+            self.node("w").error(f"image size {width:g} x {height:g} is not usable", "write whole numbers of pixels")
+            return None
+        return int(width), int(height)
+
+    def focal(self, key: str, angle_key: str, extent: int) -> float | None:
+        """Focal length in px, from the field of view where only that is given."""
+        if self.has(key) or not self.has(angle_key):
+            return self._positive(key)
+        angle = self._positive(angle_key)
+        if angle is not None and angle >= math.pi:
+            self.node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
+            return None
+        return None if angle is None else 0.5 * extent / math.tan(0.5 * angle)
+
+    def center(self, key: str, extent: int) -> float | None:
+        """Principal point in px: inside the image, its middle where not stated."""
+        if not self.has(key):
+            return extent / 2
+        value = self.node(key).number()
+        if value is not None and not 0 < value < extent:
+            self.node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
+            return None
+        return value
+
+    def _positive(self, key: str) -> float | None:
+        node = self.node(key)
+        if node.value is None:
+            node.error("is missing", "give the camera's intrinsics at the top level or in every frame")
+            return None
+        value = node.number()
+        if value is not None and value <= 0:
+            node.error(f"is {value:g}, must be positive")
+            return None
+        return value
+
+
+def parses_as_json(file: Path) -> dict[str, Any]:
+    """The JSON object in a file, {} when there is none; for deciding what a file is, without reporting."""
+    try:
+        value = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
