@@ -1,0 +1,133 @@
+"""Which tissue a test frame shows that no training frame saw: nothing can draw it right, so it is scored apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from neeco.capture.model import Frame
+from neeco.evaluation.labels import composited_parts
+from neeco.evaluation.resize import resize_camera, resize_mask
+from neeco.raster import rasterize
+from neeco.raster.types import Camera
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+
+MAX_VIEWS = 128  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
+FACTOR = 0.5  # of the image's resolution
+TOLERANCE = 0.02  # of the depth
+TOLERANCE_MM = 1.0
+CHUNK = 16  # views tested at once; most points are found seen in the first chunk
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Depth maps of the training views, drawn once and asked for every test frame."""
+
+    camera_from_world: Tensor  # [V, 4, 4]
+    intrinsics: Tensor  # [V, 4] fx, fy, cx, cy in px of the depth maps
+    depths: Tensor  # [V, h, w] mm
+    sizes: Tensor  # [V, 2] width, height of each view's map (maps are padded to a common size)
+
+    def seen(self, points: Tensor) -> Tensor:
+        """bool [M]: which world points [M, 3] (mm) at least one training view saw unoccluded.
+
+        A view saw a point that projects into it no deeper than the surface drawn there, within 2% + 1 mm.
+        """
+        seen = torch.zeros(len(points), dtype=torch.bool)
+        for start in range(0, len(self.depths), CHUNK):
+            open_points = torch.nonzero(~seen)[:, 0]
+            if len(open_points) == 0:
+                break
+            # views far apart in time first: each chunk takes every stride-th view
+            views = torch.arange(len(self.depths))[start // CHUNK :: -(-len(self.depths) // CHUNK)]
+            seen[open_points] = self._seen_by(points[open_points], views).any(dim=0)
+        return seen
+
+    def _seen_by(self, points: Tensor, views: Tensor) -> Tensor:
+        """bool [V', M] for the views with the given indices."""
+        pose = self.camera_from_world[views]
+        local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points) + pose[:, None, :3, 3]  # [V', M, 3]
+        depth = local[..., 2]
+        fx, fy, cx, cy = self.intrinsics[views].T[..., None]  # each [V', 1]
+        safe = depth.clamp_min(1e-3)
+        column = (local[..., 0] / safe * fx + cx).floor().long()
+        row = (local[..., 1] / safe * fy + cy).floor().long()
+        width, height = self.sizes[views].T[..., None]
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        stride = self.depths.shape[2]
+        index = (row * stride + column).clamp(0, self.depths[0].numel() - 1)
+        surface = self.depths[views].flatten(1).gather(1, index)  # [V', M]
+        return inside & (depth <= surface * (1 + TOLERANCE) + TOLERANCE_MM)
+
+
+@torch.no_grad()
+def observe(scene: Scene, frames: Sequence[Frame]) -> Coverage:
+    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, at half resolution, instrument included."""
+    count = min(len(frames), MAX_VIEWS)
+    chosen = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, count)] if count else []
+    drawn = []
+    for frame in chosen:
+        camera = resize_camera(scene.camera(frame.camera), FACTOR)
+        rendering = rasterize(scene.at(frame.state), camera)
+        drawn.append((camera, _filled(rendering.depth, rendering.alpha)))
+    height = max((camera.height for camera, _ in drawn), default=1)
+    width = max((camera.width for camera, _ in drawn), default=1)
+    depths = torch.zeros(len(drawn), height, width)
+    for index, (_, depth) in enumerate(drawn):
+        depths[index, : depth.shape[0], : depth.shape[1]] = depth
+    cameras = [camera for camera, _ in drawn]
+    return Coverage(
+        _stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras], (4, 4)),
+        torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras]).reshape(-1, 4),
+        depths,
+        torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.long).reshape(-1, 2),
+    )
+
+
+@torch.no_grad()
+def unseen_tissue(coverage: Coverage, scene: Scene, frame: Frame) -> tuple[Tensor, Tensor]:
+    """Tissue in `frame` that no training view saw, and all its tissue: two bool masks [H, W].
+
+    The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the
+    nearest drawn pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
+    """
+    camera = resize_camera(scene.camera(frame.camera), FACTOR)
+    labels = scene.label_channels()
+    rendering = rasterize(scene.at(frame.state), camera, channels=labels if labels.shape[1] else None)
+    tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
+    if rendering.channels is not None:
+        tissue = composited_parts(rendering) == 0
+    points = _backproject(_filled(rendering.depth, rendering.alpha), camera)  # [h, w, 3]
+    unseen = torch.zeros_like(tissue)
+    unseen[tissue] = ~coverage.seen(points[tissue])
+    size = (frame.camera.width, frame.camera.height)
+    return resize_mask(unseen, *size), resize_mask(tissue, *size)
+
+
+def _filled(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Depth [h, w], thin or empty pixels (alpha < 0.5) taking the nearest solid pixel's; unchanged if none is solid."""
+    hollow = (alpha < 0.5).numpy()
+    if not hollow.any() or hollow.all():
+        return depth.float()
+    rows, columns = distance_transform_edt(hollow, return_distances=False, return_indices=True)
+    return depth.float()[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
+
+
+def _backproject(depth: Tensor, camera: Camera) -> Tensor:
+    """World points [h, w, 3] (mm) of a depth map [h, w]."""
+    rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    rays = torch.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1)
+    pose = camera.world_from_camera.float()
+    return (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _stack(matrices: list[Tensor], shape: tuple[int, int]) -> Tensor:
+    return torch.stack(matrices) if matrices else torch.zeros(0, *shape)

@@ -1,0 +1,228 @@
+"""How good a run is: every number, per split, as given and aligned."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from neeco.capture.model import Capture, Frame, State
+from neeco.errors import NeecoError
+from neeco.evaluation.align import align_frame, moved_by
+from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
+from neeco.evaluation.labels import LABEL_THRESHOLD
+from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips, find_lpips
+from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
+from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, draw, photograph, score
+from neeco.evaluation.truth import load_reference
+from neeco.files import write_json
+from neeco.raster import rasterize
+from neeco.raster.types import Camera
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+    from neeco.training.run import Run
+
+EVALUATION_FILE = "evaluation.json"
+TIMED_DRAWS = 7
+Progress = Callable[[str, int, int], None]  # what, how many done, of how many
+
+
+@dataclass
+class _Split:
+    """Rows and part tallies of one split under one kind of pose."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    parts: PartTally = field(default_factory=PartTally)
+    frames_with_parts: int = 0
+
+
+@dataclass(frozen=True)
+class _Context:
+    """What is the same for every frame."""
+
+    scene: Scene
+    capture: Capture
+    networks: dict[str, Lpips]
+    coverage: Coverage
+
+
+def evaluate_run(
+    run: Run,
+    splits: Sequence[str] | None = None,
+    *,
+    align: bool = False,
+    lpips_weights: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Score a trained run on splits of its capture (None: all but `train`) and write `evaluation.json` into its folder.
+
+    Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
+    "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}. None is
+    "not known", never zero. psnr* in dB. Raises NeecoError for unknown splits, wrong LPIPS folders, unreadable frames.
+    """
+    capture, scene = run.capture(), run.scene
+    splits = _chosen_splits(capture, splits)
+    networks = find_lpips(lpips_weights)
+    report = progress or (lambda what, done, total: None)
+    report("training views", 0, 1)
+    context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
+    report("training views", 1, 1)
+    kinds = ("given", "aligned") if align else ("given",)
+    notes = _scene_notes(scene, networks)
+    result: dict[str, Any] = {kind: {} for kind in kinds}
+    labels: dict[str, Any] = {
+        "threshold": LABEL_THRESHOLD,
+        "names": [list(name) for name in scene.label_names],
+        "jaw_assignment": {kind: {} for kind in kinds},
+    }
+    per_frame: dict[str, Any] = {kind: {} for kind in kinds}
+    for split in splits:
+        frames = capture.split(split)
+        tallies = {kind: _Split() for kind in kinds}
+        for index, frame in enumerate(frames):
+            report(split, index, len(frames))
+            _score_frame(context, frame, tallies)
+        report(split, len(frames), len(frames))
+        fps, count = _speed(scene, frames)
+        for kind, tally in tallies.items():
+            numbers, assignment = _summary(scene, tally)
+            result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
+            labels["jaw_assignment"][kind][split] = assignment
+            per_frame[kind][split] = tally.rows
+        notes += _split_notes(split, result["given"][split])
+    evaluation = result | {"notes": notes, "labels": labels, "per_frame": per_frame}
+    evaluation = _clean(evaluation)
+    write_json(run.path / EVALUATION_FILE, evaluation)
+    return evaluation
+
+
+def _chosen_splits(capture: Capture, splits: Sequence[str] | None) -> tuple[str, ...]:
+    if splits is None:
+        splits = tuple(name for name in capture.splits if name != "train")
+        if not splits:
+            raise NeecoError(f"{capture.root}: split: all frames are training frames; score those with --splits train")
+    for name in splits:
+        if name not in capture.splits:
+            raise NeecoError(
+                f"--splits: {name!r}: {capture.root} has no such split; it has {', '.join(capture.splits)}"
+            )
+    return tuple(dict.fromkeys(splits))
+
+
+def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) -> None:
+    """Draw one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
+    scene = context.scene
+    seen = unseen_tissue(context.coverage, scene, frame)
+    photo = photograph(frame, load_reference(context.capture, frame), seen, context.networks)
+    for kind, tally in tallies.items():
+        row: dict[str, Any] = {"frame": frame.name}
+        state, camera = frame.state, frame.camera
+        if kind == "aligned":
+            state, camera = align_frame(scene, frame)
+            row |= _fit_of(frame, state, camera)
+        _add(tally, row, scene, state, camera, photo, context.networks)
+
+
+def _add(
+    tally: _Split,
+    row: dict[str, Any],
+    scene: Scene,
+    state: State,
+    camera: Camera,
+    photo: Photograph,
+    networks: dict[str, Lpips],
+) -> None:
+    drawing = draw(scene, state, camera)
+    tally.rows.append(row | score(drawing, photo, networks))
+    if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
+        tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
+        tally.frames_with_parts += 1
+
+
+def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
+    """The fitted poses, and how far they moved."""
+    moved = {name: moved_by(given, state.instruments[name]) for name, given in frame.state.instruments.items()}
+    return {
+        "moved": moved | {"camera": moved_by(frame.camera, camera)},
+        "world_from_camera": camera.world_from_camera.tolist(),
+        "world_from_instrument": {name: item.pose.tolist() for name, item in state.instruments.items()},
+    }
+
+
+def _summary(scene: Scene, tally: _Split) -> tuple[dict[str, Any], str | None]:
+    """Means over the frames that have the number, and which way the jaws were matched."""
+    numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.rows]) for key in SCORES}
+    numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.rows)
+    known = {part for _, part in scene.label_names}
+    known |= {"jaws"} & {"jaws" for part in known if part in ("jaw_left", "jaw_right")}
+    parts: dict[str, float | None] = dict.fromkeys(PART_SCORES)
+    assignment = None
+    if tally.frames_with_parts:
+        means, assignment = tally.parts.result()
+        parts |= {part: value for part, value in means.items() if part in known}
+    numbers["part_iou"] = parts
+    return numbers, assignment if "jaws" in known else None
+
+
+@torch.no_grad()
+def _speed(scene: Scene, frames: Sequence[Frame]) -> tuple[float, int]:
+    """Posed draws per second (scene.at + rasterize, median of TIMED_DRAWS after two to warm up) and Gaussians drawn."""
+    seconds = []
+    count = 0
+    for index in range(TIMED_DRAWS + 2):
+        frame = frames[index % len(frames)]
+        start = time.perf_counter()
+        gaussians = scene.at(frame.state)
+        rasterize(gaussians, scene.camera(frame.camera))
+        seconds.append(time.perf_counter() - start)
+        count = len(gaussians)
+    return 1.0 / statistics.median(seconds[2:]), count
+
+
+def _scene_notes(scene: Scene, networks: dict[str, Lpips]) -> list[str]:
+    notes = []
+    missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
+    if missing:
+        notes.append(f"{', '.join(missing)}: not computed, no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}")
+    if not scene.label_names:
+        notes.append("mask_iou, part_iou: null, the scene carries no labels")
+        return notes
+    unnamed = sorted({part for _, part in scene.label_names} - set(TRUTH_PARTS))
+    absent = [part for part in TRUTH_PARTS if part not in {part for _, part in scene.label_names}]
+    if absent:
+        notes.append(f"part_iou: null for {', '.join(absent)}: the scene has no such part")
+    if unnamed:
+        notes.append(f"part_iou: the scene's {', '.join(unnamed)} have no counterpart in the truth and are not scored")
+    return notes
+
+
+def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
+    masked, frames = numbers["mask_frames"], numbers["frames"]
+    if masked == 0:
+        return [f"{split}: psnr_instrument, mask_iou, part_iou: null, no frame has a true or reference mask"]
+    notes = []
+    if masked < frames:
+        notes.append(f"{split}: psnr_instrument, mask_iou: over the {masked} of {frames} frames that have a mask")
+    if all(value is None or math.isnan(value) for value in numbers["part_iou"].values()):
+        notes.append(f"{split}: part_iou: null, the masks do not tell parts or the scene has none")
+    if math.isnan(numbers["psnr_uncovered"]):
+        notes.append(f"{split}: psnr_uncovered: null, the training frames saw all its tissue")
+    return notes
+
+
+def _clean(value: Any) -> Any:
+    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    if isinstance(value, dict):
+        return {key: _clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

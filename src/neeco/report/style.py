@@ -1,0 +1,57 @@
+"""The report's style sheet: light and dark, phone to print, nothing fetched."""
+
+STYLE = """
+:root { color-scheme: light dark; --ink: #1c2024; --soft: #5c656e; --paper: #ffffff; --card: #f5f6f8; --edge: #dde1e6;
+  --accent: #0b6e99; --phase: #b3541e; --good: #1a7f4b; --bad: #b3261e; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6e9ec; --soft: #9aa4ae; --paper: #14171a; --card: #1d2125;
+  --edge: #333a41; --accent: #5bb8e0; --phase: #eb9a5f; --good: #6ccf98; --bad: #ff8a80; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 1120px; padding: 28px 20px 60px; background: var(--paper); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
+h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 4px; }
+h2 { font-size: 1.2rem; margin: 40px 0 8px; padding-top: 14px; border-top: 1px solid var(--edge); }
+h3 { font-size: 1rem; margin: 22px 0 6px; }
+p { max-width: 72ch; margin: 6px 0; }
+.soft, figcaption, dd, .note { color: var(--soft); font-size: .9rem; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 10px; margin: 18px 0; }
+.tile { background: var(--card); border: 1px solid var(--edge); border-radius: 10px; padding: 10px 14px; }
+.tile b { display: block; font-size: 1.5rem; font-weight: 650; font-variant-numeric: tabular-nums; }
+.tile span { color: var(--soft); font-size: .85rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; font-size: .92rem; }
+th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--edge); white-space: nowrap; }
+th { font-weight: 600; color: var(--soft); vertical-align: bottom; }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
+tr.group td { font-weight: 650; color: var(--accent); padding-top: 16px; }
+.made { display: grid; grid-template-columns: max-content 1fr; gap: 2px 18px; margin: 10px 0; font-size: .92rem; }
+.made dt { color: var(--soft); } .made dd { margin: 0; color: var(--ink); overflow-wrap: anywhere; }
+.explain dt { font-weight: 600; margin-top: 8px; } .explain dd { margin: 0; max-width: 80ch; }
+.curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(290px, 1fr)); gap: 14px; }
+.curves svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--edge); border-radius: 10px; }
+svg text { fill: var(--soft); font-size: 11px; font-family: inherit; } svg .title { fill: var(--ink);
+  font-size: 12px; }
+svg .grid { stroke: var(--edge); } svg .line { fill: none; stroke: var(--accent); stroke-width: 1.8; }
+svg .end { fill: var(--accent); } svg .phase { stroke: var(--phase); stroke-dasharray: 4 3; }
+  svg .phase-name { fill: var(--phase); }
+.row { display: grid; grid-template-columns: repeat(4, 1fr); gap: 8px; margin: 4px 0 2px; }
+figure { margin: 0; break-inside: avoid; } figure img { width: 100%; height: auto; display: block;
+  border-radius: 6px; }
+.frame { margin: 0 0 18px; break-inside: avoid; } .frame > p { margin: 0; }
+.tag { display: inline-block; border: 1px solid var(--edge); border-radius: 99px; padding: 0 9px;
+  font-size: .8rem; color: var(--soft); }
+.key i { display: inline-block; width: 12px; height: 12px; border-radius: 3px; margin: 0 5px 0 14px;
+  vertical-align: -1px; }
+.verdict { background: var(--card); border-left: 4px solid var(--accent); padding: 8px 14px;
+  border-radius: 0 8px 8px 0; }
+.preview { width: 100%; height: auto; border-radius: 8px; }
+details summary { cursor: pointer; color: var(--accent); }
+pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 10px; overflow-x: auto;
+  font-size: .82rem; }
+@media (max-width: 640px) { body { padding: 18px 14px 40px; } .row { grid-template-columns: repeat(2, 1fr); }
+  h1 { font-size: 1.4rem; } }
+@media print { :root { --ink: #000; --soft: #444; --paper: #fff; --card: #fff; --edge: #bbb; --accent: #04506f;
+  --phase: #7a3410; }
+  body { max-width: none; padding: 0; font-size: 11pt; } h2 { break-after: avoid; } .scroll { overflow: visible; }
+  table { font-size: 8.5pt; } th, td { padding: 3px 5px; } .curves { grid-template-columns: repeat(3, 1fr); }
+  * { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
+"""
