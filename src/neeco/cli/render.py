@@ -1,0 +1,43 @@
+"""`neeco render`: images, part ids and masks of a split's frames or of given states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw frames of a capture, or states from a file, with part ids and masks."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder that `neeco train` wrote."""
+    output: Path
+    """Folder to write to; pictures go into OUTPUT/SPLIT or OUTPUT/states."""
+    capture: Path | None = None
+    """Capture whose frames to draw; the run's own when not given."""
+    split: str = "test"
+    """Which frames."""
+    states: Path | None = None
+    """Draw these states (JSON lines) instead of a split."""
+
+
+def run(args: Render) -> int:
+    """Draw, and say where it lies."""
+    from neeco.synthesis.progress import counting
+    from neeco.synthesis.render import STATES_FOLDER, render, split_views, state_views
+    from neeco.training.run import load_run
+
+    trained = load_run(args.run)
+    if args.states is not None:
+        views, folder = state_views(trained.scene, args.states), args.output / STATES_FOLDER
+    else:
+        views, folder = split_views(trained, args.split, args.capture), args.output / args.split
+    with counting("render", len(views)) as advance:
+        rendered = render(trained.scene, views, folder, advance)
+    print(f"{rendered.images} images in {rendered.folder}")
+    if not rendered.labelled:
+        print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")
+    return 0

@@ -1,0 +1,97 @@
+"""Which drawn states are worth keeping: the instrument is in the image and not in the tissue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from neeco.synthesis.annotation import project
+from neeco.synthesis.drawing import Drawing, Labeller, draw
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+
+WORKING_END = ("hinge", "tip_left", "tip_right")
+BURIED_SHARE = 0.05
+TOLERANCE_MM = (2.0, 5.0)
+TOLERANCE_STATES = 12
+LEAVES_IMAGE, ENTERS_TISSUE = "leaves the image", "enters the tissue"
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """When to refuse a drawn state.
+
+    min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
+    lie behind the tissue surface, as this camera sees it (see `buried_depth`); None asks nothing. A single view cannot
+    tell "inside the tissue" from "behind a fold of it": both are refused.
+    """
+
+    min_share: float
+    tolerance_mm: float | None
+
+    def why_refused(self, scene: Scene, drawing: Drawing) -> str | None:
+        """The reason, or None when the drawing is worth keeping."""
+        keypoints = _working_ends(scene, drawing)
+        # first: an instrument wholly behind the tissue shows no pixels either
+        if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
+            return ENTERS_TISSUE
+        if np.count_nonzero(drawing.parts) < self.min_share * drawing.parts.size:
+            return LEAVES_IMAGE
+        if keypoints and not any(_in_image(point, drawing) for points in keypoints.values() for point in points):
+            return LEAVES_IMAGE
+        return None
+
+
+def buried_depth(scene: Scene, drawing: Drawing) -> float:
+    """How far, in mm, the worst instrument lies behind the tissue surface that this camera sees; 0 for none.
+
+    Of an instrument's pixels all but the deepest BURIED_SHARE are above this depth (edges are uncertain), of the
+    keypoints of its working end all are.
+    """
+    deepest = 0.0
+    keypoints = _working_ends(scene, drawing)
+    surface = drawing.tissue_depth
+    for name, alone in drawing.alone.items():
+        pixels = alone.mask & (alone.depth > 0)
+        below = np.where(surface > 0, alone.depth - surface, 0.0)[pixels]
+        if len(below):
+            deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
+        for point in keypoints.get(name, []):
+            if _in_image(point, drawing):
+                x, y, z = project(point, drawing.camera)
+                under = float(surface[int(y), int(x)])
+                deepest = max(deepest, z - under if under > 0 else 0.0)
+    return deepest
+
+
+def find_tolerance(scene: Scene, labeller: Labeller) -> float:
+    """The tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
+
+    What was recorded did not enter the tissue; where the model says it did, the model is that inexact. More than
+    5 mm is not inexactness: there, tissue stood before the instrument.
+    """
+    recorded = scene.recorded
+    chosen = np.unique(np.linspace(0, len(recorded.states) - 1, TOLERANCE_STATES).astype(int))
+    depths = [
+        buried_depth(scene, draw(scene, labeller, recorded.states[k], recorded.cameras[k], speckle=0.0)) for k in chosen
+    ]
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
+
+
+@torch.no_grad()
+def _working_ends(scene: Scene, drawing: Drawing) -> dict[str, list[np.ndarray]]:
+    known = scene.keypoints(drawing.state)
+    ends = {
+        instrument: [points[name].detach().cpu().double().numpy() for name in WORKING_END if name in points]
+        for instrument, points in known.items()
+    }
+    return {instrument: points for instrument, points in ends.items() if points}
+
+
+def _in_image(point: np.ndarray, drawing: Drawing) -> bool:
+    x, y, z = project(point, drawing.camera)
+    return z > drawing.camera.near and 0 <= x < drawing.camera.width and 0 <= y < drawing.camera.height

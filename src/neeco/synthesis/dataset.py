@@ -1,0 +1,255 @@
+"""`neeco synthesize`: draw many states, keep the acceptable ones, write them with labels."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+import neeco
+from neeco.errors import NeecoError
+from neeco.evaluation.labels import LABEL_THRESHOLD
+from neeco.files import read_json, write_json
+from neeco.synthesis.acceptance import Acceptance, find_tolerance
+from neeco.synthesis.annotation import KEYPOINTS, annotate
+from neeco.synthesis.drawing import (
+    CompositedLabels,
+    DeltaThresholds,
+    Drawing,
+    Labeller,
+    ThresholdLabels,
+    draw,
+    instruments_of,
+)
+from neeco.synthesis.preview import write_preview
+from neeco.synthesis.samplers import Sampler, make_sampler, states_fingerprint
+from neeco.synthesis.settings import Format, Settings
+from neeco.synthesis.writers.coco import write_coco
+from neeco.synthesis.writers.folder import (
+    DEPTH_MM_PER_COUNT,
+    Record,
+    load_record,
+    remove_leftovers,
+    write_sample,
+    write_skipped,
+    write_states,
+)
+from neeco.synthesis.writers.yolo import write_yolo
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+    from neeco.training.run import Run
+
+SCHEMA = "neeco-dataset/1"
+INFO = "dataset.json"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What came of it."""
+
+    output: Path
+    images: int
+    made_now: int
+    refused: dict[str, int]  # reason -> states refused
+    skipped: list[int]  # indices whose prescribed state was refused every time
+
+
+def synthesize(
+    run: Run,
+    output: Path,
+    settings: Settings,
+    formats: tuple[Format, ...] = ("coco", "yolo"),
+    resume: bool = False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Summary:
+    """Write a labelled data set of `settings.count` images of the run's scene to `output`.
+
+    Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C), it keeps and indexes what is done.
+    `on_progress` is told how many images are done. Raises NeecoError for bad settings, an output that is not empty
+    (without `resume`) or was made with other settings, and when no acceptable state is found.
+    """
+    settings.check()
+    output = Path(output)
+    scene = run.scene
+    info = _open_output(output, _description(run, settings), resume)
+    labeller = make_labeller(scene, settings)
+    sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
+    acceptance = make_acceptance(scene, labeller, settings)
+    info["tissue_tolerance_mm"] = acceptance.tolerance_mm
+    records: list[Record] = []
+    made = 0
+    try:
+        for index in range(settings.count):
+            record = load_record(output, index) if resume else None
+            if record is None:
+                record = make_sample(scene, labeller, sampler, acceptance, settings, output, index)
+                made += 1
+            records.append(record)
+            on_progress(index + 1)
+    except KeyboardInterrupt:
+        _write_indexes(output, records, info, scene, labeller, formats, complete=False)
+        raise
+    return _write_indexes(output, records, info, scene, labeller, formats, complete=True, made=made)
+
+
+def make_labeller(scene: Scene, settings: Settings) -> Labeller:
+    """The way of labelling that the settings ask for."""
+    if settings.labels == "composited":
+        return CompositedLabels(scene, settings.label_threshold or LABEL_THRESHOLD)
+    given = settings.delta_thresholds
+    return ThresholdLabels(scene, None if given is None else DeltaThresholds(*given))
+
+
+def make_acceptance(scene: Scene, labeller: Labeller, settings: Settings) -> Acceptance:
+    """What the settings ask of a drawn state; the tolerance is found from the recording where it is not given."""
+    if not settings.tissue_check:
+        return Acceptance(settings.min_share, None)
+    tolerance = settings.tissue_tolerance_mm
+    return Acceptance(settings.min_share, find_tolerance(scene, labeller) if tolerance is None else tolerance)
+
+
+def make_sample(
+    scene: Scene,
+    labeller: Labeller,
+    sampler: Sampler,
+    acceptance: Acceptance,
+    settings: Settings,
+    output: Path,
+    index: int,
+) -> Record:
+    """Draw, judge and write image `index`; returns its record.
+
+    A random state is drawn again until one is acceptable, `settings.tries` times at most, then NeecoError. A prescribed
+    state is only tried from other views, and skipped when none is acceptable.
+    """
+    drawing, refused = _first_acceptable(scene, labeller, sampler, acceptance, settings, index)
+    if drawing is not None:
+        return write_sample(output, index, drawing, annotate(scene, drawing, labeller.names), refused)
+    if sampler.prescribed:
+        return write_skipped(output, index, refused)
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
+    raise NeecoError(
+        f"{output}: image {index}: no acceptable state in {settings.tries} tries ({reasons}); "
+        "use --states inside, a smaller --margin, --no-tissue-check or more --tries"
+    )
+
+
+def _first_acceptable(
+    scene: Scene, labeller: Labeller, sampler: Sampler, acceptance: Acceptance, settings: Settings, index: int
+) -> tuple[Drawing | None, Counter[str]]:
+    rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
+    refused: Counter[str] = Counter()
+    for _ in range(settings.tries):
+        state, camera = sampler(index, rng)
+        drawing = draw(scene, labeller, state, camera, settings.speckle)
+        reason = acceptance.why_refused(scene, drawing)
+        if reason is None:
+            return drawing, refused
+        refused[reason] += 1
+    return None, refused
+
+
+def _description(run: Run, settings: Settings) -> dict[str, Any]:
+    scene_file = Path(run.path) / "scene.safetensors"
+    try:
+        digest = hashlib.sha256(scene_file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
+    return {
+        "schema": SCHEMA,
+        "version": neeco.__version__,
+        "scene_sha256": digest,
+        "settings": settings.identity() | {"states_sha256": states_fingerprint(settings.states)},
+        "scene": str(run.path),
+    }
+
+
+def _open_output(output: Path, description: dict[str, Any], resume: bool) -> dict[str, Any]:
+    """Claim an empty folder, or check that a begun data set was begun the same way."""
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give a folder")
+    if not output.exists() or not any(output.iterdir()):
+        write_json(output / INFO, description | {"complete": False})
+        return description
+    if not resume:
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")
+    if not (output / INFO).exists():
+        raise NeecoError(f"{output}: not empty and no {INFO} in it; --resume continues only data sets made by neeco")
+    begun = read_json(output / INFO)
+    for key in ("schema", "version", "scene_sha256"):
+        if begun.get(key) != description[key]:
+            raise NeecoError(
+                f"{output / INFO}: {key}: begun with {begun.get(key)!r}, now {description[key]!r}; use a new folder"
+            )
+    for key, value in description["settings"].items():
+        before = begun.get("settings", {}).get(key)
+        if before != value:
+            raise NeecoError(f"{output / INFO}: settings.{key}: begun with {before!r}, now {value!r}; use a new folder")
+    remove_leftovers(output)
+    return description
+
+
+def _write_indexes(
+    output: Path,
+    records: list[Record],
+    info: dict[str, Any],
+    scene: Scene,
+    labeller: Labeller,
+    formats: tuple[Format, ...],
+    complete: bool,
+    made: int = 0,
+) -> Summary:
+    """(Re)write everything that is about the whole data set, from the records."""
+    drawn = [record for record in records if not record.get("skipped")]
+    refused: Counter[str] = Counter()
+    for record in records:
+        refused.update(record["refused"])
+    skipped = [record["index"] for record in records if record.get("skipped")]
+    if complete and not drawn:
+        raise NeecoError(
+            f"{output}: every given state was refused ({dict(refused)}); see --no-tissue-check and --min-share"
+        )
+    instruments = instruments_of(labeller.names)
+    keypoints = keypoint_names(scene)
+    write_states(output, drawn)
+    if "coco" in formats:
+        write_coco(output, drawn, instruments, keypoints)
+    if "yolo" in formats:
+        write_yolo(output, drawn, instruments, keypoints)
+    if drawn:
+        write_preview(output, drawn, labeller.names)
+    thresholds = labeller.thresholds if isinstance(labeller, ThresholdLabels) else None
+    write_json(
+        output / INFO,
+        info
+        | {
+            "complete": complete,
+            "images": len(drawn),
+            "splits": dict(Counter(record["split"] for record in drawn)),
+            "formats": list(formats),
+            "ids": [{"id": 0, "part": "tissue"}]
+            + [{"id": k + 1, "instrument": name, "part": part} for k, (name, part) in enumerate(labeller.names)],
+            "keypoints": list(keypoints),
+            "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
+            "delta_thresholds": None if thresholds is None else asdict(thresholds),
+            "refused": dict(sorted(refused.items())),
+            "skipped": skipped,
+        },
+    )
+    return Summary(output, len(drawn), made, dict(sorted(refused.items())), skipped)
+
+
+@torch.no_grad()
+def keypoint_names(scene: Scene) -> tuple[str, ...]:
+    """Every keypoint that some instrument of the scene has, in the order of KEYPOINTS."""
+    if not scene.recorded.states:
+        return ()
+    known = {name for points in scene.keypoints(scene.recorded.states[0]).values() for name in points}
+    return tuple(name for name in KEYPOINTS if name in known)

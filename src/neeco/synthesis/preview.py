@@ -1,0 +1,133 @@
+"""A contact sheet: a look at the data set with its labels drawn over the images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy import ndimage
+
+from neeco.files import write_atomically
+from neeco.synthesis.annotation import OCCLUDED, SKELETON
+from neeco.synthesis.writers.folder import Record
+
+TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION = 12, 4, 360, 14, 40
+PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
+BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
+PALETTE = np.array(
+    [
+        (66, 135, 245),
+        (28, 200, 160),
+        (255, 122, 69),
+        (214, 80, 200),
+        (160, 200, 60),
+        (250, 200, 60),
+        (120, 110, 240),
+        (235, 85, 105),
+    ]
+)
+TINT = 0.42
+LABEL_COLUMN = 210
+
+
+def write_preview(root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]]) -> None:
+    """Write preview.png: up to 12 images spread over the data set, parts tinted, with boxes and keypoints."""
+    chosen = [records[k] for k in np.unique(np.linspace(0, len(records) - 1, min(TILES, len(records))).astype(int))]
+    tiles = [draw_tile(root, record) for record in chosen]
+    columns = min(COLUMNS, len(tiles))
+    rows = -(-len(tiles) // columns)
+    height = max(tile.height for tile in tiles)
+    legend_rows = -(-(len(names) + 3) // max(columns * (TILE_WIDTH + GAP) // LABEL_COLUMN, 1))
+    header = 26 * legend_rows + GAP
+    sheet = Image.new("RGB", (GAP + columns * (TILE_WIDTH + GAP), header + GAP + rows * (height + GAP)), PAPER)
+    _legend(ImageDraw.Draw(sheet), names, sheet.width)
+    for k, tile in enumerate(tiles):
+        row, column = divmod(k, columns)
+        sheet.paste(tile, (GAP + column * (TILE_WIDTH + GAP), header + GAP + row * (height + GAP)))
+    write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG"))
+
+
+def draw_tile(root: Path, record: Record) -> Image.Image:
+    """One image with its labels drawn over it, and a caption below."""
+    with Image.open(root / record["image"]) as stored:
+        pixels = np.asarray(stored.convert("RGB"), dtype=float)
+    with Image.open(root / record["image"].replace("images/", "parts/", 1)) as stored:
+        parts = np.asarray(stored)
+    scale = TILE_WIDTH / pixels.shape[1]
+    size = (TILE_WIDTH, round(pixels.shape[0] * scale))
+    image = np.asarray(Image.fromarray(pixels.astype(np.uint8)).resize(size, Image.Resampling.LANCZOS), dtype=float)
+    ids = np.asarray(Image.fromarray(parts).resize(size, Image.Resampling.NEAREST))
+    tinted = Image.fromarray(_tinted(image, ids).round().astype(np.uint8))
+    canvas = ImageDraw.Draw(tinted)
+    for label in record["labels"]:
+        _draw_label(canvas, label, scale)
+    tile = Image.new("RGB", (size[0], size[1] + CAPTION), PAPER)
+    tile.paste(tinted)
+    first, second = _caption(record)
+    text = ImageDraw.Draw(tile)
+    text.text((0, size[1] + 5), first, INK, _font(13))
+    text.text((0, size[1] + 22), second, FAINT, _font(12))
+    return tile
+
+
+def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    colors = np.concatenate([np.zeros((1, 3)), PALETTE[np.arange(max(int(ids.max()), 1)) % len(PALETTE)]])[ids]
+    inside = (ids > 0)[..., None]
+    tinted = np.where(inside, (1 - TINT) * image + TINT * colors, image)
+    edge = (ids > 0) & ~ndimage.binary_erosion(ids > 0, border_value=1)
+    tinted[edge] = colors[edge]
+    return tinted
+
+
+def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], scale: float) -> None:
+    if label["area"] > 0:
+        x, y, width, height = (value * scale for value in label["box"])
+        canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=BOX)
+        corners = [(px * scale, py * scale) for px, py in label["rectangle"]]
+        canvas.line([*corners, corners[0]], fill=RECTANGLE, width=2)
+        _tag(canvas, x, y, label["name"])
+    points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
+    for start, end in SKELETON:
+        if start in points and end in points:
+            canvas.line([points[start][:2], points[end][:2]], fill=BONE, width=2)
+    for x, y, visibility in points.values():
+        fill = HIDDEN if visibility == OCCLUDED else BOX
+        canvas.ellipse((x - 4, y - 4, x + 4, y + 4), fill=fill, outline=BONE, width=2)
+
+
+def _tag(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
+    """The name above the box, or inside it where there is no room above."""
+    font = _font(11)
+    width = canvas.textlength(text, font=font) + 8
+    top = y - 16 if y >= 16 else y
+    canvas.rectangle((x, top, x + width, top + 15), fill=BOX)
+    canvas.text((x + 4, top + 1), text, INK, font)
+
+
+def _caption(record: Record) -> tuple[str, str]:
+    joints = [
+        f"{joint} {value:.2f}" for instrument in record["instruments"] for joint, value in instrument["joints"].items()
+    ]
+    seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
+    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)
+
+
+def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:
+    entries = [(f"{name} {part}", tuple(PALETTE[k % len(PALETTE)].tolist())) for k, (name, part) in enumerate(names)]
+    entries += [("minimum-area box", RECTANGLE), ("keypoint seen", BOX), ("keypoint occluded", HIDDEN)]
+    columns = max((width - GAP) // LABEL_COLUMN, 1)
+    for k, (text, color) in enumerate(entries):
+        row, column = divmod(k, columns)
+        x, y = GAP + column * LABEL_COLUMN, GAP + 26 * row
+        if "keypoint" in text:
+            canvas.ellipse((x + 2, y + 2, x + 14, y + 14), fill=color, outline=BONE, width=2)
+        else:
+            canvas.rectangle((x, y, x + 16, y + 16), fill=color)
+        canvas.text((x + 24, y + 1), text, INK, _font(13))
+
+
+def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    return ImageFont.load_default(size)

@@ -1,0 +1,98 @@
+"""`neeco render`: draw the frames of a split, or given states, with part ids and masks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from neeco.capture import read_capture
+from neeco.capture.images import write_image, write_labels
+from neeco.capture.model import Frame, State
+from neeco.errors import NeecoError
+from neeco.evaluation.labels import composited_parts
+from neeco.raster import rasterize
+from neeco.raster.types import Camera
+from neeco.synthesis.samplers import make_sampler
+from neeco.synthesis.statefile import read_states
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+    from neeco.training.run import Run
+
+STATES_FOLDER = "states"
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What was drawn, and where it lies."""
+
+    folder: Path
+    images: int
+    labelled: bool  # False: the scene's method learns no labels, so there are no part ids and masks
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture to draw."""
+
+    name: str
+    state: State
+    camera: Camera
+
+
+def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[View]:
+    """The frames of one split of a capture (the run's own unless given), named by their files' stems.
+
+    Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
+    """
+    capture = run.capture() if capture_path is None else read_capture(capture_path)
+    frames = capture.split(split)
+    if not frames:
+        known = ", ".join(capture.splits) or "none"
+        raise NeecoError(f"{capture.root}: split {split!r} has no frames; the capture has {known}")
+    names = _unique_names(frames, capture.root)
+    return [View(name, frame.state, frame.camera) for name, frame in zip(names, frames, strict=True)]
+
+
+def state_views(scene: Scene, path: Path) -> list[View]:
+    """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
+    lines = read_states(path, scene.instruments)
+    sampler = make_sampler(scene, str(path), margin=0.0, views="recorded", count=len(lines))
+    first = scene.recorded.cameras[0]
+    return [View(f"{k:06d}", line.state, sampler.cameras[k] or first) for k, line in enumerate(lines)]
+
+
+@torch.no_grad()
+def render(
+    scene: Scene, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
+) -> Rendered:
+    """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view. Raises NeecoError."""
+    channels = scene.label_channels() if scene.label_names else None
+    done = 0
+    for view in views:
+        rendering = rasterize(scene.at(view.state), scene.camera(view.camera), channels=channels)
+        write_image(folder / f"{view.name}.png", rendering.color)
+        if channels is not None:
+            parts = composited_parts(rendering).cpu()
+            write_labels(folder / f"{view.name}_parts.png", parts)
+            write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
+        done += 1
+        on_progress(done)
+    return Rendered(folder, done, channels is not None)
+
+
+def _unique_names(frames: tuple[Frame, ...], root: Path) -> list[str]:
+    counts = Counter(frame.name for frame in frames)
+    names = []
+    for frame in frames:
+        if counts[frame.name] == 1:
+            names.append(frame.name)
+            continue
+        path = frame.image_path.with_suffix("")
+        names.append("_".join(path.relative_to(root).parts if path.is_relative_to(root) else path.parts[-2:]))
+    return names

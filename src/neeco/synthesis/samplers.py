@@ -1,0 +1,136 @@
+"""From what the user asked for to a sampler of states and one of views."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.random import Generator
+
+from neeco.capture.model import State
+from neeco.errors import NeecoError
+from neeco.raster import rasterize
+from neeco.raster.types import Camera
+from neeco.synthesis.drawing import surface_depth
+from neeco.synthesis.settings import PATH_PREFIX, Views
+from neeco.synthesis.statefile import read_states
+from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, Listed, StateSampler
+from neeco.synthesis.views import (
+    OrbitViews,
+    PerturbedViews,
+    RecordedViews,
+    ViewSampler,
+    moved_camera,
+    surface_points,
+)
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+
+SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """Draws (state, camera) of image `index`."""
+
+    states: StateSampler
+    views: ViewSampler
+    cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
+
+    @property
+    def prescribed(self) -> bool:
+        """Whether the state of an index is given rather than random."""
+        return self.states.prescribed
+
+    def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
+        """The next (state, camera) for image `index`."""
+        state = self.states(index, rng)
+        camera = self.cameras[index % len(self.cameras)]
+        return state, self.views(rng) if camera is None else camera
+
+
+def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: int) -> Sampler:
+    """The sampler named by `states` (inside, beyond, grid, path:FILE or FILE) and `views`. Raises NeecoError."""
+    recorded = RecordedViews(scene.recorded.cameras)
+    view_sampler = _view_sampler(scene, views, recorded)
+    if states == "inside":
+        return Sampler(Inside(scene.recorded.states), view_sampler)
+    if states == "beyond":
+        return Sampler(Beyond(scene.recorded.states, scene.instruments, margin), view_sampler)
+    if states == "grid":
+        return Sampler(Grid(scene.recorded.states, instrument_axes(scene)), view_sampler)
+    lines = read_states(states_file(states), scene.instruments)
+    if states.startswith(PATH_PREFIX):
+        return Sampler(AlongPath([line.state for line in lines], count), view_sampler)
+    intrinsics = recorded.cameras[0]
+    cameras = tuple(
+        None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
+    )
+    return Sampler(Listed([line.state for line in lines]), view_sampler, cameras)
+
+
+def states_file(states: str) -> Path:
+    """The file that `--states` names; NeecoError when it is meant to be a sampler's name but is none."""
+    path = Path(states.removeprefix(PATH_PREFIX))
+    if not path.suffix and not path.exists():
+        raise NeecoError(f"--states: {states!r} is neither inside, beyond, grid, path:FILE.jsonl nor a file")
+    return path
+
+
+def states_fingerprint(states: str) -> str | None:
+    """sha256 of the file that `--states` names; None when it names a sampler."""
+    if states in ("inside", "beyond", "grid"):
+        return None
+    path = states_file(states)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+
+
+@torch.no_grad()
+def instrument_axes(scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Axis of each instrument in its own frame: a point [3] mm and a unit direction [3].
+
+    The learned shaft where the scene knows one, else the frame's z axis.
+    """
+    axes = {instrument.name: (np.zeros(3), np.array([0.0, 0.0, 1.0])) for instrument in scene.instruments}
+    state = scene.recorded.states[0]
+    for name, points in scene.keypoints(state).items():
+        if not {"shaft_far", "shaft_near"} <= set(points):
+            continue
+        instrument_from_world = np.linalg.inv(scene.registered(state).instruments[name].pose.double().numpy())
+        far, near = (
+            (instrument_from_world @ np.append(points[end].double().numpy(), 1.0))[:3]
+            for end in ("shaft_far", "shaft_near")
+        )
+        if (length := float(np.linalg.norm(near - far))) > 1e-6:
+            axes[name] = near, (near - far) / length
+    return axes
+
+
+def _view_sampler(scene: Scene, views: Views, recorded: RecordedViews) -> ViewSampler:
+    if views == "recorded":
+        return recorded
+    if views == "perturbed":
+        return PerturbedViews(recorded)
+    return OrbitViews(recorded, surface_centre(scene))
+
+
+@torch.no_grad()
+def surface_centre(scene: Scene) -> np.ndarray:
+    """The median [3] mm of the surface points that recorded cameras see."""
+    frames = np.unique(np.linspace(0, len(scene.recorded.cameras) - 1, SURFACE_VIEWS).astype(int))
+    points = []
+    for k in frames:
+        camera = scene.camera(scene.recorded.cameras[k])
+        points.append(surface_points(surface_depth(rasterize(scene.at(scene.recorded.states[k]), camera)), camera))
+    seen = np.concatenate(points)
+    if len(seen) == 0:
+        raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")
+    return np.median(seen, axis=0)

@@ -1,0 +1,271 @@
+"""Samplers of instrument states.
+
+A sampler turns (index, generator) into a state. The generator is seeded by (seed, index) alone, so any image of a data
+set can be made without the others, in any order, and comes out the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.errors import NeecoError
+
+JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
+
+
+class StateSampler(Protocol):
+    """Draws the state of image `index`."""
+
+    prescribed: bool  # the state of an index is given, not random: another try can only change the view
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        """The state of image `index`; a random sampler draws anew on every call with the same generator."""
+        ...
+
+
+@dataclass(frozen=True)
+class JointRange:
+    """Where a joint may go, in rad."""
+
+    lower: float
+    upper: float
+
+    def widened(self, margin: float, limits: tuple[float, float] | None) -> JointRange:
+        """The range, wider by `margin` of its length at either end, but never outside `limits`."""
+        reach = margin * (self.upper - self.lower)
+        lower, upper = self.lower - reach, self.upper + reach
+        if limits is not None:
+            # limits narrower than what was recorded are the recording's fault: they must not cut into it
+            lower = min(self.lower, max(lower, limits[0]))
+            upper = max(self.upper, min(upper, limits[1]))
+        return JointRange(lower, upper)
+
+
+def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np.ndarray:
+    """The rigid pose [4, 4] between two: positions on a line, rotations by slerp.
+
+    Weight 0 gives the first, 1 the second. Weights outside [0, 1] extrapolate.
+    """
+    start, end = Rotation.from_matrix(first[:3, :3]), Rotation.from_matrix(second[:3, :3])
+    turn = (start.inv() * end).as_rotvec()
+    pose = np.eye(4)
+    pose[:3, :3] = (start * Rotation.from_rotvec(weight * turn)).as_matrix()
+    pose[:3, 3] = (1 - weight) * first[:3, 3] + weight * second[:3, 3]
+    return pose
+
+
+def interpolate_state(first: State, second: State, weight: float) -> State:
+    """The state between two, of the instruments both know: poses as `interpolate_pose`, joints and time linearly."""
+    instruments = {}
+    for name, a in first.instruments.items():
+        b = second.instruments.get(name)
+        if b is None:
+            continue
+        joints = {
+            joint: (1 - weight) * value + weight * b.joints[joint]
+            for joint, value in a.joints.items()
+            if joint in b.joints
+        }
+        instruments[name] = InstrumentState(
+            torch.from_numpy(interpolate_pose(a.pose.numpy(), b.pose.numpy(), weight)), joints
+        )
+    return State(instruments, (1 - weight) * first.time + weight * second.time)
+
+
+def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
+    """The mean of poses [4, 4]: mean position and the chordal mean of the rotations."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_matrix(np.stack([p[:3, :3] for p in poses])).mean().as_matrix()
+    pose[:3, 3] = np.mean([p[:3, 3] for p in poses], axis=0)
+    return pose
+
+
+def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
+    """The range of every joint, by (instrument, joint), over recorded states."""
+    readings: dict[tuple[str, str], list[float]] = {}
+    for state in states:
+        for name, instrument in state.instruments.items():
+            for joint, value in instrument.joints.items():
+                readings.setdefault((name, joint), []).append(float(value))
+    return {key: JointRange(min(values), max(values)) for key, values in readings.items()}
+
+
+def _usable(states: Sequence[State]) -> list[State]:
+    usable = [state for state in states if state.instruments]
+    if not usable:
+        raise NeecoError(
+            "states: the scene was trained without instrument states; train on a capture that records them"
+        )
+    return usable
+
+
+class Inside:
+    """States inside the recorded range.
+
+    A random point between two random recorded states, shaken by a rigid motion common to all instruments (so that
+    bodies tracked apart but joined in the world stay together), every position clipped to the recorded bounds; joints
+    uniform over their recorded range.
+    """
+
+    prescribed = False
+
+    def __init__(self, states: Sequence[State]) -> None:
+        self.states = _usable(states)
+        self.ranges = joint_ranges(self.states)
+        self.means: dict[str, np.ndarray] = {}
+        self.bounds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for name in {name for state in self.states for name in state.instruments}:
+            poses = [s.instruments[name].pose.numpy() for s in self.states if name in s.instruments]
+            positions = np.stack([pose[:3, 3] for pose in poses])
+            self.means[name] = mean_pose(poses)
+            self.bounds[name] = positions.min(0), positions.max(0)
+        spans = [upper - lower for lower, upper in self.bounds.values()]
+        self.shake_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
+        self.shake_rad = JITTER * float(np.mean([self._angular_spread(name) for name in self.means]))
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        first, second = (self.states[k] for k in rng.integers(len(self.states), size=2))
+        if not set(first.instruments) & set(second.instruments):
+            second = first
+        state = interpolate_state(first, second, float(rng.random()))
+        state = self._shaken(state, rng)
+        return with_joints(state, lambda name, joint: _uniform(rng, self.ranges[name, joint]))
+
+    def _angular_spread(self, name: str) -> float:
+        mean = Rotation.from_matrix(self.means[name][:3, :3])
+        poses = [s.instruments[name].pose.numpy()[:3, :3] for s in self.states if name in s.instruments]
+        return float((mean.inv() * Rotation.from_matrix(np.stack(poses))).magnitude().max())
+
+    def _shaken(self, state: State, rng: Generator) -> State:
+        poses = {name: instrument.pose.numpy() for name, instrument in state.instruments.items()}
+        centre = np.mean([pose[:3, 3] for pose in poses.values()], axis=0)
+        turn = Rotation.from_rotvec(self.shake_rad * rng.standard_normal(3)).as_matrix()
+        shift = self.shake_mm * rng.standard_normal(3)
+        instruments = {}
+        for name, pose in poses.items():
+            moved = np.eye(4)
+            moved[:3, :3] = turn @ pose[:3, :3]
+            moved[:3, 3] = np.clip(turn @ (pose[:3, 3] - centre) + centre + shift, *self.bounds[name])
+            instruments[name] = InstrumentState(torch.from_numpy(moved), state.instruments[name].joints)
+        return State(instruments, state.time)
+
+
+class Beyond(Inside):
+    """States from the recorded range widened by `margin`.
+
+    Joints are uniform over their range widened by that fraction at either end, within the limits the capture states;
+    poses are drawn as `Inside` does and then moved away from the mean recorded pose by a factor in [1, 1 + 2 margin],
+    as the half range either side of the mean grows by that much; all instruments of a state by the same factor.
+    """
+
+    def __init__(self, states: Sequence[State], instruments: Sequence[Instrument], margin: float) -> None:
+        if not margin > 0:
+            raise NeecoError(f"--margin: {margin} reaches nowhere beyond the recorded range; give a fraction above 0")
+        super().__init__(states)
+        self.margin = margin
+        limits = {(i.name, joint): limit for i in instruments for joint, limit in i.joints.items()}
+        self.ranges = {key: r.widened(margin, limits.get(key)) for key, r in self.ranges.items()}
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        state = super().__call__(index, rng)
+        factor = 1 + 2 * self.margin * float(rng.random())
+        instruments = {
+            name: InstrumentState(
+                torch.from_numpy(interpolate_pose(self.means[name], instrument.pose.numpy(), factor)), instrument.joints
+            )
+            for name, instrument in state.instruments.items()
+        }
+        return State(instruments, state.time)
+
+
+class Grid:
+    """Every joint value with every roll, about recorded poses.
+
+    Cell `index` mod (joint_values * rolls): all joints at the same fraction of their recorded ranges, each instrument
+    rolled about its axis by -roll .. +roll. Each full round of cells stands on another recorded pose.
+    `axes`: instrument -> (point [3] mm, direction [3] unit) in the instrument's frame.
+    """
+
+    prescribed = True
+
+    def __init__(
+        self,
+        states: Sequence[State],
+        axes: Mapping[str, tuple[np.ndarray, np.ndarray]],
+        joint_values: int = 5,
+        rolls: int = 5,
+        roll_rad: float = np.pi / 6,
+    ) -> None:
+        self.states = _usable(states)
+        self.ranges = joint_ranges(self.states)
+        self.axes = axes
+        self.fractions = np.linspace(0, 1, joint_values) if joint_values > 1 else np.array([0.5])
+        self.rolls = np.linspace(-roll_rad, roll_rad, rolls) if rolls > 1 else np.array([0.0])
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        round_number, cell = divmod(index, len(self.fractions) * len(self.rolls))
+        fraction, roll = self.fractions[cell // len(self.rolls)], self.rolls[cell % len(self.rolls)]
+        # golden-ratio steps: successive rounds stand far apart in the recording
+        base = self.states[int(round_number * 0.6180339887 * len(self.states)) % len(self.states)]
+        instruments = {}
+        for name, instrument in base.instruments.items():
+            point, direction = self.axes[name]
+            about = np.eye(4)
+            about[:3, :3] = Rotation.from_rotvec(roll * direction).as_matrix()
+            about[:3, 3] = point - about[:3, :3] @ point
+            instruments[name] = InstrumentState(torch.from_numpy(instrument.pose.numpy() @ about), instrument.joints)
+
+        def value(name: str, joint: str) -> float:
+            joint_range = self.ranges[name, joint]
+            return float(joint_range.lower + fraction * (joint_range.upper - joint_range.lower))
+
+        return with_joints(State(instruments, base.time), value)
+
+
+class AlongPath:
+    """`count` states evenly spread along key states, first and last included."""
+
+    prescribed = True
+
+    def __init__(self, keys: Sequence[State], count: int) -> None:
+        if len(keys) < 2:
+            raise NeecoError(f"--states path: {len(keys)} key state(s); a path needs at least two")
+        self.keys, self.count = list(keys), count
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        position = index / max(self.count - 1, 1) * (len(self.keys) - 1)
+        segment = min(int(position), len(self.keys) - 2)
+        return interpolate_state(self.keys[segment], self.keys[segment + 1], position - segment)
+
+
+class Listed:
+    """The given states in order; from the start again when more images are asked for than states are given."""
+
+    prescribed = True
+
+    def __init__(self, states: Sequence[State]) -> None:
+        self.states = list(states)
+
+    def __call__(self, index: int, rng: Generator) -> State:
+        return self.states[index % len(self.states)]
+
+
+def with_joints(state: State, value: Callable[[str, str], float]) -> State:
+    """The same state with every joint set to `value(instrument, joint)`."""
+    instruments = {
+        name: InstrumentState(instrument.pose, {joint: value(name, joint) for joint in sorted(instrument.joints)})
+        for name, instrument in state.instruments.items()
+    }
+    return State(instruments, state.time)
+
+
+def _uniform(rng: Generator, joint_range: JointRange) -> float:
+    return float(joint_range.lower + rng.random() * (joint_range.upper - joint_range.lower))

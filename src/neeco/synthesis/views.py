@@ -1,0 +1,92 @@
+"""Samplers of views: recorded cameras, cameras near them, cameras round the tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from neeco.errors import NeecoError
+from neeco.raster.types import Camera
+
+
+class ViewSampler(Protocol):
+    """Draws a camera; intrinsics and image size are always those of a recorded camera."""
+
+    def __call__(self, rng: Generator) -> Camera: ...
+
+
+@dataclass(frozen=True)
+class RecordedViews:
+    """A recorded camera, each as likely as any other."""
+
+    cameras: Sequence[Camera]
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise NeecoError("views: the scene remembers no recorded camera; train it again with this version")
+
+    def __call__(self, rng: Generator) -> Camera:
+        return self.cameras[int(rng.integers(len(self.cameras)))]
+
+
+@dataclass(frozen=True)
+class PerturbedViews:
+    """A recorded camera, turned about its centre and shifted, both normally distributed about nothing.
+
+    `degrees` and `mm` are standard deviations of the angle about each axis and of the shift along each.
+    """
+
+    recorded: RecordedViews
+    degrees: float = 3.0
+    mm: float = 3.0
+
+    def __call__(self, rng: Generator) -> Camera:
+        camera = self.recorded(rng)
+        offset = np.eye(4)
+        offset[:3, :3] = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
+        offset[:3, 3] = self.mm * rng.standard_normal(3)
+        return moved_camera(camera, camera.world_from_camera.detach().cpu().double().numpy() @ offset)
+
+
+@dataclass(frozen=True)
+class OrbitViews:
+    """A recorded camera carried round `centre` (world mm), which stays at its place in the image.
+
+    The turn is uniform in direction and uniform in angle up to `degrees`.
+    """
+
+    recorded: RecordedViews
+    centre: np.ndarray  # [3] mm
+    degrees: float = 20.0
+
+    def __call__(self, rng: Generator) -> Camera:
+        camera = self.recorded(rng)
+        world_from_camera = camera.world_from_camera.detach().cpu().double().numpy()
+        direction = 2 * np.pi * rng.random()
+        # the axis lies in the image plane: the camera moves sideways, it does not roll
+        axis = world_from_camera[:3, :3] @ np.array([np.cos(direction), np.sin(direction), 0.0])
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.random() * axis).as_matrix()
+        turn[:3, 3] = self.centre - turn[:3, :3] @ self.centre
+        return moved_camera(camera, turn @ world_from_camera)
+
+
+def moved_camera(camera: Camera, world_from_camera: np.ndarray) -> Camera:
+    """The same camera elsewhere; world_from_camera [4, 4] with OpenCV axes."""
+    return replace(camera, world_from_camera=torch.from_numpy(world_from_camera).to(camera.world_from_camera))
+
+
+def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarray:
+    """World points [P, 3] mm under every `step`-th pixel of a depth image [H, W] mm; pixels of depth 0 give none."""
+    rows, columns = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
+    z = depth[rows, columns]
+    points = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z, np.ones_like(z)], -1
+    )[z > 0]
+    return (points @ camera.world_from_camera.detach().cpu().double().numpy().T)[:, :3]

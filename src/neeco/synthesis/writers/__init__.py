@@ -1,0 +1,1 @@
+"""Data set writers: plain folders, COCO, YOLO. All index files are made from the per-image records."""

@@ -1,0 +1,122 @@
+"""The data set as plain files: images, masks, part ids, depth, states, and one record per image.
+
+A record says everything about its image and is written last, so an image without a whole record is not there yet.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from neeco.capture.images import write_image, write_labels
+from neeco.files import write_atomically, write_json, write_text
+from neeco.synthesis.annotation import InstrumentLabel
+from neeco.synthesis.drawing import Drawing
+from neeco.synthesis.statefile import camera_to_json, state_to_json
+
+Record = dict[str, Any]
+
+DEPTH_MM_PER_COUNT = 0.05
+RECORDS = ".records"
+FOLDERS = ("images", "masks", "parts", "depth", RECORDS)
+VALIDATION_EVERY = 5  # every fifth image is for validation
+
+
+def stem(index: int) -> str:
+    """File stem of image `index`."""
+    return f"{index:06d}"
+
+
+def split_of(index: int) -> str:
+    """Which split an image belongs to; it depends on nothing but the index, so a data set can grow."""
+    return "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
+
+
+def write_sample(
+    root: Path, index: int, drawing: Drawing, labels: list[InstrumentLabel], refused: Mapping[str, int]
+) -> Record:
+    """Write one image with its masks, part ids and depth, then its record; returns the record. Raises NeecoError."""
+    name = f"{stem(index)}.png"
+    parts = torch.from_numpy(drawing.parts)
+    write_image(root / "images" / name, drawing.image)
+    write_labels(root / "masks" / name, (parts > 0).to(torch.uint8) * 255)
+    write_labels(root / "parts" / name, parts)
+    write_depth(root / "depth" / name, drawing.depth)
+    camera = drawing.camera
+    record = {
+        "index": index,
+        "image": f"images/{name}",
+        "split": split_of(index),
+        "width": camera.width,
+        "height": camera.height,
+        **state_to_json(drawing.state),
+        "camera": camera_to_json(camera.world_from_camera.detach().cpu().double().numpy()),
+        "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        "labels": [label.to_json() for label in labels],
+        "refused": dict(sorted(refused.items())),
+        "files": {
+            f"{folder}/{name}": (root / folder / name).stat().st_size
+            for folder in ("images", "masks", "parts", "depth")
+        },
+    }
+    write_json(record_path(root, index), record)
+    return record
+
+
+def write_skipped(root: Path, index: int, refused: Mapping[str, int]) -> Record:
+    """Record that the prescribed state of `index` could not be drawn acceptably."""
+    record: Record = {"index": index, "skipped": True, "refused": dict(sorted(refused.items())), "files": {}}
+    write_json(record_path(root, index), record)
+    return record
+
+
+def record_path(root: Path, index: int) -> Path:
+    """Where the record of image `index` lies."""
+    return root / RECORDS / f"{stem(index)}.json"
+
+
+def load_record(root: Path, index: int) -> Record | None:
+    """The record of image `index` when it and all its files are there and whole, else None."""
+    try:
+        record = json.loads(record_path(root, index).read_text(encoding="utf-8"))
+        sizes = {name: (root / name).stat().st_size for name in record["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return record if sizes == record["files"] and record.get("index") == index else None
+
+
+def remove_leftovers(root: Path) -> None:
+    """Delete the half-written files that a killed run left behind (their names start with a dot)."""
+    for folder in FOLDERS:
+        for path in (root / folder).glob(".*"):
+            if path.is_file():
+                path.unlink()
+
+
+def write_depth(path: Path, depth: np.ndarray) -> None:
+    """Write depth [H, W] mm as a 16-bit grey PNG of 0.05 mm per count, 0 = none; beyond 3276 mm it saturates."""
+    counts = np.clip(np.round(depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16)
+    write_atomically(path, lambda temporary: Image.fromarray(counts).save(temporary, format="PNG"))
+
+
+def write_states(root: Path, records: list[Record]) -> None:
+    """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
+    lines = []
+    for record in records:
+        line = {key: value for key, value in record.items() if key not in ("files", "refused")}
+        line["labels"] = [_without_polygons(label) for label in record["labels"]]
+        lines.append(json.dumps(line, allow_nan=False))
+    write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
+
+
+def _without_polygons(label: dict[str, Any]) -> dict[str, Any]:
+    parts = {
+        name: {key: value for key, value in part.items() if key != "polygons"} for name, part in label["parts"].items()
+    }
+    return {key: value for key, value in label.items() if key != "polygons"} | {"parts": parts}

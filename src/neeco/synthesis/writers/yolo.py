@@ -1,0 +1,111 @@
+"""YOLO: detect, segment, pose and oriented-box label files that Ultralytics-style tools read.
+
+Such tools find an image's labels by replacing the last `/images/` of its path by `/labels/`, so every variant has an
+`images` folder of its own beside its `labels`: hard links to the data set's images (copies where the file system has
+no hard links), never symbolic ones.
+
+    yolo/{data.yaml, images/{train,val}, labels/{train,val}}     detect
+    yolo/segment/…   yolo/pose/…   yolo/obb/…                    the same for the other tasks
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from neeco.files import write_atomically, write_text
+from neeco.synthesis.geometry import joined_polygon
+from neeco.synthesis.writers.folder import Record, stem
+
+FOLDER = "yolo"
+Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
+
+
+def write_yolo(root: Path, records: Sequence[Record], instruments: Sequence[str], keypoints: Sequence[str]) -> None:
+    """Write every variant; classes are `instruments`, coordinates are shares of the image's width and height."""
+    _write_variant(root, root / FOLDER, records, instruments, detect_row, {})
+    _write_variant(root, root / FOLDER / "segment", records, instruments, segment_row, {})
+    _write_variant(root, root / FOLDER / "obb", records, instruments, oriented_row, {})
+    if keypoints:
+        mirrored = [name.replace("left", "\0").replace("right", "left").replace("\0", "right") for name in keypoints]
+        flip = [keypoints.index(name) if name in keypoints else k for k, name in enumerate(mirrored)]
+        extra: dict[str, Any] = {"kpt_shape": [len(keypoints), 3], "flip_idx": flip}
+        extra["kpt_names"] = {k: list(keypoints) for k in range(len(instruments))}
+        row = _pose_row(keypoints)
+        _write_variant(root, root / FOLDER / "pose", records, instruments, row, extra)
+
+
+def detect_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
+    """Box centre and size."""
+    x, y, width, height = label["box"]
+    return [*(np.array([x + width / 2, y + height / 2]) / size), *(np.array([width, height]) / size)]
+
+
+def segment_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
+    """One polygon; the pieces of an instrument seen in several are joined by bridges of no width."""
+    return _shares(joined_polygon([np.array(polygon) for polygon in label["polygons"]]), size)
+
+
+def oriented_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
+    """Corners of the minimum-area rectangle, cut at the image's border."""
+    return _shares(np.array(label["rectangle"]), size)
+
+
+def _pose_row(keypoints: Sequence[str]) -> Row:
+    def row(label: dict[str, Any], size: np.ndarray) -> list[float]:
+        points = np.array([label["keypoints"].get(name, [0, 0, 0]) for name in keypoints], dtype=float)
+        points[:, :2] /= size
+        return detect_row(label, size) + points.ravel().tolist()
+
+    return row
+
+
+def _shares(points: np.ndarray, size: np.ndarray) -> list[float]:
+    return np.clip(points / size, 0, 1).ravel().tolist()
+
+
+def _write_variant(
+    root: Path, folder: Path, records: Sequence[Record], instruments: Sequence[str], row: Row, extra: dict[str, Any]
+) -> None:
+    for record in records:
+        name, split = stem(record["index"]), record["split"]
+        size = np.array([record["width"], record["height"]], dtype=float)
+        lines = [
+            " ".join([str(instruments.index(label["name"])), *(f"{value:.6g}" for value in row(label, size))])
+            for label in record["labels"]
+            if label["area"] > 0
+        ]
+        write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
+        _link(root / record["image"], folder / "images" / split / f"{name}.png")
+    has_validation = any(record["split"] == "val" for record in records)
+    # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
+    data = {
+        "train": "images/train",
+        "val": "images/val" if has_validation else "images/train",
+        "names": dict(enumerate(instruments)),
+        **extra,
+    }
+    write_text(folder / "data.yaml", yaml.safe_dump(data, sort_keys=False))
+
+
+def _link(source: Path, target: Path) -> None:
+    """Make `target` the same file as `source`, or a copy of it. Raises NeecoError."""
+
+    def copy(temporary: Path) -> None:
+        temporary.write_bytes(source.read_bytes())
+
+    with contextlib.suppress(FileNotFoundError):
+        if os.path.samefile(source, target):
+            return
+        target.unlink()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.link(source, target)
+    except OSError:
+        write_atomically(target, copy)

@@ -1,0 +1,281 @@
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+
+from neeco.errors import NeecoError
+from neeco.synthesis import dataset
+from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
+from neeco.synthesis.render import render, split_views, state_views
+from neeco.synthesis.samplers import make_sampler
+from neeco.synthesis.settings import Settings
+from neeco.synthesis.statefile import state_to_json
+
+COUNT = 6
+SETTINGS = Settings(count=COUNT, seed=3, tissue_tolerance_mm=2.0)
+
+
+@pytest.fixture(scope="module")
+def made(run, tmp_path_factory):
+    """A data set of six images."""
+    output = tmp_path_factory.mktemp("made") / "dataset"
+    summary = synthesize(run, output, SETTINGS)
+    assert summary.images == COUNT
+    return output
+
+
+def contents(folder) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def pixels(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.array(image)
+
+
+def states_file(path, states) -> str:
+    path.write_text("".join(json.dumps(state_to_json(state)) + "\n" for state in states))
+    return str(path)
+
+
+def test_the_folder_is_laid_out_as_promised(made):
+    assert {path.name for path in made.iterdir()} == {
+        ".records", "images", "masks", "parts", "depth", "coco", "yolo", "states.jsonl", "dataset.json", "preview.png",
+    }  # fmt: skip
+    image, mask, parts = (pixels(made / folder / "000002.png") for folder in ("images", "masks", "parts"))
+    assert image.shape == (48, 64, 3)
+    assert set(np.unique(mask)) == {0, 255}
+    assert ((parts > 0) == (mask == 255)).all()
+    assert set(np.unique(parts)) == {0, 1, 2}
+
+
+def test_depth_is_stored_in_twentieths_of_a_millimetre(made):
+    depth, mask = pixels(made / "depth" / "000001.png"), pixels(made / "masks" / "000001.png")
+    assert depth.dtype == np.uint16
+    info = json.loads((made / "dataset.json").read_text())
+    millimetres = depth * info["depth"]["mm_per_count"]
+    assert np.median(millimetres[mask == 0]) == pytest.approx(100, abs=1)
+    assert 60 < np.median(millimetres[mask > 0]) < 80
+
+
+def test_the_data_set_says_how_it_was_made(made, run):
+    info = json.loads((made / "dataset.json").read_text())
+    assert info["complete"] is True
+    assert info["images"] == COUNT
+    assert info["settings"]["seed"] == 3
+    assert info["settings"]["states"] == "inside"
+    assert info["scene"] == str(run.path)
+    assert [(entry["id"], entry["part"]) for entry in info["ids"]] == [(0, "tissue"), (1, "shaft"), (2, "jaw")]
+
+
+def test_coco_is_read_by_pycocotools_and_its_polygons_are_the_masks(made):
+    coco = COCO(str(made / "coco" / "instances.json"))
+    assert len(coco.imgs) == COUNT
+    for annotation in coco.loadAnns(coco.getAnnIds()):
+        file_name = coco.imgs[annotation["image_id"]]["file_name"]
+        mask, drawn = pixels(made / "masks" / file_name) > 0, coco.annToMask(annotation) > 0
+        assert (mask & drawn).sum() / (mask | drawn).sum() > 0.9
+        assert annotation["area"] == mask.sum()
+        x, y, width, height = annotation["bbox"]
+        assert mask[y : y + height, x : x + width].sum() == mask.sum()
+        assert len(annotation["keypoints"]) == 15
+    category = coco.cats[1]
+    assert category["name"] == "rod"
+    assert category["keypoints"] == ["shaft_far", "shaft_near", "hinge", "tip_left", "tip_right"]
+
+
+def test_coco_parts_cover_the_part_ids(made):
+    coco = COCO(str(made / "coco" / "parts.json"))
+    names = {number: category["name"] for number, category in coco.cats.items()}
+    assert set(names.values()) == {"rod/shaft", "rod/jaw"}
+    for annotation in coco.loadAnns(coco.getAnnIds()):
+        parts = pixels(made / "parts" / coco.imgs[annotation["image_id"]]["file_name"])
+        number = {"rod/shaft": 1, "rod/jaw": 2}[names[annotation["category_id"]]]
+        assert annotation["area"] == (parts == number).sum()
+        assert int(coco_mask.area(coco.annToRLE(annotation))) == pytest.approx(annotation["area"], rel=0.15)
+
+
+@pytest.mark.parametrize(("variant", "numbers"), [("", 4), ("segment", None), ("pose", 4 + 15), ("obb", 8)])
+def test_yolo_labels_lie_where_tools_look_and_stay_in_range(made, variant, numbers):
+    folder = made / "yolo" / variant
+    data = yaml.safe_load((folder / "data.yaml").read_text())
+    assert data["names"] == {0: "rod"}
+    images = [path for split in ("train", "val") for path in sorted((folder / data[split]).glob("*.png"))]
+    assert len(images) == COUNT
+    for image in images:
+        assert not image.is_symlink()
+        assert image.read_bytes() == (made / "images" / image.name).read_bytes()
+        before, _, after = str(image).rpartition("/images/")
+        label = f"{before}/labels/{after}".replace(".png", ".txt")
+        with open(label) as stream:
+            (row,) = stream.read().splitlines()
+        category, *values = row.split()
+        assert category == "0"
+        assert numbers in (None, len(values))
+        coordinates = np.array(values, dtype=float)
+        if variant == "pose":
+            assert set(coordinates[6::3]) <= {0, 1, 2}
+            coordinates = np.concatenate([coordinates[4::3], coordinates[5::3]])
+        assert (coordinates >= 0).all()
+        assert (coordinates <= 1).all()
+
+
+def test_a_yolo_box_is_the_extreme_pixels(made):
+    values = np.array((made / "yolo/labels/train/000000.txt").read_text().split()[1:], dtype=float)
+    mask = pixels(made / "masks" / "000000.png") > 0
+    columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
+    left, right = (values[0] - values[2] / 2) * 64, (values[0] + values[2] / 2) * 64
+    top, bottom = (values[1] - values[3] / 2) * 48, (values[1] + values[3] / 2) * 48
+    assert (left, right, top, bottom) == pytest.approx((columns[0], columns[-1] + 1, rows[0], rows[-1] + 1), abs=0.01)
+
+
+def test_pose_labels_swap_left_and_right_when_mirrored(made):
+    data = yaml.safe_load((made / "yolo/pose/data.yaml").read_text())
+    assert data["flip_idx"] == [0, 1, 2, 4, 3]
+    assert data["kpt_shape"] == [5, 3]
+
+
+def test_states_jsonl_draws_the_same_images_again(made, run, tmp_path):
+    again = tmp_path / "again"
+    synthesize(run, again, replace(SETTINGS, count=2, states=str(made / "states.jsonl")))
+    for k in range(2):
+        first, second = pixels(made / f"images/{k:06d}.png"), pixels(again / f"images/{k:06d}.png")
+        assert np.abs(first.astype(int) - second).max() <= 1
+
+
+def test_an_image_depends_on_seed_and_index_only(made, run, tmp_path):
+    scene = run.scene
+    labeller = make_labeller(scene, SETTINGS)
+    acceptance = make_acceptance(scene, labeller, SETTINGS)
+    sampler = make_sampler(scene, "inside", 0.2, "recorded", COUNT)
+    for index in (4, 1):  # out of order, the others never drawn
+        make_sample(scene, labeller, sampler, acceptance, SETTINGS, tmp_path, index)
+        for folder in ("images", "parts", "depth"):
+            name = f"{folder}/{index:06d}.png"
+            assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
+    make_sample(scene, labeller, sampler, acceptance, replace(SETTINGS, seed=4), tmp_path, 1)
+    assert (tmp_path / "images/000001.png").read_bytes() != (made / "images/000001.png").read_bytes()
+
+
+def test_interrupted_and_resumed_is_the_same_data_set(made, run, tmp_path, monkeypatch):
+    output = tmp_path / "dataset"
+
+    def interrupt(done):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        synthesize(run, output, SETTINGS, on_progress=interrupt)
+    info = json.loads((output / "dataset.json").read_text())
+    assert (info["complete"], info["images"]) == (False, 3)
+    (output / "images/000001.png").write_bytes(b"cut short")
+    (output / "masks/.000003.abc.png").write_bytes(b"left over from a kill")
+    summary = synthesize(run, output, SETTINGS, resume=True)
+    assert summary.made_now == COUNT - 2
+    assert contents(output) == contents(made)
+
+
+def test_a_data_set_can_grow(made, run, tmp_path):
+    output = tmp_path / "dataset"
+    synthesize(run, output, replace(SETTINGS, count=2))
+    assert synthesize(run, output, SETTINGS, resume=True).made_now == COUNT - 2
+    assert contents(output / "images") == contents(made / "images")
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(run, tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    for resume in (False, True):
+        with pytest.raises(NeecoError, match="not empty"):
+            synthesize(run, tmp_path, SETTINGS, resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("other", "field"),
+    [({"seed": 9}, "seed"), ({"states": "beyond"}, "states"), ({"labels": "threshold"}, "labels")],
+)
+def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, other, field):
+    output = tmp_path / "dataset"
+    shutil.copytree(made, output)
+    with pytest.raises(NeecoError, match=f"settings.{field}"):
+        synthesize(run, output, replace(SETTINGS, **other), resume=True)
+    with pytest.raises(NeecoError, match="--resume"):
+        synthesize(run, output, SETTINGS)
+
+
+def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
+    refusals = iter(["leaves the image", "enters the tissue", None, None])
+    monkeypatch.setattr(dataset.Acceptance, "why_refused", lambda self, scene, drawing: next(refusals))
+    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
+    assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
+    assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused
+
+
+def test_impossible_demands_end_in_one_clear_line(run, tmp_path):
+    with pytest.raises(NeecoError, match=r"image 0: no acceptable state in 3 tries \(leaves the image: 3\)"):
+        synthesize(run, tmp_path / "dataset", replace(SETTINGS, min_share=0.9, tries=3))
+
+
+def test_given_states_that_are_refused_are_skipped_and_named(run, tmp_path, state):
+    given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0), state(x=3.0)])
+    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=3, states=given, tries=2))
+    assert summary.skipped == [1]
+    assert sorted(path.name for path in (tmp_path / "dataset/images").iterdir()) == ["000000.png", "000002.png"]
+
+
+@pytest.mark.parametrize("how", [{"states": "beyond"}, {"states": "grid"}, {"views": "orbit"}, {"views": "perturbed"}])
+def test_every_sampler_makes_a_data_set(run, tmp_path, how):
+    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2, **how), formats=("coco",))
+    assert summary.images + len(summary.skipped) == 2
+    assert not (tmp_path / "dataset/yolo").exists()
+
+
+def test_threshold_labels_make_a_data_set_of_one_part(run, tmp_path):
+    synthesize(run, tmp_path / "dataset", Settings(count=1, labels="threshold", tissue_check=False))
+    info = json.loads((tmp_path / "dataset/dataset.json").read_text())
+    assert info["ids"][1:] == [{"id": 1, "instrument": "rod", "part": "instrument"}]
+    assert info["delta_thresholds"]["means"] > 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "option"), [({"count": 0}, "--count"), ({"seed": -1}, "--seed"), ({"tries": 0}, "--tries")]
+)
+def test_senseless_numbers_are_refused(run, tmp_path, wrong, option):
+    with pytest.raises(NeecoError, match=option):
+        synthesize(run, tmp_path / "dataset", replace(SETTINGS, **wrong))
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_render_writes_image_part_ids_and_mask_for_every_view(run, tmp_path, state):
+    given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0)])
+    rendered = render(run.scene, state_views(run.scene, given), tmp_path / "out")
+    assert rendered.images == 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        f"00000{k}{end}" for k in (0, 1) for end in (".png", "_parts.png", "_mask.png")
+    }
+    parts, mask = pixels(tmp_path / "out/000000_parts.png"), pixels(tmp_path / "out/000000_mask.png")
+    assert set(np.unique(parts)) == {0, 1, 2}
+    assert ((parts > 0) * 255 == mask).all()
+    assert not pixels(tmp_path / "out/000001_mask.png").any()  # outside the image: rendered all the same
+
+
+def test_render_names_views_after_files_and_splits_that_exist(scene, camera, state, tmp_path):
+    from neeco.capture.model import Capture, Frame, PointCloud
+
+    empty = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    files = ("left/000001.png", "right/000001.png", "left/000002.png")
+    frames = tuple(Frame(tmp_path / file, camera, state(), "test") for file in files)
+
+    class WithCapture:
+        def capture(self):
+            return Capture(tmp_path, frames, scene.instruments, empty)
+
+    assert [view.name for view in split_views(WithCapture(), "test")] == ["left_000001", "right_000001", "000002"]
+    with pytest.raises(NeecoError, match="'unseen' has no frames; the capture has test"):
+        split_views(WithCapture(), "unseen")

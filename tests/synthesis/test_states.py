@@ -1,0 +1,164 @@
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import Instrument
+from neeco.errors import NeecoError
+from neeco.synthesis.samplers import instrument_axes, make_sampler
+from neeco.synthesis.statefile import read_states, state_to_json
+from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, JointRange, interpolate_pose
+from neeco.synthesis.views import OrbitViews, PerturbedViews, RecordedViews
+
+
+def rng_of(index: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([0, index]))
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    pose[:3, 3] = rng.normal(size=3) * 50
+    return pose
+
+
+def is_rigid(pose: np.ndarray) -> bool:
+    rotation = pose[:3, :3]
+    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0)
+
+
+@given(st.integers(0, 10_000), st.floats(-0.5, 1.5))
+@settings(max_examples=50, deadline=None)
+def test_a_pose_between_two_is_rigid_and_reaches_both(seed, weight):
+    rng = np.random.default_rng(seed)
+    first, second = random_pose(rng), random_pose(rng)
+    assert is_rigid(interpolate_pose(first, second, weight))
+    assert np.allclose(interpolate_pose(first, second, 0.0), first)
+    assert np.allclose(interpolate_pose(first, second, 1.0), second, atol=1e-7)
+
+
+def test_inside_stays_inside_the_recorded_range_and_is_not_a_recorded_state(scene):
+    sampler = Inside(scene.recorded.states)
+    recorded = np.stack([s.instruments["rod"].pose[:3, 3].numpy() for s in scene.recorded.states])
+    drawn = [sampler(k, rng_of(k)).instruments["rod"] for k in range(60)]
+    positions = np.stack([d.pose[:3, 3].numpy() for d in drawn])
+    assert (positions >= recorded.min(0) - 1e-9).all()
+    assert (positions <= recorded.max(0) + 1e-9).all()
+    assert np.linalg.norm(positions[:, None] - recorded[None], axis=2).min() > 1e-3
+    assert all(0 <= d.joints["jaw_angle"] <= 0.8 and is_rigid(d.pose.numpy()) for d in drawn)
+    assert np.ptp([d.joints["jaw_angle"] for d in drawn]) > 0.6
+
+
+def test_beyond_leaves_the_recorded_range_by_at_most_the_margin_and_obeys_limits(scene):
+    sampler = Beyond(scene.recorded.states, (Instrument("rod", {"jaw_angle": (0.0, 0.9)}),), margin=0.5)
+    jaws = [sampler(k, rng_of(k)).instruments["rod"].joints["jaw_angle"] for k in range(200)]
+    assert min(jaws) >= 0.0  # the limit; the margin alone would allow -0.4
+    assert 0.82 < max(jaws) <= 0.9
+    free = Beyond(scene.recorded.states, (Instrument("rod", {"jaw_angle": None}),), margin=0.5)
+    jaws = [free(k, rng_of(k)).instruments["rod"].joints["jaw_angle"] for k in range(200)]
+    assert -0.4 <= min(jaws) < -0.2
+    assert 1.0 < max(jaws) <= 1.2
+
+
+def test_beyond_moves_poses_farther_from_the_mean(scene):
+    inside, beyond = Inside(scene.recorded.states), Beyond(scene.recorded.states, scene.instruments, 0.5)
+    mean = inside.means["rod"][:3, 3]
+
+    def reach(sampler):
+        poses = (sampler(k, rng_of(k)).instruments["rod"].pose[:3, 3].numpy() for k in range(100))
+        return np.mean([np.linalg.norm(p - mean) for p in poses])
+
+    assert 1.2 < reach(beyond) / reach(inside) < 1.9
+
+
+def test_a_margin_of_nothing_is_refused(scene):
+    with pytest.raises(NeecoError, match="--margin"):
+        Beyond(scene.recorded.states, scene.instruments, 0.0)
+
+
+def test_limits_narrower_than_the_recording_do_not_cut_into_it():
+    assert JointRange(0.0, 1.0).widened(0.2, (0.1, 0.9)) == JointRange(0.0, 1.0)
+
+
+def test_the_grid_holds_every_joint_value_with_every_roll_about_the_shaft(scene):
+    axes = instrument_axes(scene)
+    assert np.allclose(axes["rod"][1], [0, 1, 0])
+    sampler = Grid(scene.recorded.states, axes, joint_values=3, rolls=4)
+    states = [sampler(k, rng_of(k)).instruments["rod"] for k in range(12)]
+    assert {round(s.joints["jaw_angle"], 6) for s in states} == {0.0, 0.4, 0.8}
+    shafts = np.stack([s.pose[:3, 1].numpy() for s in states])
+    assert np.allclose(shafts, shafts[0])  # rolling keeps the shaft
+    assert len({tuple(np.round(s.pose[:3, 0].numpy(), 6)) for s in states}) == 4
+
+
+def test_a_path_passes_through_its_key_states(state):
+    keys = [state(x=0.0, jaw=0.0), state(x=10.0, jaw=0.4), state(x=10.0, y=5.0, jaw=0.8)]
+    path = AlongPath(keys, count=5)
+    drawn = [path(k, rng_of(k)).instruments["rod"] for k in range(5)]
+    assert [d.joints["jaw_angle"] for d in drawn] == pytest.approx([0, 0.2, 0.4, 0.6, 0.8])
+    assert drawn[1].pose[0, 3] == pytest.approx(5.0)
+    with pytest.raises(NeecoError, match="two"):
+        AlongPath(keys[:1], 5)
+
+
+def test_states_written_are_states_read(tmp_path, scene, state):
+    path = tmp_path / "states.jsonl"
+    first, second = state(x=3.0, jaw=0.5), state(y=2.0)
+    camera = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()  # OpenGL axes of an OpenCV camera at the world's origin
+    lines = [state_to_json(first), state_to_json(second) | {"camera": camera}]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    read = read_states(path, scene.instruments)
+    assert read[0].state.instruments["rod"].joints == {"jaw_angle": 0.5}
+    assert (read[0].state.instruments["rod"].pose == first.instruments["rod"].pose).all()
+    assert read[0].world_from_camera is None
+    assert np.allclose(read[1].world_from_camera, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda line: line["instruments"][0].update(name="hook"), r"instruments\[0\].name"),
+        (lambda line: line["instruments"][0]["pose"][0].__setitem__(0, 2.0), r"instruments\[0\].pose"),
+        (lambda line: line["instruments"][0]["pose"][0].__setitem__(3, float("nan")), r"instruments\[0\].pose"),
+        (lambda line: line["instruments"][0]["pose"].pop(), r"instruments\[0\].pose"),
+        (lambda line: line["instruments"][0]["joints"].update(jaw_angle=2.0), "joints.jaw_angle.*limits"),
+        (lambda line: line["instruments"][0]["joints"].clear(), r"instruments\[0\].joints"),
+        (lambda line: line["instruments"].clear(), "rod missing"),
+        (lambda line: line.pop("instruments"), "instruments"),
+        (lambda line: line.update(camera=[[1]]), "camera"),
+        (lambda line: line.update(time="now"), "time"),
+    ],
+)
+def test_a_bad_state_is_refused_with_its_line_and_field(tmp_path, scene, state, change, field):
+    path = tmp_path / "states.jsonl"
+    bad = state_to_json(state())
+    change(bad)
+    path.write_text(json.dumps(state_to_json(state())) + "\n" + json.dumps(bad) + "\n")
+    with pytest.raises(NeecoError, match=f"states.jsonl: line 2: .*{field}") as caught:
+        read_states(path, scene.instruments)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_sampler_is_refused_by_name(scene):
+    with pytest.raises(NeecoError, match="'insid' is neither inside, beyond"):
+        make_sampler(scene, "insid", 0.2, "recorded", 1)
+
+
+def test_an_orbit_keeps_its_centre_at_its_place_and_distance(camera):
+    centre = np.array([5.0, -3.0, 100.0])
+    views = OrbitViews(RecordedViews((camera,)), centre, degrees=30)
+    for k in range(10):
+        moved = views(rng_of(k)).world_from_camera.numpy()
+        assert is_rigid(moved)
+        assert np.allclose((np.linalg.inv(moved) @ np.append(centre, 1))[:3], centre)
+    assert not np.allclose(moved, np.eye(4), atol=1e-3)
+
+
+def test_perturbed_views_stay_near_recorded_ones(camera):
+    views = PerturbedViews(RecordedViews((camera,)), degrees=2.0, mm=1.0)
+    shifts = [np.linalg.norm(views(rng_of(k)).world_from_camera.numpy()[:3, 3]) for k in range(100)]
+    assert 0 < np.mean(shifts) < 3
+    assert views(rng_of(0)).fx == camera.fx
