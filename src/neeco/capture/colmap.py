@@ -1,17 +1,266 @@
-"""Read COLMAP sparse models, binary and text."""
+"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format")."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from neeco.capture.parsed import Parsed
-from neeco.capture.problems import Report
+import numpy as np
+import torch
+
+from neeco.capture.model import Frame, PointCloud, State
+from neeco.capture.parsed import Parsed, Place
+from neeco.capture.paths import inside
+from neeco.capture.problems import Report, shown
+from neeco.capture.transforms import TEST_EVERY, relative_name
+from neeco.errors import NeecoError
+from neeco.raster.types import Camera
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+}  # fmt: skip
+
+
+_Content = TypeVar("_Content")
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera_id: int
+    quaternion: tuple[float, ...]  # wxyz, camera_from_world
+    translation: tuple[float, ...]  # camera_from_world
 
 
 def find_model(root: Path) -> Path | None:
     """The folder of a capture that holds a COLMAP model, or None."""
+    for folder in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
     return None
 
 
 def parse_colmap(model: Path, root: Path, report: Report) -> Parsed:
-    raise NotImplementedError
+    """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit.
+
+    Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
+    """
+    parsed = Parsed(root, timed=False)
+    suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
+    binary = suffix == ".bin"
+    try:
+        cameras = _parse(model / f"cameras{suffix}", _cameras_binary if binary else _cameras_text)
+        images = _parse(model / f"images{suffix}", _images_binary if binary else _images_text)
+    except NeecoError as error:
+        report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
+        return parsed
+    _add_points(model / f"points3D{suffix}", binary, parsed, report)
+    file = relative_name(model / f"images{suffix}", root)
+    if not images:
+        report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
+    for order, image in enumerate(sorted(images, key=lambda item: item.name)):
+        place = Place(file, shown(image.name))
+        frame = _frame(image, cameras, root, order, place, report)
+        if frame is not None:
+            parsed.frames.append(frame)
+            parsed.places.append(place)
+    return parsed
+
+
+def _add_points(path: Path, binary: bool, parsed: Parsed, report: Report) -> None:
+    parsed.points_place = Place(relative_name(path, parsed.root), "")
+    try:
+        rows = _parse(path, _points_binary if binary else _points_text)
+    except NeecoError as error:
+        report.error(parsed.points_place.file, "", str(error).removeprefix(f"{path}: "))
+        return
+    positions = np.array([row[:3] for row in rows], dtype=np.float32).reshape(-1, 3)
+    colors = np.array([row[3:6] for row in rows], dtype=np.float32).reshape(-1, 3) / 255
+    if not np.isfinite(positions).all():
+        report.error(parsed.points_place.file, "", "holds points that are NaN or infinite", "remove them")
+        return
+    parsed.points = PointCloud(positions, colors.clip(0, 1))
+
+
+def _frame(
+    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: Report
+) -> Frame | None:
+    intrinsics = cameras.get(image.camera_id)
+    if intrinsics is None:
+        report.error(
+            place.file, place.field, f"uses camera {image.camera_id}, which the model lacks", "export it again"
+        )
+        return None
+    pose = _world_from_camera(image)
+    if pose is None:
+        report.error(place.file, place.field, "its pose is not a finite unit quaternion and translation", "drop it")
+        return None
+    try:
+        focal = _pinhole(intrinsics)
+        path = inside(root, root / "images", image.name)
+    except NeecoError as error:
+        report.error(place.file, place.field, *str(error).split("; ", 1))
+        return None
+    if not path.is_file():
+        report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
+        return None
+    camera = Camera(torch.from_numpy(pose).float(), *focal, intrinsics.width, intrinsics.height)
+    split = "test" if order % TEST_EVERY == 0 else "train"
+    return Frame(path, camera, State(time=float(order)), split)
+
+
+def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy. Raises NeecoError for distorted or impossible cameras."""
+    if camera.model == "SIMPLE_PINHOLE":
+        fx, cx, cy = camera.params
+        fy = fx
+    elif camera.model == "PINHOLE":
+        fx, fy, cx, cy = camera.params
+    else:
+        raise NeecoError(
+            f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
+        )
+    usable = all(np.isfinite(camera.params)) and fx > 0 and fy > 0
+    if not (usable and 0 < cx < camera.width and 0 < cy < camera.height and max(camera.width, camera.height) < 65_536):
+        raise NeecoError("its camera has impossible intrinsics; repair the cameras file")
+    return fx, fy, cx, cy
+
+
+def _world_from_camera(image: _Image) -> np.ndarray | None:
+    """[4, 4] from COLMAP's camera_from_world, None when it is no rigid transform."""
+    quaternion, translation = np.array(image.quaternion), np.array(image.translation)
+    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all() and np.abs(translation).max() < 1e9):
+        return None
+    norm = np.linalg.norm(quaternion)
+    if not 0.99 < norm < 1.01:
+        return None
+    w, x, y, z = quaternion / norm
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ translation
+    return pose
+
+
+def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
+    """`parse` applied to a file's content; damage becomes NeecoError."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise NeecoError(f"{path}: no such file; export the whole COLMAP model") from None
+    except OSError as error:
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    try:
+        return parse(content)
+    except (struct.error, ValueError, IndexError, KeyError, OverflowError):
+        raise NeecoError(f"{path}: is damaged or not a COLMAP model file; export it again") from None
+
+
+class _Stream:
+    """Little-endian values out of bytes, one after the other."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content, self.offset = content, 0
+
+    def take(self, layout: str) -> tuple:
+        values = struct.unpack_from("<" + layout, self.content, self.offset)
+        self.offset += struct.calcsize("<" + layout)
+        return values
+
+    def skip(self, count: int) -> None:
+        self.offset += count
+        if self.offset > len(self.content):
+            raise ValueError("truncated")
+
+    def name(self) -> str:
+        end = self.content.index(b"\0", self.offset)
+        text = self.content[self.offset : end].decode("utf-8")
+        self.offset = end + 1
+        return text
+
+
+def _cameras_binary(content: bytes) -> dict[int, _Intrinsics]:
+    stream = _Stream(content)
+    cameras = {}
+    for _ in range(stream.take("Q")[0]):
+        camera_id, model_id, width, height = stream.take("iiQQ")
+        model, count = _MODELS[model_id]
+        cameras[camera_id] = _Intrinsics(model, width, height, stream.take(f"{count}d"))
+    return cameras
+
+
+def _images_binary(content: bytes) -> list[_Image]:
+    stream = _Stream(content)
+    images = []
+    for _ in range(stream.take("Q")[0]):
+        _, *pose, camera_id = stream.take("i7di")
+        images.append(_Image(stream.name(), camera_id, tuple(pose[:4]), tuple(pose[4:])))
+        stream.skip(24 * stream.take("Q")[0])  # x, y, point id of each observation
+    return images
+
+
+def _points_binary(content: bytes) -> list[tuple[float, ...]]:
+    stream = _Stream(content)
+    rows: list[tuple[float, ...]] = []
+    for _ in range(stream.take("Q")[0]):
+        _, x, y, z, red, green, blue, _error, track = stream.take("Q3d3BdQ")
+        rows.append((x, y, z, red, green, blue))
+        stream.skip(8 * track)
+    return rows
+
+
+def _lines(content: bytes) -> list[str]:
+    lines = content.decode("utf-8").splitlines()
+    return [line for line in lines if not line.startswith("#")]
+
+
+def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
+    cameras = {}
+    for line in _lines(content):
+        if line.strip():
+            camera_id, model, width, height, *params = line.split()
+            expected = {name: count for name, count in _MODELS.values()}.get(model, len(params))
+            if len(params) != expected:
+                raise ValueError("parameters missing")
+            cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    return cameras
+
+
+def _images_text(content: bytes) -> list[_Image]:
+    images = []
+    # two lines an image; the second (observations) may be empty, so only every other line is read
+    lines = _lines(content)
+    while lines and not lines[0].strip():
+        lines.pop(0)
+    for line in lines[::2]:
+        if line.strip():
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            values = tuple(map(float, pose))
+            images.append(_Image(name.strip(), int(camera_id), values[:4], values[4:]))
+    return images
+
+
+def _points_text(content: bytes) -> list[tuple[float, ...]]:
+    rows = [tuple(map(float, line.split()[1:7])) for line in _lines(content) if line.strip()]
+    if any(len(row) != 6 for row in rows):
+        raise ValueError("columns missing")
+    return rows

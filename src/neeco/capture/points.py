@@ -52,7 +52,11 @@ def write_ply(path: Path, points: PointCloud) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name, _ in fields] + ["end_header", ""]
     content = "\n".join(header).encode("ascii") + vertices.tobytes()
-    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content) and None)
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+
+    write_atomically(Path(path), write)
 
 
 def random_points(center: np.ndarray, half_size: float, count: int = 20_000, seed: int = 0) -> PointCloud:

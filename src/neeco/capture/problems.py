@@ -65,6 +65,11 @@ def shown(value: Any, limit: int = 60) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
+def key_name(key: str) -> str:
+    """A JSON key as messages write it."""
+    return key if key.isidentifier() else f"[{shown(key)}]"
+
+
 @dataclass(frozen=True)
 class Node:
     """A JSON value and where it lies. Readings that fail report one error and return None."""
@@ -86,8 +91,7 @@ class Node:
 
     def child(self, key: str) -> Node:
         """The value under `key` (None when absent)."""
-        name = key if key.isidentifier() else f"[{shown(key)}]"
-        path = f"{self.field}.{name}" if self.field else name
+        path = f"{self.field}.{key_name(key)}" if self.field else key_name(key)
         value = self.value.get(key) if isinstance(self.value, dict) else None
         return Node(value, self.file, path, self.report)
 

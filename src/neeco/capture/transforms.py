@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,9 @@ def parse_frames(
         return
     splits = _Splits(document, split)
     timed = 0
+    if not isinstance(nodes.value, list):
+        nodes.error(f"expected a list, found {shown(nodes.value)}")
+        return
     for index, node in enumerate(nodes.items()):
         if not node.is_object():
             continue
@@ -115,9 +119,17 @@ def parse_frames(
         state = State(instruments, time)
         parsed.frames.append(Frame(image_path, camera, state, name, mask_path, background))
         parsed.places.append(Place(node.file, node.field))
-    parsed.timed = parsed.timed and timed == len(nodes.value if isinstance(nodes.value, list) else ())
-    if isinstance(nodes.value, list) and not nodes.value:
+    if nodes.value == []:
         nodes.error("is empty", "list the images and their cameras there")
+    elif timed < len(nodes.value):
+        parsed.timed = False
+        _time_by_order(parsed.frames)
+
+
+def _time_by_order(frames: list[Frame]) -> None:
+    """Where not every frame has a time, seconds and counts must not mix: the order stands in for all."""
+    for order, frame in enumerate(frames):
+        frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
 def parse_points(document: Node, folder: Path, parsed: Parsed) -> None:

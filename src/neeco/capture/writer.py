@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
     path = Path(path)
     if (path / "transforms.json").exists() and not overwrite:
         raise NeecoError(f"{path}: already holds a capture; choose another folder or ask to overwrite it")
-    _check_names(capture)
+    names = _names(capture)
     header: dict[str, Any] = {"schema": SCHEMA, "camera_model": "PINHOLE", "units": "mm"}
     header["instrument_frame"] = "world" if capture.registered else "unregistered"
     header["instruments"] = [
@@ -39,25 +40,30 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
         }
         for instrument in capture.instruments
     ]
-    header["frames"] = [_write_frame(frame, path) for frame in capture.frames]
+    header["frames"] = [_write_frame(frame, name, path) for frame, name in zip(capture.frames, names, strict=True)]
     if capture.points.measured:
         write_ply(path / "sparse.ply", capture.points)
         header["ply_file_path"] = "sparse.ply"
     write_json(path / "transforms.json", header)
 
 
-def _check_names(capture: Capture) -> None:
-    """Frames are named by their image's stem; two of one name would overwrite each other."""
-    seen: dict[str, Path] = {}
-    for frame in capture.frames:
-        if frame.name in seen:
-            raise NeecoError(f"{frame.image_path}: has the same name as {seen[frame.name]}; rename one of them")
-        seen[frame.name] = frame.image_path
+def _names(capture: Capture) -> list[str]:
+    """Each frame's file stem: its own, with its split and folder before it where two images share one."""
+    stems = Counter(frame.name for frame in capture.frames)
+    names = [
+        frame.name if stems[frame.name] == 1 else f"{frame.split}_{frame.image_path.parent.name}_{frame.name}"
+        for frame in capture.frames
+    ]
+    for name, count in Counter(names).items():
+        if count > 1:
+            path = capture.frames[names.index(name)].image_path
+            raise NeecoError(f"{path}: {count} frames would be written as {name!r}; rename one of their images")
+    return names
 
 
-def _write_frame(frame: Frame, path: Path) -> dict[str, Any]:
+def _write_frame(frame: Frame, name: str, path: Path) -> dict[str, Any]:
     """Copy a frame's files and return its JSON."""
-    image_name = _write_image(frame, path)
+    image_name = _write_image(frame, name, path)
     camera = frame.camera
     pose = swap_camera_axes(camera.world_from_camera.detach().cpu().to(torch.float64).numpy())
     entry: dict[str, Any] = {
@@ -73,23 +79,24 @@ def _write_frame(frame: Frame, path: Path) -> dict[str, Any]:
         "split": frame.split,
     }
     if frame.mask_path is not None:
-        entry["mask_path"] = f"masks/{frame.name}{frame.mask_path.suffix}"
+        entry["mask_path"] = f"masks/{name}{frame.mask_path.suffix}"
         _copy(frame.mask_path, path / entry["mask_path"])
     entry["instruments"] = [
-        {"name": name, "pose": state.pose.detach().cpu().double().tolist(), "joints": dict(state.joints)}
-        for name, state in frame.state.instruments.items()
+        {"name": instrument, "pose": state.pose.detach().cpu().double().tolist(), "joints": dict(state.joints)}
+        for instrument, state in frame.state.instruments.items()
     ]
     return entry
 
 
-def _write_image(frame: Frame, path: Path) -> str:
+def _write_image(frame: Frame, name: str, path: Path) -> str:
+    """Copy or flatten a frame's image; its path in the new capture."""
     if has_alpha(frame.image_path):
-        name = f"images/{frame.name}.png"
-        write_image(path / name, frame.load_image())
+        target = f"images/{name}.png"
+        write_image(path / target, frame.load_image())
     else:
-        name = f"images/{frame.name}{frame.image_path.suffix}"
-        _copy(frame.image_path, path / name)
-    return name
+        target = f"images/{name}{frame.image_path.suffix}"
+        _copy(frame.image_path, path / target)
+    return target
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -97,4 +104,8 @@ def _copy(source: Path, target: Path) -> None:
         return
     if not source.is_file():
         raise NeecoError(f"{source}: no such file")
-    write_atomically(target, lambda temporary: shutil.copyfile(source, temporary) and None)
+
+    def copy(temporary: Path) -> None:
+        shutil.copyfile(source, temporary)
+
+    write_atomically(target, copy)

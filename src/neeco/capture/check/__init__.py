@@ -1,0 +1,38 @@
+"""Find everything that is wrong with a capture, at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neeco.capture.check.frames import check_frames
+from neeco.capture.check.geometry import check_cameras, check_instruments
+from neeco.capture.check.images import check_images
+from neeco.capture.check.states import check_states
+from neeco.capture.check.summary import Summary, summarize
+from neeco.capture.problems import Problem, Report, errors_only
+from neeco.capture.reader import parse_capture
+
+__all__ = ["Problem", "Summary", "check_capture", "errors_only", "inspect_capture", "summarize"]
+
+
+def check_capture(path: Path | str, transforms: str = "transforms.json") -> list[Problem]:
+    """Everything that is wrong with a capture, errors and warnings, in the order found. Bad data never raises.
+
+    Training refuses a capture with errors; warnings tell what may be meant but often is not.
+    """
+    return inspect_capture(path, transforms)[0]
+
+
+def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> tuple[list[Problem], Summary]:
+    """What is wrong with a capture, and what it holds."""
+    report = Report()
+    parsed = parse_capture(path, report, transforms)
+    if parsed.frames:
+        check_frames(parsed, report)
+        check_images(parsed, report)
+        check_states(parsed, report)
+        check_cameras(parsed, report)
+        check_instruments(parsed, report)
+    elif not report.problems:
+        report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
+    return report.problems, summarize(parsed)

@@ -1,0 +1,73 @@
+"""neeco check: tell everything that is wrong with a capture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+from rich.console import Console
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from neeco.capture.check import Problem, Summary
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Tell everything that is wrong with a capture, at once. Exit status 1 when it cannot be trained on."""
+
+    capture: tyro.conf.Positional[Path]
+    """The capture's folder, or a transforms file in it."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the folder to check."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else."""
+
+
+def run(arguments: Arguments) -> int:
+    """Print the problems of a capture; 1 when there are errors, else 0."""
+    from neeco.capture.check import errors_only, inspect_capture
+
+    problems, summary = inspect_capture(arguments.capture, arguments.transforms)
+    errors = len(errors_only(problems))
+    if arguments.json:
+        report = {"capture": str(arguments.capture), "errors": errors, "warnings": len(problems) - errors}
+        report["problems"] = [asdict(problem) for problem in problems]
+        print(json.dumps({**report, "summary": summary.as_json()}, indent=1))
+    else:
+        _print(problems, errors, summary)
+    return 1 if errors else 0
+
+
+def _print(problems: list[Problem], errors: int, summary: Summary) -> None:
+    console = Console(soft_wrap=True, highlight=False)
+    for problem in problems:
+        style = "bold red" if problem.severity == "error" else "yellow"
+        console.print(Text.assemble((f"{problem.severity:<8}", style), str(problem)))
+    warnings = len(problems) - errors
+    if problems:
+        console.print(f"{_count(errors, 'error')}, {_count(warnings, 'warning')}")
+    else:
+        console.print(Text("no problems found", "bold green"))
+    for line in _summary_lines(summary):
+        console.print(Text(line))
+
+
+def _summary_lines(summary: Summary) -> list[str]:
+    frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
+    lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
+    for name, travel in summary.travel_mm.items():
+        joints = [
+            f"{joint.removeprefix(name + '.')} {low:.3g} .. {high:.3g}"
+            for joint, (low, high) in summary.joints.items()
+            if joint.startswith(name + ".")
+        ]
+        lines.append(f"instrument {name!r}: " + ", ".join([f"moves {travel:.1f} mm", *joints]))
+    return lines
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
