@@ -18,6 +18,7 @@ from neeco.capture.transforms import swap_camera_axes
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene
 SEEN_RARELY = 0.1  # a share of the points, or of the frames, that makes one look for a mistake
+SEEN_SURELY = 0.7  # a share that settles it
 SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
 METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
@@ -182,18 +183,20 @@ def check_instruments(parsed: Parsed, report: Report) -> None:
         if not found:
             continue
         poses = np.stack([state.pose.numpy() for _, state in found])
-        if parsed.registered:
+        if not _report_metres(instrument.name, poses, found[0][0], report) and parsed.registered:
             has = [instrument.name in frame.state.instruments for frame in parsed.frames]
             _check_placement(parsed, instrument.name, np.array(has), poses, [place for place, _ in found], report)
-        else:
-            _check_unregistered(instrument.name, poses, found[0][0], report)
 
 
-def _check_unregistered(name: str, poses: np.ndarray, place: Place, report: Report) -> None:
+def _report_metres(name: str, poses: np.ndarray, place: Place, report: Report) -> bool:
+    """Report an instrument that moves, but never a millimetre from its frame's origin; True if so."""
     origins = poses[:, :3, 3]
-    if np.ptp(origins, axis=0).max() > 0 and np.abs(origins).max() < METRES:
-        message = f"positions of {shown(name)} stay within {np.abs(origins).max():.2g} mm of its origin: metres?"
-        report.error(place.file, "frames[*].instruments", message, "give poses in mm")
+    farthest = float(np.linalg.norm(origins, axis=1).max())
+    if np.ptp(origins, axis=0).max() == 0 or farthest >= METRES:
+        return False
+    message = f"positions of {shown(name)} stay within {farthest:.2g} mm of the frame's origin: metres?"
+    report.error(place.file, "frames[*].instruments[*].pose", message, "give them in mm")
+    return True
 
 
 def _check_placement(
@@ -243,9 +246,8 @@ def _report_never_seen(name: str, cameras: _Cameras, poses: np.ndarray, places: 
     """An origin outside every image: a sensor away from the instrument's visible part, or a wrong frame."""
     field = "frames[*].instruments[*].pose"
     message = f"the origin of {shown(name)} is outside every image"
-    reach = _visible_body_point(cameras, poses)
-    if reach is not None:
-        x, y, z = reach
+    (x, y, z), share = _visible_body_point(cameras, poses)
+    if share > 0.5:
         remedy = f"right only if the sensor sits away from the tip: the point ({x:.0f}, {y:.0f}, {z:.0f}) mm is in view"
         report.warning(places[0].file, field, message, remedy)
     else:
@@ -255,8 +257,8 @@ def _report_never_seen(name: str, cameras: _Cameras, poses: np.ndarray, places: 
         report.error(places[0].file, field, message, remedy)
 
 
-def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> np.ndarray | None:
-    """A point [3] fixed to the instrument, within a sensor's reach, that most images show; None if there is none.
+def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarray, float]:
+    """The point [3] fixed to the instrument, within a sensor's reach, that most images show, and the share that do.
 
     Least squares: the body point nearest to all optical axes.
     """
@@ -266,9 +268,9 @@ def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> np.ndarray | No
     target = (across @ (centers - poses[:, :3, 3])[:, :, None]).reshape(-1)
     point = np.linalg.lstsq(rows, target, rcond=1e-6)[0]
     if np.linalg.norm(point) > SENSOR_REACH_MM:
-        return None
+        return point, 0.0
     world = np.einsum("fij,j->fi", poses[:, :3, :3], point) + poses[:, :3, 3]
-    return point if cameras.sees(world[:, None])[:, 0].mean() > 0.5 else None
+    return point, float(cameras.sees(world[:, None])[:, 0].mean())
 
 
 def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> tuple[str, str] | None:
@@ -278,9 +280,6 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
     flipped = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins * [1, -1, -1]) + cameras.poses[:, :3, 3]
     in_world = "turn the poses into the cameras' world frame"
     guesses = {
-        ("its positions are in metres", "give them in mm"): origins * 1000.0,
-        ("cameras and points are in metres, or its positions in micrometres", "give all lengths in mm"): origins
-        / 1000.0,
         ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): _inverted(poses)[
             :, :3, 3
         ],
@@ -290,9 +289,14 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
         ("poses are in the camera's frame", "multiply by world_from_camera"): in_camera,
         ("poses are in the camera's frame with OpenGL axes", "multiply by transform_matrix"): flipped,
     }
+    # shrinking puts everything at the world's origin, in view or not: a unit slip must also be far out to begin with
+    if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.poses[:, :3, 3], axis=1).max():
+        guesses["cameras and points are in metres, its positions in mm", "give all lengths in mm"] = origins / 1000.0
     shares = {name: float(cameras.sees(moved[:, None])[:, 0].mean()) for name, moved in guesses.items()}
     best = max(shares, key=lambda name: shares[name])
-    return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
+    # a sensor behind the visible part needs no mistake to be out of view; a mistake must explain more than that does
+    behind = min(_visible_body_point(cameras, poses)[1], SEEN_SURELY)
+    return best if shares[best] > max(SEEN_AGAIN, 3 * given) and shares[best] >= behind else None
 
 
 def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: Report) -> None:

@@ -1,0 +1,265 @@
+"""`check_capture` finds each kind of problem and names its place."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neeco.capture import check_capture, errors_only, read_capture
+from neeco.capture.points import write_ply
+from neeco.cli import check as check_verb
+from neeco.errors import NeecoError
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
+
+
+def problems(folder, severity="error"):
+    return [problem for problem in check_capture(folder.root) if problem.severity == severity]
+
+
+def assert_found(folder, field: str, words: str, severity: str = "error") -> None:
+    found = problems(folder, severity)
+    assert any(problem.field == field and words in problem.message for problem in found), [str(one) for one in found]
+
+
+def test_a_good_capture_has_no_errors(folder):
+    assert problems(folder) == []
+
+
+def test_the_sample_capture_is_clean_and_quickly_checked():
+    start = time.perf_counter()
+    assert check_capture(SAMPLE) == []
+    assert time.perf_counter() - start < 20
+
+
+def _frame(index, key, value):
+    return lambda document: document["frames"][index].__setitem__(key, value)
+
+
+def _pose(index, row, column, value):
+    return lambda document: document["frames"][index]["instruments"][0]["pose"][row].__setitem__(column, value)
+
+
+def _joint(index, value):
+    return lambda document: document["frames"][index]["instruments"][0]["joints"].__setitem__("jaw_angle", value)
+
+
+def _head(key, value):
+    return lambda document: document.__setitem__(key, value)
+
+
+EDITS = [
+    (_frame(2, "file_path", "images/none.png"), "frames[2].file_path", "no such file"),
+    (_frame(2, "file_path", "../../etc/passwd"), "frames[2].file_path", "leaves the capture's folder"),
+    (_frame(2, "file_path", "/etc/passwd"), "frames[2].file_path", "absolute"),
+    (_frame(2, "file_path", "C:\\x.png"), "frames[2].file_path", "absolute"),
+    (_frame(2, "file_path", "a\0b"), "frames[2].file_path", "not a usable path"),
+    (_frame(2, "file_path", None), "frames[2].file_path", "missing"),
+    (_frame(2, "file_path", 7), "frames[2].file_path", "expected text"),
+    (_frame(2, "file_path", "images/000001.png"), "frames[2].file_path", "same image as frames[1]"),
+    (_frame(2, "mask_path", "masks/none.png"), "frames[2].mask_path", "no such file"),
+    (_frame(2, "transform_matrix", [[1, 0], [0, 1]]), "frames[2].transform_matrix", "4x4"),
+    (_frame(2, "transform_matrix", None), "frames[2].transform_matrix", "missing"),
+    (_frame(2, "time", "soon"), "frames[2].time", "expected a number"),
+    (_frame(2, "instruments", {}), "frames[2].instruments", "expected a list"),
+    (_frame(2, "instruments", []), "frames[2].instruments", "missing here"),
+    (_frame(2, "fl_x", -3), "frames[2].fl_x", "positive"),
+    (_frame(2, "k1", 0.1), "frames[2].k1", "distorted"),
+    (_pose(3, 0, 3, math.nan), "frames[3].instruments[0].pose", "NaN"),
+    (_pose(3, 0, 3, math.inf), "frames[3].instruments[0].pose", "infinity"),
+    (_pose(3, 0, 3, "1"), "frames[3].instruments[0].pose", "not a number"),
+    (_pose(3, 0, 3, 1e6), "frames[3].instruments[0].pose", "far from the points"),
+    (_pose(3, 0, 0, 3.0), "frames[3].instruments[0].pose", "not rigid"),
+    (_pose(3, 2, 2, -1.0), "frames[3].instruments[0].pose", "reflection"),
+    (_pose(3, 3, 0, 5.0), "frames[3].instruments[0].pose", "last row"),
+    (_joint(5, 2.0), "frames[5].instruments[0].joints.jaw_angle", "outside its limits"),
+    (_joint(5, None), "frames[5].instruments[0].joints.jaw_angle", "expected a number"),
+    (_joint(5, math.nan), "frames[5].instruments[0].joints.jaw_angle", "not a finite number"),
+    (
+        lambda d: d["frames"][5]["instruments"][0]["joints"].clear(),
+        "frames[5].instruments[0].joints.jaw_angle",
+        "missing",
+    ),
+    (_head("cx", 900), "cx", "outside the image"),
+    (_head("fl_x", 0), "fl_x", "positive"),
+    (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "only PINHOLE"),
+    (_head("units", "m"), "units", "must be mm"),
+    (_head("instrument_frame", "moon"), "instrument_frame", "'moon'"),
+    (_head("ply_file_path", "../sparse.ply"), "ply_file_path", "leaves the capture's folder"),
+    (_head("ply_file_path", "none.ply"), "ply_file_path", "no such file"),
+    (_head("frames", []), "frames", "empty"),
+    (lambda d: d.pop("frames"), "frames", "missing"),
+    (lambda d: d["frames"].__delitem__(slice(2, None)), "frames", "too few frames"),
+    (lambda d: [frame.update(split="test") for frame in d["frames"]], "frames", "'train' is empty"),
+    (lambda d: d["frames"][1].pop("split"), "frames[1].split", "missing"),
+    (lambda d: [f["instruments"][0].update(d["frames"][0]["instruments"][0]) for f in d["frames"]], "frames", "never"),
+]
+
+
+@pytest.mark.parametrize(("edit", "field", "words"), EDITS)
+def test_a_damaged_file_is_an_error_that_names_its_field(folder, edit, field, words):
+    folder.edit(edit)
+    assert_found(folder, field, words)
+
+
+def test_joints_in_degrees_are_noticed(folder):
+    folder.edit(lambda document: document.pop("instruments"))
+    folder.edit(lambda d: [f["instruments"][0]["joints"].update(jaw_angle=9.0 * i) for i, f in enumerate(d["frames"])])
+    assert_found(folder, "frames[7].instruments[0].joints.jaw_angle", "degrees")
+
+
+def _scale(pose, factor):
+    pose = pose.copy()
+    pose[:3, 3] *= factor
+    return pose
+
+
+MISTAKES = [
+    ("poses", lambda pose: _scale(pose, 1e-3), "metres?"),
+    ("poses", np.linalg.inv, "outside every image"),
+    ("poses", lambda pose: np.diag([1.0, -1, -1, 1]) @ pose, "y and z flipped"),
+    (
+        "poses",
+        lambda pose: np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]) @ pose,
+        "outside every",
+    ),
+    ("cameras", lambda pose: pose * [1, -1, -1, 1], "camera axes are OpenCV's"),
+    ("cameras", np.linalg.inv, "world-to-camera"),
+    ("cameras", lambda pose: np.linalg.inv(pose * [1, -1, -1, 1]), "world-to-camera with OpenCV axes"),
+    ("cameras", lambda pose: _scale(pose, 1e-3), "camera positions are in metres"),
+]
+
+
+@pytest.mark.parametrize(("what", "mistake", "words"), MISTAKES)
+def test_mistakes_of_units_and_axes_are_named(folder, what, mistake, words):
+    (folder.edit_poses if what == "poses" else folder.edit_cameras)(mistake)
+    assert any(words in problem.message for problem in problems(folder)), [str(one) for one in problems(folder)]
+
+
+def test_a_whole_capture_in_metres_is_noticed(folder):
+    points = read_capture(folder.root).points
+    write_ply(folder.root / "sparse.ply", type(points)(points.positions / 1000, points.colors))
+    folder.edit_poses(lambda pose: _scale(pose, 1e-3))
+    folder.edit_cameras(lambda pose: _scale(pose, 1e-3))
+    assert any("metres" in problem.message for problem in problems(folder))
+
+
+def test_a_sensor_mounted_behind_the_tip_is_only_a_warning(folder):
+    behind = np.eye(4)
+    behind[:3, 3] = [0, 150.0, 0]
+    folder.edit_poses(lambda pose: pose @ behind)
+    assert problems(folder) == []
+    assert_found(folder, "frames[*].instruments[*].pose", "outside every image", "warning")
+
+
+def test_a_sensor_mounted_tilted_is_fine(folder):
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    folder.edit_poses(lambda pose: pose @ tilt)
+    assert problems(folder) == []
+
+
+def test_a_camera_far_from_the_points_is_an_error(folder):
+    folder.edit(lambda d: d["frames"][6]["transform_matrix"][0].__setitem__(3, 1e5))
+    assert_found(folder, "frames[6].transform_matrix", "far from the points")
+
+
+def test_a_tracker_dropout_is_a_warning(folder):
+    folder.edit(lambda d: [d["frames"][6]["instruments"][0]["pose"][row].__setitem__(3, 200.0) for row in range(3)])
+    assert_found(folder, "frames[6].instruments[0].pose", "where it usually is", "warning")
+
+
+def test_unregistered_instruments_are_a_warning_and_not_located(folder):
+    folder.edit_poses(lambda pose: _scale(pose, 20))
+    folder.edit(_head("instrument_frame", "unregistered"))
+    assert problems(folder) == []
+    assert_found(folder, "instrument_frame", "unregistered", "warning")
+
+
+def test_damaged_images_are_errors(folder):
+    images = folder.root / "images"
+    (images / "000001.png").write_bytes(b"")
+    (images / "000002.png").write_bytes((images / "000002.png").read_bytes()[:900])
+    Image.new("RGB", (16, 12)).save(images / "000003.png")
+    assert_found(folder, "frames[1].file_path", "not an image file")
+    assert_found(folder, "frames[2].file_path", "cannot be decoded")
+    assert_found(folder, "frames[3].file_path", "image is 16x12, its camera says 32x24")
+
+
+def test_the_same_picture_under_two_names_is_an_error(folder):
+    shutil.copy(folder.root / "images/000001.png", folder.root / "images/000005.png")
+    assert_found(folder, "frames[5].file_path", "same pixels as frames[1]")
+
+
+def test_a_mask_that_ignores_everything_is_an_error_and_missing_ones_a_warning(folder):
+    Image.new("L", (32, 24), 1).save(folder.root / "mask.png")
+    folder.edit(_frame(2, "mask_path", "mask.png"))
+    assert_found(folder, "frames[2].mask_path", "ignores every pixel")
+    assert_found(folder, "frames[0].mask_path", "no mask", "warning")
+
+
+def test_a_link_out_of_the_folder_is_an_error(folder, tmp_path):
+    (folder.root / "images/000001.png").rename(tmp_path / "outside.png")
+    (folder.root / "images/000001.png").symlink_to(tmp_path / "outside.png")
+    assert_found(folder, "frames[1].file_path", "leaves the capture's folder")
+
+
+@pytest.mark.parametrize("time_", [None, -1.0])
+def test_missing_or_backward_time_is_only_a_warning(folder, time_):
+    folder.edit(_frame(3, "time", time_))
+    assert problems(folder) == []
+    assert any("time" in problem.message for problem in problems(folder, "warning"))
+
+
+def test_bad_points_are_errors_and_few_a_warning(folder):
+    points = read_capture(folder.root).points
+    broken = points.positions.copy()
+    broken[3] = np.nan
+    write_ply(folder.root / "sparse.ply", type(points)(broken, points.colors))
+    assert_found(type(folder)(folder.root), "vertex", "NaN")
+    write_ply(folder.root / "sparse.ply", type(points)(points.positions[:9], points.colors[:9]))
+    assert_found(folder, "vertex", "few sparse points", "warning")
+    write_ply(folder.root / "sparse.ply", type(points)(points.positions[:0], points.colors[:0]))
+    assert_found(folder, "vertex", "no points")
+
+
+def test_all_problems_are_told_at_once_and_reading_raises_the_first(folder):
+    folder.edit(_frame(1, "file_path", "none.png"))
+    folder.edit(_joint(5, None))
+    assert len(errors_only(check_capture(folder.root))) >= 2
+    with pytest.raises(NeecoError, match=r"frames\[1\].file_path: no such file.*neeco check"):
+        read_capture(folder.root)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", "null", "[" * 100_000, '{"frames": 3}', '{"frames": [1' + "0" * 9999 + "]}"]
+)
+def test_a_file_that_is_no_capture_is_one_error(folder, text):
+    (folder.root / "transforms.json").write_text(text)
+    assert errors_only(check_capture(folder.root))
+    with pytest.raises(NeecoError):
+        read_capture(folder.root)
+
+
+def test_no_folder_and_empty_folder_are_errors(tmp_path):
+    assert "no such folder" in check_capture(tmp_path / "none")[0].message
+    assert "no such file" in check_capture(tmp_path)[0].message
+
+
+def test_the_verb_prints_and_returns_a_status(folder, capsys):
+    assert check_verb.run(check_verb.Arguments(SAMPLE)) == 0
+    assert "no problems found" in capsys.readouterr().out
+    folder.edit(_joint(5, 2.0))
+    assert check_verb.run(check_verb.Arguments(folder.root, json=True)) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["errors"] == 1
+    errors = [problem for problem in report["problems"] if problem["severity"] == "error"]
+    assert errors[0]["field"] == "frames[5].instruments[0].joints.jaw_angle"
+    assert report["summary"]["splits"] == {"train": 7, "test": 1}

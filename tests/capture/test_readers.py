@@ -1,0 +1,228 @@
+"""What is written reads back; foreign formats arrive as the same capture."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from neeco.capture import check_capture, errors_only, read_capture, write_capture
+from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
+from neeco.capture.points import read_ply
+from neeco.capture.truth import load_truth_mask
+from neeco.errors import NeecoError
+
+ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")
+ASCII_HEADER += b"end_header\n"
+SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
+
+
+def assert_same(one, two):
+    assert one.instruments == two.instruments
+    assert one.registered == two.registered
+    assert torch.equal(torch.from_numpy(one.points.positions), torch.from_numpy(two.points.positions))
+    assert np.array_equal(one.points.colors, two.points.colors)
+    assert [frame.name for frame in one.frames] == [frame.name for frame in two.frames]
+    for mine, other in zip(one.frames, two.frames, strict=True):
+        assert (mine.split, mine.state.time) == (other.split, other.state.time)
+        assert torch.equal(mine.camera.world_from_camera, other.camera.world_from_camera)
+        assert [getattr(mine.camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")] == [
+            getattr(other.camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")
+        ]
+        for name, state in mine.state.instruments.items():
+            assert torch.equal(state.pose, other.state.instruments[name].pose)
+            assert dict(state.joints) == dict(other.state.instruments[name].joints)
+
+
+def test_a_written_capture_reads_back_exactly(folder, tmp_path):
+    Image.new("L", (32, 24), 255).save(folder.root / "keep.png")
+    folder.edit(lambda d: d["frames"][2].update(mask_path="keep.png"))
+    capture = read_capture(folder.root)
+    write_capture(capture, tmp_path / "copy")
+    copy = read_capture(tmp_path / "copy")
+    assert_same(capture, copy)
+    assert torch.equal(capture.frames[3].load_image(), copy.frames[3].load_image())
+    assert copy.frames[2].load_mask().all()
+    assert not errors_only(check_capture(tmp_path / "copy"))
+    with pytest.raises(NeecoError, match="already holds a capture"):
+        write_capture(capture, tmp_path / "copy")
+
+
+def test_the_sample_round_trips_and_has_truth(tmp_path):
+    capture = read_capture(SAMPLE)
+    write_capture(capture, tmp_path / "copy")
+    assert_same(capture, read_capture(tmp_path / "copy"))
+    labels = load_truth_mask(capture, capture.frames[0])
+    assert labels.shape == (192, 240)
+    assert set(labels.unique().tolist()) <= {0, 1, 2, 3, 4}
+    assert load_truth_mask(read_capture(tmp_path / "copy"), capture.frames[0]) is None
+
+
+def test_exact_poses_of_the_truth_folder_are_read_as_another_transforms_file():
+    truth = read_capture(SAMPLE, transforms="truth/transforms.json")
+    assert truth.root == SAMPLE
+    assert truth.frames[0].load_image().shape == (192, 240, 3)
+
+
+def test_cameras_have_opencv_axes(folder):
+    camera = read_capture(folder.root).frames[0].camera
+    ahead = torch.tensor([30.0, -20.0, 50.0]) - camera.world_from_camera[:3, 3]
+    assert torch.allclose(camera.world_from_camera[:3, :3].T @ ahead, torch.tensor([0.0, 0.0, 100.0]), atol=1e-3)
+    assert camera.world_from_camera[1, 1] < 0  # y points down; up is +y in this world
+
+
+def test_splits_come_from_lists_or_every_eighth(folder):
+    folder.edit(lambda d: [frame.pop("split") for frame in d["frames"]])
+    assert [frame.split for frame in read_capture(folder.root).frames] == ["test"] + ["train"] * 7
+    names = [frame["file_path"] for frame in folder.document["frames"]]
+    folder.edit(lambda d: d.update(train_filenames=names[:5], test_filenames=names[5:]))
+    assert [frame.split for frame in read_capture(folder.root).frames] == ["train"] * 5 + ["test"] * 3
+
+
+def test_instruments_are_derived_from_frames_when_not_declared(folder):
+    folder.edit(lambda document: document.pop("instruments"))
+    (instrument,) = read_capture(folder.root).instruments
+    assert instrument.name == "grasper"
+    assert dict(instrument.joints) == {"jaw_angle": None}
+
+
+def test_a_capture_without_points_starts_from_random_ones_where_cameras_look(folder):
+    folder.edit(lambda document: document.pop("ply_file_path"))
+    points = read_capture(folder.root).points
+    assert not points.measured
+    assert np.abs(points.positions.mean(axis=0) - [30, -20, 50]).max() < 1
+    assert np.array_equal(points.positions, read_capture(folder.root).points.positions)
+
+
+def test_blender_captures_are_composited_and_split_by_file(folder, tmp_path):
+    root = tmp_path / "blender"
+    (root / "pics").mkdir(parents=True)
+    frames = folder.document["frames"]
+    for index, frame in enumerate(frames):
+        Image.new("RGBA", (32, 24), (255, 0, 0, 127 if index else 0)).save(root / f"pics/r_{index}.png")
+        frames[index] = {
+            "file_path": f"./pics/r_{index}",
+            "time": index / 8,
+            "transform_matrix": frame["transform_matrix"],
+        }
+    for split, part in {"train": frames[:6], "val": frames[6:7], "test": frames[7:]}.items():
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": part}))
+    capture = read_capture(root)
+    assert [len(capture.split(name)) for name in ("train", "val", "test")] == [6, 1, 1]
+    assert capture.frames[0].camera.fx == pytest.approx(16 / np.tan(0.35))
+    assert capture.frames[0].load_image().min() == 1.0
+    assert read_capture(root, background=0.0).frames[0].load_image().max() == 0.0
+    assert np.abs(capture.points.positions).max() <= 1.5
+    assert capture.frames[6].state.time == 0.75
+    write_capture(capture, tmp_path / "copy")
+    assert torch.allclose(
+        read_capture(tmp_path / "copy").frames[1].load_image(), capture.frames[1].load_image(), atol=2e-3
+    )
+
+
+def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE") -> None:
+    capture = read_capture(folder.root)
+    (folder.root / "images").rename(root / "images")
+    sparse = root / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    poses = []
+    for frame in capture.frames:
+        inverse = np.linalg.inv(frame.camera.world_from_camera.double().numpy())
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        poses.append((w, x, y, z, *inverse[:3, 3]))
+    points = capture.points
+    if binary:
+        ids = {"PINHOLE": 1, "OPENCV": 4}
+        params = (40.0, 41.0, 16.5, 12.0, *[0.0] * (4 if model == "OPENCV" else 0))
+        cameras = struct.pack("<QiiQQ", 1, 1, ids[model], 32, 24) + struct.pack(f"<{len(params)}d", *params)
+        images = struct.pack("<Q", len(poses))
+        for index, pose in enumerate(poses):
+            images += struct.pack("<i7di", index, *pose, 1) + f"{index:06d}.png".encode() + b"\0"
+            images += struct.pack("<Qddq", 1, 3.0, 4.0, -1)
+        cloud = struct.pack("<Q", len(points.positions))
+        for xyz in points.positions:
+            cloud += struct.pack("<Q3d3BdQii", 1, *xyz, 200, 100, 50, 0.5, 1, 0, 0)
+        contents = {"cameras.bin": cameras, "images.bin": images, "points3D.bin": cloud}
+    else:
+        rows = [f"{i} {' '.join(map(repr, map(float, pose)))} 1 {i:06d}.png\n" for i, pose in enumerate(poses)]
+        cloud_rows = [
+            f"1 {x!r} {y!r} {z!r} 200 100 50 0.5 0 0\n" for x, y, z in points.positions.astype(float).tolist()
+        ]
+        distortion = " 0 0 0 0" if model == "OPENCV" else ""
+        contents = {
+            "cameras.txt": f"# cameras\n1 {model} 32 24 40 41 16.5 12{distortion}\n".encode(),
+            "images.txt": ("# images\n" + "\n".join(rows) + "\n").encode(),
+            "points3D.txt": "".join(cloud_rows).encode(),
+        }
+    for name, content in contents.items():
+        (sparse / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_colmap_models_are_read(folder, tmp_path, binary):
+    expected = read_capture(folder.root)
+    write_colmap(folder, tmp_path, binary)
+    capture = read_capture(tmp_path)
+    assert [frame.split for frame in capture.frames] == ["test"] + ["train"] * 7
+    assert np.allclose(capture.points.positions, expected.points.positions)
+    assert np.allclose(capture.points.colors, expected.points.colors)
+    for mine, other in zip(capture.frames, expected.frames, strict=True):
+        assert torch.allclose(mine.camera.world_from_camera, other.camera.world_from_camera, atol=1e-4)
+        assert (mine.camera.fx, mine.camera.fy, mine.camera.cx) == (40.0, 41.0, 16.5)
+    assert not errors_only(check_capture(tmp_path))
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_distorted_or_damaged_colmap_models_are_refused(folder, tmp_path, binary):
+    write_colmap(folder, tmp_path, binary, "OPENCV")
+    with pytest.raises(NeecoError, match="OPENCV; run `colmap image_undistorter`"):
+        read_capture(tmp_path)
+    for path in (tmp_path / "sparse/0").iterdir():
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 3])
+    with pytest.raises(NeecoError):
+        read_capture(tmp_path)
+    assert errors_only(check_capture(tmp_path))
+
+
+def test_images_of_every_depth_become_rgb(tmp_path):
+    Image.fromarray(np.full((2, 3), 65535, dtype=np.uint16)).save(tmp_path / "deep.png")
+    Image.new("L", (3, 2), 51).save(tmp_path / "grey.png")
+    Image.new("1", (3, 2), 1).save(tmp_path / "bit.png")
+    assert read_image(tmp_path / "deep.png").eq(1).all()
+    assert torch.allclose(read_image(tmp_path / "grey.png"), torch.full((2, 3, 3), 0.2))
+    assert read_mask(tmp_path / "bit.png", (3, 2)).all()
+    with pytest.raises(NeecoError, match="image is 3x2"):
+        read_image(tmp_path / "grey.png", (4, 2))
+
+
+def test_written_images_and_labels_read_back(tmp_path):
+    image = torch.rand(5, 7, 3, generator=torch.Generator().manual_seed(1))
+    write_image(tmp_path / "a.png", image)
+    assert (read_image(tmp_path / "a.png", (7, 5)) - image).abs().max() <= 0.5 / 255 + 1e-6
+    labels = torch.arange(35, dtype=torch.uint8).reshape(5, 7)
+    write_labels(tmp_path / "b.png", labels)
+    assert torch.equal(read_labels(tmp_path / "b.png"), labels)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"ply\n",
+        ASCII_HEADER + b"1 2",
+        ASCII_HEADER + b"1 2 a",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1",
+    ],
+)
+def test_damaged_point_clouds_are_refused(tmp_path, content):
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(NeecoError, match=r"bad\.ply"):
+        read_ply(tmp_path / "bad.ply")
