@@ -183,3 +183,10 @@ def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camer
     assert 2.5 < tolerance < 4.5
     drawing, _ = labelled(scene, dipping[0], camera)
     assert Acceptance(0.005, tolerance).why_refused(scene, drawing) is None
+
+
+def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camera):
+    labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
+    drawing, label = labelled(scene, state(), camera, labeller)
+    assert not drawing.parts.any()
+    assert label.shape is None

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from neeco.capture.model import State
+from neeco.raster.types import Camera
 from neeco.synthesis.annotation import project
 from neeco.synthesis.drawing import Drawing, Labeller, draw
 
@@ -35,13 +37,13 @@ class Acceptance:
 
     def why_refused(self, scene: Scene, drawing: Drawing) -> str | None:
         """The reason, or None when the drawing is worth keeping."""
-        keypoints = _working_ends(scene, drawing)
+        keypoints = working_ends(scene, drawing.state)
         # first: an instrument wholly behind the tissue shows no pixels either
         if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
             return ENTERS_TISSUE
         if np.count_nonzero(drawing.parts) < self.min_share * drawing.parts.size:
             return LEAVES_IMAGE
-        if keypoints and not any(_in_image(point, drawing) for points in keypoints.values() for point in points):
+        if keypoints and not any(in_image(point, drawing.camera) for points in keypoints.values() for point in points):
             return LEAVES_IMAGE
         return None
 
@@ -53,7 +55,7 @@ def buried_depth(scene: Scene, drawing: Drawing) -> float:
     keypoints of its working end all are.
     """
     deepest = 0.0
-    keypoints = _working_ends(scene, drawing)
+    keypoints = working_ends(scene, drawing.state)
     surface = drawing.tissue_depth
     for name, alone in drawing.alone.items():
         pixels = alone.mask & (alone.depth > 0)
@@ -61,7 +63,7 @@ def buried_depth(scene: Scene, drawing: Drawing) -> float:
         if len(below):
             deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
         for point in keypoints.get(name, []):
-            if _in_image(point, drawing):
+            if in_image(point, drawing.camera):
                 x, y, z = project(point, drawing.camera)
                 under = float(surface[int(y), int(x)])
                 deepest = max(deepest, z - under if under > 0 else 0.0)
@@ -83,15 +85,24 @@ def find_tolerance(scene: Scene, labeller: Labeller) -> float:
 
 
 @torch.no_grad()
-def _working_ends(scene: Scene, drawing: Drawing) -> dict[str, list[np.ndarray]]:
-    known = scene.keypoints(drawing.state)
+def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
+    """Hinge and jaw tips [3] mm of every instrument for which the scene knows any."""
     ends = {
         instrument: [points[name].detach().cpu().double().numpy() for name in WORKING_END if name in points]
-        for instrument, points in known.items()
+        for instrument, points in scene.keypoints(state).items()
     }
     return {instrument: points for instrument, points in ends.items() if points}
 
 
-def _in_image(point: np.ndarray, drawing: Drawing) -> bool:
-    x, y, z = project(point, drawing.camera)
-    return z > drawing.camera.near and 0 <= x < drawing.camera.width and 0 <= y < drawing.camera.height
+def shows_working_end(scene: Scene, state: State, camera: Camera) -> bool:
+    """Whether any hinge or tip projects into the image; where none is known, any instrument's origin."""
+    ends = [point for points in working_ends(scene, state).values() for point in points]
+    if not ends:
+        ends = [instrument.pose[:3, 3].numpy() for instrument in scene.registered(state).instruments.values()]
+    return any(in_image(point, camera) for point in ends)
+
+
+def in_image(point: np.ndarray, camera: Camera) -> bool:
+    """Whether a world point [3] mm projects into the image."""
+    x, y, z = project(point, camera)
+    return z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height

@@ -137,7 +137,7 @@ def make_sample(
     reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
     raise NeecoError(
         f"{output}: image {index}: no acceptable state in {settings.tries} tries ({reasons}); "
-        "use --states inside, a smaller --margin, --no-tissue-check or more --tries"
+        "use --states inside, a smaller --margin, --no-tissue-check or --resume with more --tries"
     )
 
 

@@ -15,6 +15,7 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
+from neeco.synthesis.acceptance import shows_working_end
 from neeco.synthesis.drawing import surface_depth
 from neeco.synthesis.settings import PATH_PREFIX, Views
 from neeco.synthesis.statefile import read_states
@@ -31,6 +32,7 @@ from neeco.synthesis.views import (
 if TYPE_CHECKING:
     from neeco.scene import Scene
 
+AIMS = 50  # views tried before the drawn image decides
 SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
 
 
@@ -38,6 +40,7 @@ SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
 class Sampler:
     """Draws (state, camera) of image `index`."""
 
+    scene: Scene
     states: StateSampler
     views: ViewSampler
     cameras: tuple[Camera | None, ...] = (None,)  # given with the states, in turn; None: the view sampler decides
@@ -48,10 +51,21 @@ class Sampler:
         return self.states.prescribed
 
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
-        """The next (state, camera) for image `index`."""
+        """The next (state, camera) for image `index`.
+
+        Of a moving camera's views most do not show the instrument, and drawing is dear: views are drawn until one has
+        the instrument in the image, if one does.
+        """
         state = self.states(index, rng)
-        camera = self.cameras[index % len(self.cameras)]
-        return state, self.views(rng) if camera is None else camera
+        given = self.cameras[index % len(self.cameras)]
+        if given is not None:
+            return state, given
+        camera = self.views(rng)
+        for _ in range(AIMS):
+            if shows_working_end(self.scene, state, camera):
+                break
+            camera = self.views(rng)
+        return state, camera
 
 
 def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: int) -> Sampler:
@@ -59,19 +73,19 @@ def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: 
     recorded = RecordedViews(scene.recorded.cameras)
     view_sampler = _view_sampler(scene, views, recorded)
     if states == "inside":
-        return Sampler(Inside(scene.recorded.states), view_sampler)
+        return Sampler(scene, Inside(scene.recorded.states), view_sampler)
     if states == "beyond":
-        return Sampler(Beyond(scene.recorded.states, scene.instruments, margin), view_sampler)
+        return Sampler(scene, Beyond(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
-        return Sampler(Grid(scene.recorded.states, instrument_axes(scene)), view_sampler)
+        return Sampler(scene, Grid(scene.recorded.states, instrument_axes(scene)), view_sampler)
     lines = read_states(states_file(states), scene.instruments)
     if states.startswith(PATH_PREFIX):
-        return Sampler(AlongPath([line.state for line in lines], count), view_sampler)
+        return Sampler(scene, AlongPath([line.state for line in lines], count), view_sampler)
     intrinsics = recorded.cameras[0]
     cameras = tuple(
         None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
     )
-    return Sampler(Listed([line.state for line in lines]), view_sampler, cameras)
+    return Sampler(scene, Listed([line.state for line in lines]), view_sampler, cameras)
 
 
 def states_file(states: str) -> Path:

@@ -29,7 +29,7 @@ class Settings:
     tissue_check: bool = True  # refuse states that enter the tissue
     tissue_tolerance_mm: float | None = None  # None: found from the recorded states
     min_share: float = 0.005  # of the image's pixels that the instruments must cover
-    tries: int = 20
+    tries: int = 50
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
@@ -49,6 +49,7 @@ class Settings:
     def identity(self) -> dict[str, Any]:
         """What must stay the same for a data set to be continued: all but the count, unless a path spreads over it."""
         values = asdict(self)
+        del values["tries"]  # more of them change no image that was made
         if not self.states.startswith(PATH_PREFIX):
             del values["count"]
         if self.delta_thresholds is not None:

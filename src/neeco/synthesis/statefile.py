@@ -98,9 +98,9 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
 
 def _joints(entry: dict[str, Any], instrument: Instrument, at: str) -> dict[str, float]:
     given = entry.get("joints", {})
-    if not isinstance(given, dict) or set(given) != set(instrument.joints):
-        expected = ", ".join(instrument.joints) or "none"
-        raise NeecoError(f"{at}.joints: expected exactly these joints, in rad: {expected}")
+    # joints that the scene does not have are let pass: training drops those that say nothing about the instrument
+    if not isinstance(given, dict) or not set(instrument.joints) <= set(given):
+        raise NeecoError(f"{at}.joints: expected these joints, in rad: {', '.join(instrument.joints) or 'none'}")
     joints = {}
     for name, limits in instrument.joints.items():
         joints[name] = _number(given[name], f"{at}.joints.{name}")

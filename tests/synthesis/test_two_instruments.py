@@ -1,0 +1,92 @@
+"""Two instruments, one before the other: who hides whom must show in the labels."""
+
+import numpy as np
+import pytest
+import torch
+
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.scene import CanonicalGaussians, Recording, Scene
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
+from neeco.synthesis.annotation import annotate
+from neeco.synthesis.drawing import CompositedLabels, ThresholdLabels, draw
+from neeco.synthesis.states import Inside
+
+WALL, BAR = 300, 40
+
+
+class TwoBars(Deformation):
+    """Rigid bars `upright` and `level`, each in its own frame."""
+
+    label_names = (("upright", "instrument"), ("level", "instrument"))
+
+    def pose(self, canonical, state, perturbation=UNPERTURBED):
+        means = canonical.means.clone()
+        for k, name in enumerate(("upright", "level")):
+            rows = canonical.body(k + 1)
+            means[rows] = means[rows] + state.instruments[name].pose[:3, 3].float()
+        return Posed(means, canonical.quats, canonical.log_scales.exp())
+
+    def label_channels(self, canonical):
+        return torch.nn.functional.one_hot(canonical.bodies, 3)[:, 1:].float()
+
+
+def at(upright_z: float, level_z: float) -> State:
+    poses = {}
+    for name, z in (("upright", upright_z), ("level", level_z)):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[2, 3] = z
+        poses[name] = InstrumentState(pose)
+    return State(poses)
+
+
+@pytest.fixture(scope="module")
+def bars(request) -> Scene:
+    wall = [(x, y, 100.0) for x in np.linspace(-70, 70, 20) for y in np.linspace(-50, 50, 15)]
+    upright = [(0.0, y, 0.0) for y in np.linspace(-15, 15, BAR)]
+    level = [(x, 0.0, 0.0) for x in np.linspace(-15, 15, BAR)]
+    means = torch.tensor([*wall, *upright, *level], dtype=torch.float32)
+    size = torch.tensor([4.5] * WALL + [2.0] * 2 * BAR)
+    canonical = CanonicalGaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(len(means), 1),
+        log_scales=size.log()[:, None].repeat(1, 3),
+        opacity_logits=torch.full((len(means),), 4.0),
+        sh_dc=torch.ones(len(means), 1, 3),
+        sh_rest=torch.zeros(len(means), 15, 3),
+        counts=(WALL, BAR, BAR),
+    )
+    states = (at(60, 70), at(70, 60))
+    recorded = Recording(("0", "1"), ("train",) * 2, states, ())
+    instruments = (Instrument("upright"), Instrument("level"))
+    return Scene("bars", canonical, TwoBars(), instruments, recorded, torch.zeros(3))
+
+
+@pytest.mark.parametrize(("front", "state"), [("upright", at(60, 70)), ("level", at(70, 60))])
+def test_the_instrument_in_front_hides_the_other(bars, camera, front, state):
+    labeller = CompositedLabels(bars)
+    drawing = draw(bars, labeller, state, camera, 0.01)
+    labels = {label.name: label for label in annotate(bars, drawing, labeller.names)}
+    assert drawing.parts[24, 32] == {"upright": 1, "level": 2}[front]
+    back = "level" if front == "upright" else "upright"
+    assert labels[front].visibility > 0.97
+    assert 0.6 < labels[back].visibility < 0.95
+    assert len(labels[back].shape.polygons) == 2  # cut in two by the one in front
+    assert labels[back].shape.area < drawing.alone[back].mask.sum()
+
+
+def test_threshold_labels_tell_instruments_apart_by_nearness(bars, camera):
+    state = at(50, 80)
+    labeller = ThresholdLabels(bars)
+    owners = labeller.owners(state, bars.at(state))
+    assert (owners[:WALL] == -1).all()
+    assert (owners[WALL : WALL + BAR] == 0).all()
+    assert (owners[WALL + BAR :] == 1).all()
+    assert draw(bars, labeller, state, camera, 0.01).parts[24, 32] == 1
+
+
+def test_bodies_sampled_together_are_moved_together(bars):
+    sampler = Inside([at(60, 70), at(60, 70), at(61, 71)])
+    for index in range(10):
+        state = sampler(index, np.random.default_rng(index))
+        gap = state.instruments["level"].pose[2, 3] - state.instruments["upright"].pose[2, 3]
+        assert float(gap) == pytest.approx(10, abs=0.1)
