@@ -9,7 +9,7 @@ import tyro
 
 
 @dataclass(frozen=True)
-class Render:
+class Arguments:
     """Draw frames of a capture, or states from a file, with part ids and masks."""
 
     run: tyro.conf.Positional[Path]
@@ -24,17 +24,17 @@ class Render:
     """Draw these states (JSON lines) instead of a split."""
 
 
-def run(args: Render) -> int:
+def run(arguments: Arguments) -> int:
     """Draw, and say where it lies."""
     from neeco.synthesis.progress import counting
     from neeco.synthesis.render import STATES_FOLDER, render, split_views, state_views
     from neeco.training.run import load_run
 
-    trained = load_run(args.run)
-    if args.states is not None:
-        views, folder = state_views(trained.scene, args.states), args.output / STATES_FOLDER
+    trained = load_run(arguments.run)
+    if arguments.states is not None:
+        views, folder = state_views(trained.scene, arguments.states), arguments.output / STATES_FOLDER
     else:
-        views, folder = split_views(trained, args.split, args.capture), args.output / args.split
+        views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
     with counting("render", len(views)) as advance:
         rendered = render(trained.scene, views, folder, advance)
     print(f"{rendered.images} images in {rendered.folder}")

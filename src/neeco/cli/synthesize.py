@@ -11,7 +11,7 @@ from neeco.synthesis.settings import Format, LabelWay, Settings, Views
 
 
 @dataclass(frozen=True)
-class Synthesize:
+class Arguments:
     """Draw a labelled data set of states that nobody recorded."""
 
     run: tyro.conf.Positional[Path]
@@ -50,17 +50,17 @@ class Synthesize:
     """How often to draw a state anew when it is refused."""
 
 
-def run(args: Synthesize) -> int:
+def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
     from neeco.synthesis.dataset import synthesize
     from neeco.synthesis.progress import counting
     from neeco.training.run import load_run
 
-    settings = Settings(**{name: getattr(args, name) for name in Settings.__dataclass_fields__})
+    settings = Settings(**{name: getattr(arguments, name) for name in Settings.__dataclass_fields__})
     settings.check()
-    trained = load_run(args.run)
-    with counting("synthesize", args.count) as advance:
-        summary = synthesize(trained, args.output, settings, args.formats, args.resume, advance)
+    trained = load_run(arguments.run)
+    with counting("synthesize", arguments.count) as advance:
+        summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
     print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
     for reason, times in summary.refused.items():
         print(f"refused {times} states: instrument {reason}")
