@@ -1,0 +1,185 @@
+// Plain data that passes between the stages of the rasteriser: inputs, outputs, gradients, and what one drawn frame keeps.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <new>
+#include <utility>
+#include <vector>
+
+namespace neeco {
+
+// Memory that is reused from frame to frame, not initialised, aligned for the widest vectors.
+template <class T>
+class Buffer {
+public:
+    Buffer() = default;
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+    Buffer(Buffer&& other) noexcept : data_(other.data_), capacity_(other.capacity_) {
+        other.data_ = nullptr;
+        other.capacity_ = 0;
+    }
+    Buffer& operator=(Buffer&& other) noexcept {
+        std::swap(data_, other.data_);
+        std::swap(capacity_, other.capacity_);
+        return *this;
+    }
+    ~Buffer() { std::free(data_); }
+
+    // Room for at least n elements; contents are lost when it has to grow.
+    T* reserve(size_t n) {
+        if (n > capacity_) {
+            std::free(data_);
+            data_ = allocate(n + n / 4 + 64);
+        }
+        return data_;
+    }
+
+    // The same, contents kept.
+    T* grow(size_t n) {
+        if (n > capacity_) {
+            const size_t kept = capacity_;
+            T* old = data_;
+            data_ = allocate(2 * n + 64);
+            for (size_t i = 0; i < kept; i++) data_[i] = old[i];
+            std::free(old);
+        }
+        return data_;
+    }
+
+    T* data() const { return data_; }
+    size_t capacity() const { return capacity_; }
+
+private:
+    T* allocate(size_t n) {
+        const size_t bytes = (n * sizeof(T) + 63) / 64 * 64;
+        void* memory = nullptr;
+        if (posix_memalign(&memory, 64, bytes) != 0) {
+            data_ = nullptr;
+            capacity_ = 0;
+            throw std::bad_alloc();
+        }
+        capacity_ = n;
+        return static_cast<T*>(memory);
+    }
+
+    T* data_ = nullptr;
+    size_t capacity_ = 0;
+};
+
+struct Camera {
+    float rotation[9];        // camera_from_world, row major
+    float translation[3];     // camera_from_world, mm
+    float centre[3];          // of the camera, world, mm
+    double depth_row[4];      // last row of camera_from_world: depths are computed in double, then rounded once
+    float fx, fy, cx, cy;     // px
+    float nearest;            // mm
+    float low_x, high_x;      // bounds of x/z where the projection is linearised: 1.3 x the field of view
+    float low_y, high_y;
+    int width, height;
+};
+
+struct GaussianInputs {
+    int count = 0, sh_count = 0, channel_count = 0;
+    const float* means = nullptr;       // [N, 3]
+    const float* quats = nullptr;       // [N, 4]
+    const float* scales = nullptr;      // [N, 3]
+    const float* opacities = nullptr;   // [N]
+    const float* sh = nullptr;          // [N, K, 3]
+    const float* sh_frames = nullptr;   // [N, 4] or null
+    const float* falloff = nullptr;     // [N] or null: no headlight
+    const float* vignette = nullptr;    // [2], with falloff
+    const float* channels = nullptr;    // [N, C] or null
+};
+
+struct Images {
+    float* color;              // [H, W, 3]
+    float* alpha;              // [H, W]
+    float* depth;              // [H, W]
+    float* channels;           // [H, W, C] or null
+    float* radii;              // [N]
+    const float* background;   // [3] or null
+};
+
+struct ImageGradients {
+    const float* color;      // each may be null: zero
+    const float* alpha;
+    const float* depth;
+    const float* channels;
+    const float* drawn_alpha;  // what forward returned
+    const float* drawn_depth;
+    const float* background;
+};
+
+struct GaussianGradients {   // each may be null: not wanted
+    float* means;
+    float* quats;
+    float* scales;
+    float* opacities;
+    float* sh;
+    float* falloff;
+    float* channels;
+    float* centers;          // [N, 2]
+    float* vignette;         // [2]
+    float* world_from_camera;  // [4, 4]
+};
+
+// One Gaussian as compositing sees it: log2(alpha) = A dx^2 + B dx dy + C dy^2 + log2_opacity with d = pixel - centre,
+// followed in memory by the composited values: r, g, b, z, channels.
+struct Record {
+    float x, y, a, b, c, log2_opacity;
+};
+constexpr int kRecordHead = 6;
+
+// One Gaussian in one tile: rows [first_row, end_row) of the tile's strip, and where its gradient goes.
+struct Pair {
+    uint32_t gaussian;
+    uint32_t slot;
+    uint16_t first_row, end_row;
+};
+
+// Where a Gaussian's pairs lie in its chunk's list (Gaussian order).
+struct Span {
+    uint32_t first, count;
+};
+
+constexpr int kChunkBits = 11;  // Gaussians are projected in chunks of 2048, whatever the number of threads
+constexpr int kChunk = 1 << kChunkBits;
+
+// A strip piece as projection emits it: tile | first row << 20 | last row << 26.
+constexpr int kTileBits = 20, kRowBits = 6;
+
+struct Chunk {
+    Buffer<uint32_t> pieces;
+    uint32_t piece_count = 0, visible = 0, base = 0;
+    uint32_t lowest_key = 0, highest_key = 0;
+};
+
+enum Stage { kProject, kSort, kBin, kComposite, kCompositeBackward, kProjectBackward, kStages };
+
+struct Frame {
+    Camera camera;
+    int count = 0, values = 0;               // Gaussians; composited values per pixel, padded to a compiled size
+    int record_stride = 0;                   // floats
+    int tile_width = 0, tile_height = 0, tiles_x = 0, tiles_y = 0;
+    Buffer<float> records;
+    Buffer<Span> spans;
+    std::vector<Chunk> chunks;
+    Buffer<uint32_t> keys, order;            // visible Gaussians, near to far
+    Buffer<uint32_t> spare_keys, spare_order, histogram;
+    size_t visible = 0, pairs = 0;
+    Buffer<uint32_t> tile_start, tile_order;
+    Buffer<Pair> list;
+    Buffer<float> transmittance;             // [H * W] after the last blended Gaussian
+    Buffer<int32_t> last;                    // [H * W] position in the tile's list at which the pixel was full
+    Buffer<float> slots;                     // gradients per pair, in Gaussian order
+    Buffer<double> partial;                  // per-chunk sums
+    double milliseconds[kStages] = {};
+
+    int tiles() const { return tiles_x * tiles_y; }
+    int slot_stride() const { return (kRecordHead + values + 7) / 8 * 8; }
+};
+
+}  // namespace neeco

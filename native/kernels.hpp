@@ -1,0 +1,64 @@
+// The functions that exist once per instruction set, as a table.
+#pragma once
+
+#include "frame.hpp"
+
+namespace neeco {
+
+struct LossInputs {
+    int height, width;
+    const float* image;         // [H, W, 3]
+    const float* target;        // [H, W, 3]
+    const float* mask;          // [H, W] 0 or 1, or null
+    const float* target_mean;   // [3, H, W] blurred target, or null: computed
+    const float* target_square; // [3, H, W] blurred squared target
+    float ssim_weight;
+    double pixels;              // unmasked pixels
+};
+
+struct AdamStep {
+    float* parameter;
+    const float* gradient;
+    float* mean;                // exp_avg
+    float* square;              // exp_avg_sq
+    size_t count;
+    size_t row_length;          // elements per row
+    const float* row_lr;        // [rows] factors of the learning rate, or null
+    float lr, beta1, beta2, eps, correction1, correction2_root;
+};
+
+struct Kernels {
+    const char* name;
+    int width;                  // floats per vector
+    int tile_width, tile_height;
+    void (*project)(Frame&, const GaussianInputs&, float* radii);
+    void (*composite)(Frame&, const Images&, int channel_count, bool keep);
+    void (*composite_backward)(Frame&, const ImageGradients&, int channel_count);
+    void (*project_backward)(Frame&, const GaussianInputs&, const GaussianGradients&);
+    double (*photometric)(const LossInputs&, Buffer<float>& work, float* gradient);
+    void (*blur_target)(const LossInputs&, Buffer<float>& work, float* mean, float* square);
+    void (*adam)(const AdamStep&);
+};
+
+// The table for this machine, or the one NEECO_SIMD asks for; throws std::runtime_error when that cannot run here.
+const Kernels& kernels();
+
+// Names this build holds and this machine can run, widest last.
+std::vector<const char*> runnable_kernels();
+
+// Chooses by name ("" = the default) for the rest of the process.
+void select_kernels(const char* name);
+
+// Numbers of composited values that the kernels are compiled for: colour, depth and 0, 1, 2, 4, 8, 16, 32 channels.
+#define NEECO_VALUES(X) X(4) X(5) X(6) X(8) X(12) X(20) X(36)
+constexpr int kMostChannels = 32;
+
+// Sorts the visible Gaussians by depth (equal depths by index) and lists them per tile.
+void sort_by_depth(Frame& frame);
+void list_per_tile(Frame& frame);
+
+void draw(Frame& frame, const Kernels& k, const GaussianInputs& in, const Images& out, bool keep);
+void draw_backward(Frame& frame, const Kernels& k, const GaussianInputs& in, const ImageGradients& from,
+                   const GaussianGradients& to);
+
+}  // namespace neeco

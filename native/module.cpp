@@ -1,0 +1,13 @@
+// neeco._native: what Python sees of the kernels.
+#include <nanobind/nanobind.h>
+
+namespace neeco {
+void bind_raster(nanobind::module_& m);
+void bind_loss(nanobind::module_& m);
+}  // namespace neeco
+
+NB_MODULE(_native, m) {
+    m.doc() = "CPU kernels of neeco: use neeco.raster, not this.";
+    neeco::bind_raster(m);
+    neeco::bind_loss(m);
+}

@@ -1,0 +1,164 @@
+"""The definition of drawing: plain torch, dense, differentiable by autograd, in whatever float type the inputs have.
+
+Every Gaussian is evaluated at every pixel: use it to understand and to test, not to train.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neeco.raster.sh import headlight_factor, rotation_matrices, sh_colors
+from neeco.raster.types import Camera, Gaussians, Rendering
+
+LOW_PASS = 0.3  # px^2 added to projected covariances
+FAINTEST = 1 / 255  # smallest alpha that is drawn
+OPAQUE = 0.999  # largest alpha
+FULL = 1e-4  # transmittance at which a pixel takes no more
+FIELD_MARGIN = 0.3  # share of half the field of view by which the linearisation point may lie outside
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Gaussians in the image."""
+
+    centers: Tensor  # [N, 2] px
+    covariances: Tensor  # [N, 2, 2] px^2, with the low-pass
+    depths: Tensor  # [N] mm
+
+
+def rasterize_reference(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
+    """`rasterize`, as a formula. Memory grows with Gaussians x pixels."""
+    means = gaussians.means
+    offsets = torch.zeros(len(gaussians), 2, dtype=means.dtype, device=means.device)
+    offsets.requires_grad_(torch.is_grad_enabled())
+    rotation, translation = camera_from_world(camera.world_from_camera.to(means))
+    usable = _usable(gaussians, camera, channels)
+    chosen, usable_channels = _take(gaussians, usable), None if channels is None else channels[usable]
+    camera_means = chosen.means @ rotation.T + translation
+    values = torch.cat([_colors(chosen, camera, camera_means), camera_means[:, 2:]], dim=-1)
+    if usable_channels is not None:
+        values = torch.cat([values, usable_channels], dim=-1)
+
+    projection = project(chosen, camera, camera_means, rotation, offsets[usable])
+    order = torch.argsort(depth_keys(chosen.means, camera), stable=True)
+    weights = blend_weights(projection, chosen.opacities, order, camera)  # [P, N], near to far
+    images = (weights @ values[order]).reshape(camera.height, camera.width, -1)
+    alpha = weights.sum(dim=1).reshape(camera.height, camera.width)
+    color = images[..., :3]
+    if background is not None:
+        color = color + (1 - alpha)[..., None] * background
+    drawn = alpha > 0
+    depth = torch.where(drawn, images[..., 3] / torch.where(drawn, alpha, torch.ones_like(alpha)), 0.0)
+    radii = torch.zeros(len(gaussians), dtype=means.dtype, device=means.device)
+    radii[usable] = _radii(projection, chosen.opacities, camera)
+    return Rendering(color, alpha, depth, None if channels is None else images[..., 4:], radii, offsets)
+
+
+def camera_from_world(world_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation [3, 3] and translation [3] that take world points to the camera frame: R^T and -R^T t."""
+    rotation = world_from_camera[:3, :3].T
+    return rotation, -(rotation @ world_from_camera[:3, 3])
+
+
+def depth_keys(means: Tensor, camera: Camera) -> Tensor:
+    """Depths [N] to sort by: in float64, summed in a fixed order, rounded once to float32. Every backend sorts these."""
+    with torch.no_grad():
+        pose = camera.world_from_camera.double()
+        axis, centre = pose[:3, 2], pose[:3, 3]
+        offset = -(axis[0] * centre[0]) - axis[1] * centre[1] - axis[2] * centre[2]
+        m = means.double()
+        return (((axis[0] * m[:, 0] + axis[1] * m[:, 1]) + axis[2] * m[:, 2]) + offset).float()
+
+
+def project(gaussians: Gaussians, camera: Camera, camera_means: Tensor, rotation: Tensor, offsets: Tensor) -> Projection:
+    """Project Gaussians to the image (EWA splatting, Zwicker et al. 2001).
+
+    camera_means [N, 3] mm, rotation [3, 3] camera_from_world, offsets [N, 2] px added to the centres.
+    """
+    x, y, z = camera_means.unbind(-1)
+    slope_x, slope_y = x / z, y / z
+    centers = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=-1) + offsets
+    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
+    slope_x = slope_x.clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    slope_y = slope_y.clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [camera.fx / z, zero, -camera.fx * slope_x / z, zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1
+    ).reshape(-1, 2, 3)
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1)
+    u = jacobian @ rotation @ (rotation_matrices(quats) * gaussians.scales[:, None, :])  # [N, 2, 3]
+    covariances = u @ u.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=u.dtype, device=u.device)
+    return Projection(centers, covariances, z)
+
+
+def alphas_at_pixels(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
+    """Alpha [P, N] of every Gaussian at every pixel centre, before any of the cut-offs."""
+    options = {"dtype": opacities.dtype, "device": opacities.device}
+    rows = torch.arange(camera.height, **options) + 0.5
+    columns = torch.arange(camera.width, **options) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    dx = x.reshape(-1, 1) - projection.centers[:, 0]
+    dy = y.reshape(-1, 1) - projection.centers[:, 1]
+    xx, xy, yy = projection.covariances[:, 0, 0], projection.covariances[:, 0, 1], projection.covariances[:, 1, 1]
+    squared = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    return opacities * torch.exp(-0.5 * squared)
+
+
+def blend_weights(projection: Projection, opacities: Tensor, order: Tensor, camera: Camera) -> Tensor:
+    """Weights [P, N], columns in `order`, near to far: what share of a pixel each Gaussian makes up."""
+    alphas = alphas_at_pixels(projection, opacities, camera)[:, order]
+    alphas = torch.where(alphas >= FAINTEST, alphas.clamp(max=OPAQUE), 0.0)
+    with torch.no_grad():
+        taken = torch.cumprod(1 - alphas, dim=1) > FULL
+    alphas = torch.where(taken, alphas, 0.0)
+    behind = torch.cumprod(1 - alphas, dim=1)
+    before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
+    return alphas * before
+
+
+def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tensor:
+    centre = camera.world_from_camera[:3, 3].to(gaussians.means)
+    colors = sh_colors(gaussians.sh, gaussians.means, centre, gaussians.sh_frames).clamp(min=0)
+    if gaussians.headlight is not None:
+        colors = colors * headlight_factor(gaussians.headlight, camera_means)[:, None]
+    return colors
+
+
+def _usable(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
+    """Indices of Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
+    n = len(gaussians)
+    light = gaussians.headlight
+    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, gaussians.sh_frames]
+    tensors += [channels, None if light is None else light.falloff]
+    good = depth_keys(gaussians.means, camera) > camera.near
+    for tensor in tensors:
+        if tensor is not None and n > 0:
+            good &= torch.isfinite(tensor.detach()).reshape(n, -1).all(dim=1)
+    return (good & (gaussians.quats.detach().norm(dim=-1) > 0)).nonzero()[:, 0]
+
+
+def _take(gaussians: Gaussians, index: Tensor) -> Gaussians:
+    light = gaussians.headlight
+    return Gaussians(
+        means=gaussians.means[index],
+        quats=gaussians.quats[index],
+        scales=gaussians.scales[index],
+        opacities=gaussians.opacities[index],
+        sh=gaussians.sh[index],
+        sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames[index],
+        headlight=None if light is None else type(light)(light.falloff[index], light.vignette),
+    )
+
+
+@torch.no_grad()
+def _radii(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
+    """3 standard deviations along the longer axis, px; 0 for Gaussians fainter than 1/255 at every pixel."""
+    largest = torch.linalg.eigvalsh(projection.covariances)[:, -1]
+    touching = (alphas_at_pixels(projection, opacities, camera) >= FAINTEST).any(dim=0)
+    return torch.where(touching, 3 * largest.sqrt(), 0.0)
