@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Pixels = NDArray[np.uint8]  # [H, W, 3]
 
 FULL_SCALE = 0.25  # mean absolute difference of a pixel drawn in the brightest colour; fixed, so maps can be compared
-# black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, so it survives grey print
+# black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, for grey print
 _COLORS = np.array(
     [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
 )

@@ -110,9 +110,7 @@ def _chosen_splits(capture: Capture, splits: Sequence[str] | None) -> tuple[str,
             raise NeecoError(f"{capture.root}: split: all frames are training frames; score those with --splits train")
     for name in splits:
         if name not in capture.splits:
-            raise NeecoError(
-                f"--splits: {name!r}: {capture.root} has no such split; it has {', '.join(capture.splits)}"
-            )
+            raise NeecoError(f"--splits: {capture.root} has no split {name!r}; it has {', '.join(capture.splits)}")
     return tuple(dict.fromkeys(splits))
 
 

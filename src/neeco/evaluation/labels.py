@@ -16,7 +16,7 @@ def composited_parts(rendering: Rendering, threshold: float = LABEL_THRESHOLD) -
     """uint8 [H, W] part ids of an image drawn with `channels=scene.label_channels()`.
 
     A pixel is instrument where its label columns sum to more than `threshold`; its id is the largest column's index
-    + 1, 0 is tissue. Occlusion is right because compositing did it. Raises NeecoError when drawn without label channels.
+    + 1, 0 is tissue. Occlusion is right because compositing did it. Raises NeecoError when there are no such channels.
     """
     channels = rendering.channels
     if channels is None:

@@ -25,7 +25,7 @@ COLUMNS = (  # key, heading, format, what it means
     ("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     ("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
     ("psnr_instrument", "PSNR instr.", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
-    ("mask_iou", "mask IoU", "{:.3f}", "The label mask against the true mask: shared area over joint area, 1 is perfect."),
+    ("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
     ("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     ("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
     ("fps", "FPS", "{:.1f}", "Posed drawings per second on the machine that evaluated."),
@@ -131,8 +131,8 @@ def _numbers(evaluation: dict[str, Any]) -> str:
     return (
         "<h2>Numbers</h2>"
         "<p>A tracker that is off by a millimetre moves the drawn instrument by pixels, whatever the model knows. So "
-        "there are two scores: <b>as given</b> says what a user of these poses gets; <b>aligned</b> says what the model knows, "
-        "and how good its labels are, because a synthesised image and its label share one pose.</p>"
+        "there are two scores: <b>as given</b> says what a user of these poses gets; <b>aligned</b> says what the model "
+        "knows, and how good its labels are, because a synthesised image and its label share one pose.</p>"
         f"<div class='scroll'><table><thead><tr><th>split</th>{head}</tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div>"
         f"<details open><summary>What the numbers mean</summary><dl class='explain'>{meanings}</dl></details>"
@@ -157,8 +157,8 @@ def _parts(evaluation: dict[str, Any]) -> str:
         "<h3>Overlap (IoU) by part</h3>"
         f"<div class='scroll'><table><thead><tr><th>split</th>{head}<th>jaws matched</th></tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div>"
-        "<p class='soft'>Images alone do not say which jaw is called left, so the better of the two namings over a whole "
-        "split is used. “jaws” is both jaws as one part.</p>"
+        "<p class='soft'>Images alone do not say which jaw is called left, so the better of the two namings over a "
+        "whole split is used. “jaws” is both jaws as one part.</p>"
     )
 
 

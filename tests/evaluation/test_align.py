@@ -1,0 +1,62 @@
+"""A pose that was wrong by tracker errors is found again in the photograph."""
+
+import math
+
+import pytest
+import torch
+
+from neeco.evaluation.align import AlignConfig, align_frame, moved_by
+
+
+@pytest.fixture(scope="module")
+def scene_and_frame(world, tmp_path_factory):
+    scene = world.TinyScene()
+    return scene, world.make_capture(tmp_path_factory.mktemp("capture"), scene, ("train", "test")).frames[1]
+
+
+# the tiny image is 48 px wide, so millimetres move it by half as many pixels as in a real one
+LOOSE = AlignConfig(sigma_instrument_mm=5, sigma_instrument_deg=5, sigma_camera_mm=5, sigma_camera_deg=2, levels=(0.5, 1.0), steps=(4, 5))  # fmt: skip  # noqa: E501
+
+
+def test_a_displaced_instrument_and_camera_are_found_again(world, scene_and_frame):
+    scene, frame = scene_and_frame
+    wrong = world.moved(frame, world.translation(1.2, -1.0, yaw=0.03), world.translation(0.6, 0.4))
+    state, camera = align_frame(scene, wrong, LOOSE)
+    truth = frame.state.instruments["bar"]
+    before = moved_by(truth, wrong.state.instruments["bar"])
+    after = moved_by(truth, state.instruments["bar"])
+    assert after["mm"] < 0.25 * before["mm"]
+    assert after["deg"] < 0.5 * before["deg"]
+    assert moved_by(frame.camera, camera)["mm"] < 0.5 * moved_by(frame.camera, wrong.camera)["mm"]
+
+
+def test_right_poses_stay_where_they_are(scene_and_frame):
+    scene, frame = scene_and_frame
+    state, camera = align_frame(scene, frame)
+    assert moved_by(frame.state.instruments["bar"], state.instruments["bar"])["mm"] < 0.05
+    assert moved_by(frame.camera, camera)["mm"] < 0.05
+    assert camera.world_from_camera.dtype == frame.camera.world_from_camera.dtype
+
+
+def test_the_prior_holds_poses_that_the_image_cannot_tell(world, scene_and_frame):
+    scene, frame = scene_and_frame
+    wrong = world.moved(frame, world.translation(0.8), world.translation())
+    tight = AlignConfig(
+        sigma_instrument_mm=1e-3, sigma_instrument_deg=1e-3, sigma_camera_mm=1e-3, sigma_camera_deg=1e-3
+    )
+    state, _ = align_frame(scene, wrong, tight)
+    assert moved_by(wrong.state.instruments["bar"], state.instruments["bar"])["mm"] < 0.05
+
+
+def test_the_distance_between_two_poses_is_in_millimetres_and_degrees(world):
+    moved = moved_by(world.camera_at(), world.camera_at(3.0, 4.0, yaw=math.radians(2)))
+    assert moved["mm"] == pytest.approx(5.0)
+    assert moved["deg"] == pytest.approx(2.0, abs=1e-4)
+
+
+def test_the_fit_needs_no_gradient_and_leaves_none(scene_and_frame):
+    scene, frame = scene_and_frame
+    state, camera = align_frame(scene, frame, AlignConfig(levels=(0.5,), steps=(1,)))
+    assert not state.instruments["bar"].pose.requires_grad
+    assert not camera.world_from_camera.requires_grad
+    assert torch.isfinite(camera.world_from_camera).all()

@@ -1,0 +1,122 @@
+"""A whole evaluation of a world whose photographs the scene itself drew."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from neeco.capture.images import write_labels
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import evaluate_run
+
+
+@pytest.fixture(autouse=True)
+def _no_weights(monkeypatch):
+    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
+
+
+def make_run(world, folder, splits=("train", "train", "test", "unseen"), **options):
+    capture = world.make_capture(folder / "capture", world.TinyScene(), splits, truth=options.pop("truth", True))
+    return world.TinyRun(folder, world.TinyScene(**options), capture)
+
+
+def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
+    run = make_run(world, tmp_path)
+    seen = []
+    evaluation = evaluate_run(run, progress=lambda *event: seen.append(event))
+    numbers = evaluation["given"]["test"]
+    assert set(evaluation["given"]) == {"test", "unseen"}
+    assert numbers["psnr"] > 45  # 8 bit rounding
+    assert numbers["ssim"] > 0.99
+    assert numbers["psnr_instrument"] > 45
+    assert numbers["mask_iou"] == 1.0
+    assert numbers["part_iou"]["shaft"] == 1.0
+    assert numbers["part_iou"]["wrist"] is None
+    assert numbers["covered_fraction"] > 0.9
+    assert numbers["fps"] > 0
+    assert numbers["num_gaussians"] == 108
+    assert numbers["frames"] == 1
+    assert numbers["lpips"] is None
+    assert any("lpips" in note and "no weights" in note for note in evaluation["notes"])
+    assert evaluation["per_frame"]["given"]["test"][0]["frame"] == "002"
+    assert ("test", 1, 1) in seen
+
+
+def test_the_numbers_are_written_into_the_run_folder(world, tmp_path):
+    evaluation = evaluate_run(make_run(world, tmp_path), ["test"])
+    assert json.loads((tmp_path / "evaluation.json").read_text()) == evaluation
+    assert "aligned" not in evaluation
+
+
+def test_aligned_scores_forgive_the_tracker_and_given_scores_do_not(world, tmp_path):
+    run = make_run(world, tmp_path, ("train", "test"))
+    wrong = world.moved(run.recorded.frames[1], world.translation(0.9, 0.6), world.translation())
+    run.recorded = replace(run.recorded, frames=(run.recorded.frames[0], wrong))
+    evaluation = evaluate_run(run, align=True)
+    given, aligned = evaluation["given"]["test"], evaluation["aligned"]["test"]
+    assert aligned["psnr_instrument"] > given["psnr_instrument"] + 3
+    assert aligned["mask_iou"] >= given["mask_iou"]
+    row = evaluation["per_frame"]["aligned"]["test"][0]
+    assert 0.4 < row["moved"]["bar"]["mm"] < 2
+    assert set(row["moved"]) == {"bar", "camera"}
+
+
+def test_without_truth_the_mask_numbers_are_null_and_a_note_says_so(world, tmp_path):
+    evaluation = evaluate_run(make_run(world, tmp_path, truth=False), ["test"])
+    numbers = evaluation["given"]["test"]
+    assert numbers["mask_iou"] is None
+    assert numbers["psnr_instrument"] is None
+    assert numbers["mask_frames"] == 0
+    assert any("no frame has a true or reference mask" in note for note in evaluation["notes"])
+
+
+def test_reference_masks_of_some_frames_are_used_and_counted(world, tmp_path):
+    run = make_run(world, tmp_path, ("train", "test", "test"), truth=False)
+    mask = torch.zeros(world.HEIGHT, world.WIDTH, dtype=torch.uint8)
+    mask[:10] = 255
+    write_labels(run.recorded.root / "reference_masks" / "001.png", mask)
+    evaluation = evaluate_run(run, ["test"])
+    numbers = evaluation["given"]["test"]
+    assert numbers["mask_frames"] == 1
+    assert 0 <= numbers["mask_iou"] < 1
+    assert numbers["part_iou"]["shaft"] is None
+    assert any("1 of 2 frames" in note for note in evaluation["notes"])
+
+
+def test_a_scene_without_labels_has_no_mask_numbers(world, tmp_path):
+    evaluation = evaluate_run(make_run(world, tmp_path, labelled=False), ["test"])
+    assert evaluation["given"]["test"]["mask_iou"] is None
+    assert evaluation["given"]["test"]["psnr_instrument"] is not None
+    assert any("carries no labels" in note for note in evaluation["notes"])
+
+
+def test_ignored_pixels_do_not_count(world, tmp_path):
+    run = make_run(world, tmp_path, ("train", "test"))
+    frame = run.recorded.frames[1]
+    state = replace(
+        frame.state, instruments={"bar": replace(frame.state.instruments["bar"], pose=world.translation(z=-50))}
+    )  # the bar is behind the camera now: only where it was in the photograph is the drawing wrong
+    ignore = torch.full((world.HEIGHT, world.WIDTH), 255, dtype=torch.uint8)
+    photo = frame.load_image()
+    empty = world.rasterize(run.scene.at(state), frame.camera).color
+    ignore[(photo - empty).abs().amax(-1) > 0.004] = 0
+    path = tmp_path / "ignore.png"
+    write_labels(path, ignore)
+    open_frame, masked_frame = replace(frame, state=state), replace(frame, state=state, mask_path=path)
+    scores = []
+    for candidate in (open_frame, masked_frame):
+        run.recorded = replace(run.recorded, frames=(run.recorded.frames[0], candidate))
+        scores.append(evaluate_run(run, ["test"])["given"]["test"])
+    assert scores[0]["psnr"] < 30
+    assert scores[1]["psnr"] > 45
+    assert scores[1]["ssim"] > 0.99 > scores[0]["ssim"]
+
+
+def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
+    run = make_run(world, tmp_path)
+    with pytest.raises(NeecoError, match="no split 'tset'; it has train, test, unseen"):
+        evaluate_run(run, ["tset"])
+    only_training = make_run(world, tmp_path / "other", ("train",))
+    with pytest.raises(NeecoError, match="all frames are training frames"):
+        evaluate_run(only_training)

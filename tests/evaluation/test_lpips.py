@@ -1,0 +1,74 @@
+"""LPIPS: its published check values where the weights are at hand; its errors everywhere."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from neeco.capture.images import read_image
+from neeco.errors import NeecoError
+from neeco.evaluation.lpips import NETWORKS, Lpips, find_lpips, load_lpips
+
+WEIGHTS = os.environ.get("NEECO_LPIPS_WEIGHTS", "")
+needs_weights = pytest.mark.skipif(not WEIGHTS, reason="NEECO_LPIPS_WEIGHTS names no weights")
+
+
+@needs_weights
+@pytest.mark.parametrize(
+    ("network", "other", "expected"),
+    [("alexnet", "p0", 0.7219), ("alexnet", "p1", 0.1376), ("vgg16", "p0", 0.5686), ("vgg16", "p1", 0.4217)],
+)
+def test_the_authors_example_images_have_the_authors_distances(network, other, expected):
+    folder = Path(WEIGHTS)
+    images = [read_image(folder / f"ex_{name}.png") for name in ("ref", other)]
+    assert find_lpips(folder)[network].distance(images[1], images[0]) == pytest.approx(expected, abs=1e-4)
+
+
+def random_alexnet() -> Lpips:
+    random = torch.Generator().manual_seed(0)
+    weights, channels = {}, 3
+    for index, layer in enumerate(NETWORKS["alexnet"]):
+        shape = (8, channels, layer.kernel, layer.kernel)
+        weights[f"features.{index}.weight"] = torch.randn(shape, generator=random) * 0.1
+        weights[f"features.{index}.bias"] = torch.randn(8, generator=random) * 0.1
+        weights[f"linear.{index}.weight"] = torch.rand(8, generator=random)
+        channels = 8
+    return Lpips(NETWORKS["alexnet"], weights)
+
+
+def test_a_full_mask_changes_nothing_and_ignored_pixels_do_not_count():
+    network, random = random_alexnet(), torch.Generator().manual_seed(1)
+    target = torch.rand(64, 64, 3, generator=random)
+    image = torch.rand(64, 64, 3, generator=random)
+    everywhere = torch.ones(64, 64, dtype=torch.bool)
+    assert network.distance(image, target, everywhere) == pytest.approx(network.distance(image, target), rel=1e-5)
+    left = everywhere.clone()
+    left[:, 32:] = False
+    changed = image.clone()
+    changed[:, 32:] = 0
+    assert network.distance(changed, target, left) == network.distance(image, target, left)
+    assert network.distance(target, target) == 0.0
+
+
+def test_no_folder_means_no_networks_but_a_wrong_folder_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
+    assert find_lpips(None) == {}
+    with pytest.raises(NeecoError, match="no such folder"):
+        find_lpips(tmp_path / "nowhere")
+    with pytest.raises(NeecoError, match="holds neither"):
+        find_lpips(tmp_path)
+    monkeypatch.setenv("NEECO_LPIPS_WEIGHTS", str(tmp_path / "nowhere"))
+    with pytest.raises(NeecoError, match="NEECO_LPIPS_WEIGHTS"):
+        find_lpips(None)
+
+
+def test_damaged_or_foreign_weights_are_refused(tmp_path):
+    path = tmp_path / "alexnet.safetensors"
+    path.write_bytes(b"not tensors")
+    with pytest.raises(NeecoError, match="not a readable safetensors"):
+        load_lpips(path, "alexnet")
+    save_file({"features.0.weight": torch.zeros(4, 3, 3, 3)}, path)
+    with pytest.raises(NeecoError, match="features.0"):
+        load_lpips(path, "alexnet")

@@ -1,0 +1,69 @@
+"""Overlap numbers worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from neeco.errors import NeecoError
+from neeco.evaluation.labels import composited_parts
+from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, to_truth_ids
+from neeco.raster.types import Rendering
+
+
+def mask(*rows):
+    return torch.tensor([[character == "#" for character in row] for row in rows])
+
+
+def test_iou_and_dice_of_two_overlapping_strips():
+    first, second = mask("###.", "...."), mask(".###", "....")
+    assert iou(first, second) == pytest.approx(2 / 4)
+    assert dice(first, second) == pytest.approx(4 / 6)
+    assert math.isnan(iou(mask("..."), mask("...")))
+    assert iou(first, second, mask("##..", "....")) == pytest.approx(1 / 2)
+
+
+def test_jaws_are_matched_once_for_the_whole_split_not_per_frame():
+    tally = PartTally()
+    truth = torch.tensor([[1, 2, 3, 3, 3, 4, 4]], dtype=torch.uint8)
+    named = truth.clone()
+    swapped = torch.tensor([[1, 2, 4, 4, 4, 3, 3]], dtype=torch.uint8)
+    for parts in (swapped, swapped, named):
+        tally.add(parts, truth)
+    scores, assignment = tally.result()
+    assert assignment == "swapped"
+    assert scores["jaw_left"] == pytest.approx(2 / 3)
+    assert scores["jaws"] == 1.0
+    assert scores["shaft"] == 1.0
+
+
+def test_frames_without_a_part_do_not_count_for_it():
+    tally = PartTally()
+    tally.add(torch.tensor([[1, 0]]), torch.tensor([[1, 1]]))
+    scores, assignment = tally.result()
+    assert scores["shaft"] == 0.5
+    assert math.isnan(scores["wrist"])
+    assert assignment == "as named"
+
+
+def test_part_ids_become_the_truths_numbers_and_unknown_parts_tissue():
+    names = (("a", "jaw_right"), ("a", "shaft"), ("b", "hook"))
+    assert to_truth_ids(torch.tensor([[0, 1, 2, 3]]), names).tolist() == [[0, 4, 1, 0]]
+
+
+def rendering(channels):
+    image = torch.zeros(1, 3, 3)
+    return Rendering(image, image[..., 0], image[..., 0], channels, torch.zeros(0), torch.zeros(0, 2))
+
+
+def test_a_pixel_is_instrument_where_its_columns_together_pass_the_threshold():
+    channels = torch.tensor([[[0.3, 0.4], [0.5, 0.1], [0.9, 0.05]]])
+    assert composited_parts(rendering(channels)).tolist() == [[2, 0, 1]]
+    assert composited_parts(rendering(torch.zeros(1, 3, 0))).tolist() == [[0, 0, 0]]
+    with pytest.raises(NeecoError, match="label channels"):
+        composited_parts(rendering(None))
+
+
+def test_the_mean_leaves_out_what_is_not_known():
+    assert mean_of([1.0, None, math.nan, 3.0]) == 2.0
+    assert math.isnan(mean_of([None]))

@@ -1,0 +1,24 @@
+"""Gives tests the tiny world of tests/evaluation/worlds.py."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+WORLDS = Path(__file__).resolve().parent.parent / "evaluation" / "worlds.py"
+
+
+@pytest.fixture(scope="session")
+def world() -> ModuleType:
+    """The module itself: tests are not a package, so it cannot be imported by name."""
+    if "neeco_test_worlds" not in sys.modules:
+        spec = importlib.util.spec_from_file_location("neeco_test_worlds", WORLDS)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+    return sys.modules["neeco_test_worlds"]

@@ -1,0 +1,115 @@
+"""The report is one offline page that says what the numbers say."""
+
+import json
+from html.parser import HTMLParser
+
+import pytest
+
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import evaluate_run
+from neeco.report import write_report
+from neeco.report.curves import curve, nice_ticks, phase_starts, read_metrics
+from neeco.report.figures import chosen_rows
+
+VOID = {"meta", "img", "br", "path", "circle", "link"}
+
+
+class Page(HTMLParser):
+    """Collects references and checks that elements close in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.references, self.tags = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.references += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def reported(world, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    scene = world.TinyScene(diagnostics={"bar": {"hinge_axis": [0.0, 1.0, 0.0], "verdict": "joint <found>"}})
+    capture = world.make_capture(folder / "capture", world.TinyScene(), ("train", "test", "test", "unseen"))
+    rows = [
+        {"iteration": i * 10, "loss": 1 / (i + 1), "psnr": 20 + i / 9, "num_gaussians": 100 + i, "phase": 1 + (i > 20),
+         "seconds": i * 0.5}
+        for i in range(50)
+    ]  # fmt: skip
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)) + '\n{"iteration": 5')
+    (folder / "config.yaml").write_text("method: tiny\nnote: <b>\n")
+    evaluation = evaluate_run(world.TinyRun(folder, scene, capture), align=True)
+    path = write_report(folder, evaluation, capture, scene, synthesis_preview=capture.frames[0].image_path)
+    return folder, capture, scene, evaluation, path
+
+
+def test_the_page_is_whole_and_fetches_nothing(reported):
+    text = reported[-1].read_text()
+    page = Page()
+    page.feed(text)
+    assert page.open == []
+    assert all(reference.startswith("data:image/") for reference in page.references)
+    assert len(page.references) == 3 * 4 + 1  # two test frames and one unseen, four pictures each, and the preview
+    assert "http" not in text.replace("http-equiv", "")
+    assert page.tags.count("svg") == 3
+    assert "prefers-color-scheme: dark" in text
+    assert "@media print" in text
+    assert "viewport" in page.tags or 'name="viewport"' in text
+
+
+def test_the_page_says_the_numbers_and_the_notes(reported):
+    *_, evaluation, path = reported
+    text = path.read_text()
+    for kind in ("given", "aligned"):
+        assert f"<td>{evaluation[kind]['test']['psnr']:.2f}</td>" in text
+    assert "phase 2" in text
+    assert "0.4 min" in text
+
+
+def test_what_the_user_wrote_is_shown_as_text_not_as_markup(reported):
+    text = reported[-1].read_text()
+    assert "joint &lt;found&gt;" in text
+    assert "note: &lt;b&gt;" in text
+
+
+def test_a_run_without_metrics_or_preview_still_has_a_page(reported, tmp_path):
+    _, capture, scene, evaluation, _ = reported
+    text = write_report(tmp_path, evaluation, capture, scene).read_text()
+    assert "<svg" not in text
+    assert "Synthesised" not in text
+
+
+def test_a_preview_that_cannot_be_read_is_named(reported, tmp_path):
+    _, capture, scene, evaluation, _ = reported
+    with pytest.raises(NeecoError, match=r"gone\.png"):
+        write_report(tmp_path, evaluation, capture, scene, synthesis_preview=tmp_path / "gone.png")
+
+
+def test_best_median_and_worst_frame_are_shown_once_each():
+    rows = [{"frame": name, "psnr": value} for name, value in zip("abcde", (3.0, 1.0, 5.0, None, 4.0), strict=True)]
+    assert [(why, row["frame"]) for why, row in chosen_rows(rows)] == [("best", "c"), ("median", "a"), ("worst", "b")]
+    assert [why for why, _ in chosen_rows(rows[:1])] == ["best"]
+    assert chosen_rows([]) == []
+
+
+def test_curves_mark_where_the_phase_changes_and_stay_out_when_there_is_nothing_to_draw(tmp_path):
+    rows = [{"iteration": i, "loss": 1.0 - i / 20, "phase": 1 if i < 5 else 2} for i in range(10)]
+    assert phase_starts(rows) == [(5.0, "2")]
+    assert 'class="phase"' in curve(rows, "loss", "loss")
+    assert curve(rows, "psnr", "PSNR") == ""
+    assert curve(rows[:1], "loss", "loss") == ""
+    assert read_metrics(tmp_path / "none.jsonl") == []
+
+
+def test_ticks_are_round_and_inside_the_range():
+    assert nice_ticks(0.0, 10.0, 5) == [0, 2, 4, 6, 8, 10]
+    ticks = nice_ticks(23.1, 29.7, 4)
+    assert ticks == [24, 26, 28]
