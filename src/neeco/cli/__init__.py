@@ -1,1 +1,83 @@
+"""The command line: `neeco VERB …`. Parses, calls one function, prints.
 
+Each verb is one module of this package: a frozen dataclass (its docstring and fields are the help text) and
+`run(args) -> int`. Only the module of the verb that was asked for is imported, so that `neeco --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import make_dataclass
+from typing import Any, get_type_hints
+
+from neeco import __version__
+from neeco.errors import NeecoError
+
+VERBS = {
+    "demo": "The whole main job on the bundled sample capture, in five minutes.",
+    "check": "Tell everything that is wrong with a capture.",
+    "train": "Learn a scene from a capture.",
+    "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
+    "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
+    "synthesize": "Draw a labelled data set of states that nobody recorded.",
+}
+
+DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
+
+INTERRUPTED = 130  # 128 + SIGINT, what a shell reports
+PIPE_CLOSED = 141  # 128 + SIGPIPE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line (default: this process's) and return its exit status.
+
+    0 done; 1 bad input, told in one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our output went
+    away. Usage errors (2) and `--help` (0) leave through SystemExit.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        status = _dispatch(words)
+        sys.stdout.flush()
+        return status
+    except NeecoError as error:
+        print(f"neeco: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\nneeco: interrupted; what was finished is kept", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the interpreter flushes stdout once more on its way out; give it somewhere to go
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
+
+
+def _dispatch(words: list[str]) -> int:
+    if words == ["--version"]:
+        print(f"neeco {__version__}")
+        return 0
+    import tyro
+
+    run, arguments = _verb(words[0]) if words and words[0] in VERBS else (None, None)
+    choices: dict[str, Callable[..., Any]] = {
+        name: arguments if arguments is not None and name == words[0] else _named_only(name, line)
+        for name, line in VERBS.items()
+    }
+    parsed = tyro.extras.subcommand_cli_from_dict(
+        choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    assert run is not None, "tyro leaves through SystemExit when no verb was given"
+    return run(parsed)
+
+
+def _verb(name: str) -> tuple[Callable[[Any], int], Callable[..., Any]]:
+    """A verb's `run` and the dataclass of its arguments, which is what `run` takes."""
+    run = importlib.import_module(f"{__name__}.{name}").run
+    return run, get_type_hints(run)["args"]
+
+
+def _named_only(name: str, line: str) -> Callable[..., Any]:
+    """Stands for a verb in the overview without importing it."""
+    return make_dataclass(name, [], namespace={"__doc__": line})

@@ -1,0 +1,115 @@
+"""`neeco demo`: the whole main job on the bundled sample, with the same functions as the other verbs."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from neeco.training.run import Run
+
+SAMPLE = "liver-mini"
+IMAGES = 24
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole main job on the bundled sample capture: check, train, evaluate, synthesize, report."""
+
+    output: Path = Path("neeco-demo")
+    """Folder to write to; must be empty or absent."""
+    minutes: float = 2.0
+    """How long to train."""
+
+
+def run(args: Demo) -> int:
+    """Do it all and say where everything lies."""
+    from neeco.errors import NeecoError
+
+    if not args.minutes > 0:
+        raise NeecoError(f"--minutes: {args.minutes} is no time to train; give more than 0")
+    if args.output.exists() and (not args.output.is_dir() or any(args.output.iterdir())):
+        raise NeecoError(f"{args.output}: exists already; give another --output, or remove it")
+    start = time.monotonic()
+    capture = sample_capture()
+    _check(capture)
+    trained = _train(capture, args.output / "run", args.minutes)
+    dataset = args.output / "dataset"
+    _synthesize(trained, dataset)
+    report = _evaluate(trained, dataset)
+    print(f"\nDone in {time.monotonic() - start:.0f} s.")
+    for what, path in (
+        ("capture", capture),
+        ("learned scene", trained.path),
+        ("labelled data set", dataset),
+        ("its preview", dataset / "preview.png"),
+        ("report, open it in a browser", report),
+    ):
+        print(f"  {what}: {path.resolve()}")
+    return 0
+
+
+def sample_capture() -> Path:
+    """The bundled sample's folder: inside the installed package, or in the checkout it is run from.
+
+    Raises NeecoError when neither is there.
+    """
+    from neeco.errors import NeecoError
+
+    package = Path(__file__).resolve().parents[1]
+    places = (package / "samples" / SAMPLE, package.parents[1] / "samples" / SAMPLE)
+    for place in places:
+        if (place / "transforms.json").is_file():
+            return place
+    raise NeecoError(f"{places[0]}: the sample capture is missing; install neeco again")
+
+
+def _check(path: Path) -> None:
+    from neeco.capture import check_capture, errors_only
+    from neeco.errors import NeecoError
+
+    print(f"1/4 check {path}")
+    problems = check_capture(path)
+    for problem in problems:
+        print(f"  {problem.severity}: {problem}")
+    if errors := errors_only(problems):
+        raise NeecoError(f"{path}: {len(errors)} problems in the sample capture; install neeco again")
+
+
+def _train(capture: Path, output: Path, minutes: float) -> Run:
+    from dataclasses import replace
+
+    from neeco.cli._progress import training_bar
+    from neeco.training.config import method_defaults
+    from neeco.training.run import load_run
+    from neeco.training.train import train
+
+    print(f"2/4 train for {minutes:g} minutes")
+    with training_bar() as progress:
+        path = train(capture, output, replace(method_defaults("kinematic"), minutes=minutes), progress=progress)
+    return load_run(path)
+
+
+def _synthesize(trained: Run, output: Path) -> None:
+    from neeco.synthesis.dataset import synthesize
+    from neeco.synthesis.progress import counting
+    from neeco.synthesis.settings import Settings
+
+    print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
+    with counting("synthesize", IMAGES) as advance:
+        synthesize(trained, output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
+
+
+def _evaluate(trained: Run, dataset: Path) -> Path:
+    from neeco.evaluation.evaluate import evaluate_run
+    from neeco.report import write_report
+
+    print("4/4 evaluate on frames kept from training")
+    evaluation = evaluate_run(trained)
+    for split, numbers in evaluation["given"].items():
+        iou = "" if numbers["mask_iou"] is None else f", mask IoU {numbers['mask_iou']:.3f}"
+        print(f"  {split}: PSNR {numbers['psnr']:.2f} dB{iou}")
+    preview = dataset / "preview.png"
+    return write_report(trained.path, evaluation, trained.capture(), trained.scene, synthesis_preview=preview)

@@ -1,0 +1,136 @@
+"""What the command line promises whatever the verb: help, exit statuses, one line per error."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from neeco import __version__, cli
+from neeco.errors import NeecoError
+
+MISSING = "/nowhere/at/all"
+WITH_BAD_PATH = {
+    "check": [MISSING],
+    "train": [MISSING, "--output", "run"],
+    "evaluate": [MISSING],
+    "render": [MISSING, "--output", "drawn"],
+    "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
+    "demo": ["--output", "taken"],
+}
+
+
+def neeco(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the program as a user does."""
+    command = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())", *words]
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, check=False, env=os.environ | {"COLUMNS": "120"}
+    )
+
+
+def test_help_names_every_verb_with_a_line() -> None:
+    shown = neeco("--help")
+    assert shown.returncode == 0
+    for verb, line in cli.VERBS.items():
+        assert verb in shown.stdout
+        assert line.split()[0] in shown.stdout
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_every_verb_has_help_with_hyphenated_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main([verb, "--help"])
+    shown = capsys.readouterr().out
+    assert left.value.code == 0
+    assert f"neeco {verb}" in shown
+    options = [word for word in shown.split() if word.startswith("--")]
+    assert not [word for word in options if "_" in word]
+
+
+def test_overview_does_not_load_torch() -> None:
+    program = (
+        "import sys; from neeco.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
+
+
+def test_overview_answers_at_once() -> None:
+    fastest = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        neeco("--help")
+        fastest = min(fastest, time.perf_counter() - start)
+    assert fastest < 3.0  # under a second on an idle machine; tests share theirs
+
+
+def test_version_is_the_package_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"neeco {__version__}\n"
+
+
+@pytest.mark.parametrize("words", [[], ["synthesise"], *([verb, "--no-such-option"] for verb in cli.VERBS)])
+def test_wrong_usage_exits_2(words: list[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(words)
+    assert left.value.code == 2
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_bad_path_is_one_line_and_exit_1(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("a file, not a folder")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([verb, *WITH_BAD_PATH[verb]]) == 1
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err + told.out
+    if verb != "check":  # check lists problems on stdout; that is its result
+        assert len(told.err.strip().splitlines()) == 1
+        assert told.err.startswith("neeco: error: ")
+        assert (MISSING if verb != "demo" else "taken") in told.err
+
+
+def test_an_error_of_many_lines_is_told_in_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "_dispatch", raising(NeecoError("file: field:\n  wrong;\n  mend it")))
+    assert cli.main([]) == 1
+    assert capsys.readouterr().err == "neeco: error: file: field: wrong; mend it\n"
+
+
+def test_ctrl_c_is_one_line_and_exit_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(cli, "_dispatch", raising(KeyboardInterrupt()))
+    assert cli.main([]) == 130
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_reader_that_goes_away_makes_no_noise() -> None:
+    program = (
+        "import sys; from neeco import cli\n"
+        "def flood(words):\n"
+        "    while True: print('x' * 10000)\n"
+        "cli._dispatch = flood\n"
+        "sys.exit(cli.main([]))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.read(10)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait(timeout=60) == cli.PIPE_CLOSED
+
+
+def raising(error: BaseException):
+    """A function that raises `error` whatever it is given."""
+
+    def call(*_: object) -> int:
+        raise error
+
+    return call

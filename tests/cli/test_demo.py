@@ -1,0 +1,31 @@
+"""The demo finds its sample and never writes over anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from neeco.capture import check_capture, errors_only
+from neeco.cli.demo import Demo, run, sample_capture
+from neeco.errors import NeecoError
+
+
+def test_the_bundled_sample_is_found_and_sound() -> None:
+    sample = sample_capture()
+    assert errors_only(check_capture(sample)) == []
+    assert len(list((sample / "truth" / "masks").glob("*.png"))) > 0  # without them no mask score
+
+
+def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("precious")
+    with pytest.raises(NeecoError, match="exists already"):
+        run(Demo(output=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
+def test_no_time_to_train_is_refused(minutes: float, tmp_path: Path) -> None:
+    with pytest.raises(NeecoError, match="--minutes"):
+        run(Demo(output=tmp_path / "new", minutes=minutes))
+    assert not (tmp_path / "new").exists()
