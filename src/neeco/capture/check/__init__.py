@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neeco.capture.check.frames import check_frames
-from neeco.capture.check.geometry import check_cameras, check_instruments
+from neeco.capture.check.geometry import check_geometry
 from neeco.capture.check.images import check_images
 from neeco.capture.check.states import check_states
 from neeco.capture.check.summary import Summary, summarize
@@ -31,8 +31,7 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> tu
         check_frames(parsed, report)
         check_images(parsed, report)
         check_states(parsed, report)
-        check_cameras(parsed, report)
-        check_instruments(parsed, report)
+        check_geometry(parsed, report)
     elif not report.problems:
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     return report.problems, summarize(parsed)

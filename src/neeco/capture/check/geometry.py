@@ -12,7 +12,7 @@ import numpy as np
 
 from neeco.capture.check.states import states_of
 from neeco.capture.parsed import Parsed, Place
-from neeco.capture.problems import Report, shown
+from neeco.capture.problems import Report, errors_only, shown
 from neeco.capture.transforms import swap_camera_axes
 
 FEW_POINTS = 100
@@ -66,6 +66,14 @@ def _inverted(poses: np.ndarray) -> np.ndarray:
     inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3])
     return inverse
+
+
+def check_geometry(parsed: Parsed, report: Report) -> None:
+    """Check cameras against points, then instruments against both (not against cameras that are wrong)."""
+    before = len(errors_only(report.problems))
+    check_cameras(parsed, report)
+    if len(errors_only(report.problems)) == before:
+        check_instruments(parsed, report)
 
 
 def check_cameras(parsed: Parsed, report: Report) -> None:
@@ -152,6 +160,8 @@ def _camera_mistake(scene: _Scene, given: float) -> tuple[str, str] | None:
     cameras, points = scene.cameras, scene.points[None]
     opengl = swap_camera_axes(cameras.poses)  # as written in the file
     metres = "give all lengths in mm"
+    if np.linalg.norm(opengl[:, :3, 3], axis=1).max() < METRES < 0.1 * scene.spread:
+        return "camera positions are in metres", metres
     guesses = {
         ("camera axes are OpenCV's", "flip y and z: transform_matrix has OpenGL axes"): (opengl, points),
         ("matrices are world-to-camera", "invert them: camera-to-world is expected"): (
@@ -294,9 +304,10 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
         guesses["cameras and points are in metres, its positions in mm", "give all lengths in mm"] = origins / 1000.0
     shares = {name: float(cameras.sees(moved[:, None])[:, 0].mean()) for name, moved in guesses.items()}
     best = max(shares, key=lambda name: shares[name])
-    # a sensor behind the visible part needs no mistake to be out of view; a mistake must explain more than that does
-    behind = min(_visible_body_point(cameras, poses)[1], SEEN_SURELY)
-    return best if shares[best] > max(SEEN_AGAIN, 3 * given) and shares[best] >= behind else None
+    # a sensor behind the visible part needs no mistake to be out of view: where that explains things, nothing is wrong
+    if _visible_body_point(cameras, poses)[1] > SEEN_SURELY:
+        return None
+    return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
 def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: Report) -> None:
