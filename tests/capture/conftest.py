@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 FRAMES = 8
 
@@ -63,9 +64,9 @@ def opengl_camera(angle: float, distance: float = 100.0) -> np.ndarray:
 
 def instrument_pose(index: int) -> np.ndarray:
     """Turning and moving a little near the middle of the scene."""
-    angle = 0.2 * index
     pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    turn = [0.8 * np.sin(index), 0.6 * np.cos(2 * index), 0.25 * index]
+    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
     pose[:3, 3] = [30.0 + 1.5 * index - 5, -20.0 - index, 52.0 + index]
     return pose
 

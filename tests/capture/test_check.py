@@ -47,6 +47,14 @@ def _pose(index, row, column, value):
     return lambda document: document["frames"][index]["instruments"][0]["pose"][row].__setitem__(column, value)
 
 
+def _mirror(index):
+    def edit(document):
+        for row in document["frames"][index]["instruments"][0]["pose"]:
+            row[0] = -row[0]
+
+    return edit
+
+
 def _joint(index, value):
     return lambda document: document["frames"][index]["instruments"][0]["joints"].__setitem__("jaw_angle", value)
 
@@ -77,7 +85,7 @@ EDITS = [
     (_pose(3, 0, 3, "1"), "frames[3].instruments[0].pose", "not a number"),
     (_pose(3, 0, 3, 1e6), "frames[3].instruments[0].pose", "far from the points"),
     (_pose(3, 0, 0, 3.0), "frames[3].instruments[0].pose", "not rigid"),
-    (_pose(3, 2, 2, -1.0), "frames[3].instruments[0].pose", "reflection"),
+    (_mirror(3), "frames[3].instruments[0].pose", "reflection"),
     (_pose(3, 3, 0, 5.0), "frames[3].instruments[0].pose", "last row"),
     (_joint(5, 2.0), "frames[5].instruments[0].joints.jaw_angle", "outside its limits"),
     (_joint(5, None), "frames[5].instruments[0].joints.jaw_angle", "expected a number"),
@@ -123,13 +131,6 @@ def _scale(pose, factor):
 
 MISTAKES = [
     ("poses", lambda pose: _scale(pose, 1e-3), "metres?"),
-    ("poses", np.linalg.inv, "outside every image"),
-    ("poses", lambda pose: np.diag([1.0, -1, -1, 1]) @ pose, "y and z flipped"),
-    (
-        "poses",
-        lambda pose: np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]) @ pose,
-        "outside every",
-    ),
     ("cameras", lambda pose: pose * [1, -1, -1, 1], "camera axes are OpenCV's"),
     ("cameras", np.linalg.inv, "world-to-camera"),
     ("cameras", lambda pose: np.linalg.inv(pose * [1, -1, -1, 1]), "world-to-camera with OpenCV axes"),
@@ -151,12 +152,34 @@ def test_a_whole_capture_in_metres_is_noticed(folder):
     assert any("metres" in problem.message for problem in problems(folder))
 
 
-def test_a_sensor_mounted_behind_the_tip_is_only_a_warning(folder):
+@pytest.fixture()
+def sample(folder, tmp_path):
+    """A copy of the sample capture, whose instrument turns and moves as a real one does."""
+    return type(folder)(Path(shutil.copytree(SAMPLE, tmp_path / "sample")))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (np.linalg.inv, "instrument-from-world"),
+        (lambda pose: np.diag([1.0, -1, -1, 1]) @ pose, "y and z flipped"),
+        (lambda pose: _scale(pose, 1e3), "metres"),
+    ],
+)
+def test_mistakes_in_instrument_poses_are_named(sample, mistake, words):
+    sample.edit_poses(mistake)
+    (problem,) = problems(sample)
+    assert problem.field == "frames[*].instruments[*].pose"
+    assert "outside" in problem.message
+    assert words in problem.message
+
+
+def test_a_sensor_mounted_behind_the_tip_is_only_a_warning(sample):
     behind = np.eye(4)
-    behind[:3, 3] = [0, 150.0, 0]
-    folder.edit_poses(lambda pose: pose @ behind)
-    assert problems(folder) == []
-    assert_found(folder, "frames[*].instruments[*].pose", "outside every image", "warning")
+    behind[:3, 3] = [0, 0, -100.0]
+    sample.edit_poses(lambda pose: pose @ behind)
+    assert problems(sample) == []
+    assert_found(sample, "frames[*].instruments[*].pose", "outside every image", "warning")
 
 
 def test_a_sensor_mounted_tilted_is_fine(folder):
