@@ -75,7 +75,7 @@ def _dispatch(words: list[str]) -> int:
 def _verb(name: str) -> tuple[Callable[[Any], int], Callable[..., Any]]:
     """A verb's `run` and the dataclass of its arguments, which is what `run` takes."""
     run = importlib.import_module(f"{__name__}.{name}").run
-    return run, get_type_hints(run)["args"]
+    return run, next(iter(get_type_hints(run).values()))
 
 
 def _named_only(name: str, line: str) -> Callable[..., Any]:

@@ -81,15 +81,13 @@ def _check(path: Path) -> None:
 def _train(capture: Path, output: Path, minutes: float) -> Run:
     from dataclasses import replace
 
-    from neeco.cli._progress import training_bar
+    from neeco.cli._training import train_with_progress
     from neeco.training.config import method_defaults
     from neeco.training.run import load_run
-    from neeco.training.train import train
 
     print(f"2/4 train for {minutes:g} minutes")
-    with training_bar() as progress:
-        path = train(capture, output, replace(method_defaults("kinematic"), minutes=minutes), progress=progress)
-    return load_run(path)
+    config = replace(method_defaults("kinematic"), minutes=minutes)
+    return load_run(train_with_progress(capture, output, config))
 
 
 def _synthesize(trained: Run, output: Path) -> None:
