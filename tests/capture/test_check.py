@@ -152,7 +152,7 @@ def test_a_whole_capture_in_metres_is_noticed(folder):
     assert any("metres" in problem.message for problem in problems(folder))
 
 
-@pytest.fixture()
+@pytest.fixture
 def sample(folder, tmp_path):
     """A copy of the sample capture, whose instrument turns and moves as a real one does."""
     return type(folder)(Path(shutil.copytree(SAMPLE, tmp_path / "sample")))
