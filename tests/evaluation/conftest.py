@@ -17,7 +17,8 @@ def world() -> ModuleType:
     """The module itself: tests are not a package, so it cannot be imported by name."""
     if "neeco_test_worlds" not in sys.modules:
         spec = importlib.util.spec_from_file_location("neeco_test_worlds", WORLDS)
-        assert spec is not None and spec.loader is not None
+        assert spec is not None
+        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)

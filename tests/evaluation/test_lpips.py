@@ -70,5 +70,5 @@ def test_damaged_or_foreign_weights_are_refused(tmp_path):
     with pytest.raises(NeecoError, match="not a readable safetensors"):
         load_lpips(path, "alexnet")
     save_file({"features.0.weight": torch.zeros(4, 3, 3, 3)}, path)
-    with pytest.raises(NeecoError, match="features.0"):
+    with pytest.raises(NeecoError, match=r"features\.0"):
         load_lpips(path, "alexnet")

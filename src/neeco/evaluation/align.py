@@ -34,9 +34,9 @@ class AlignConfig:
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
     levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # resolutions, coarse to fine
-    steps: tuple[int, ...] = (3, 2, 3)  # Gauss-Newton steps at each
+    steps: tuple[int, ...] = (3, 2, 2)  # Gauss-Newton steps at each
     huber: float = 0.05  # colour residual beyond which a pixel pulls linearly: highlights and unseen tissue
-    correlation_px: float = 16.0  # neighbouring pixels err together: so many count as one observation
+    correlation_px: float = 100.0  # neighbouring pixels err together: so many count as one observation
     step_mm: float = 0.1  # finite difference at full resolution, larger at coarse levels
     step_deg: float = 0.1
 
@@ -97,7 +97,7 @@ def align_frame(scene: Scene, frame: Frame, config: AlignConfig | None = None) -
 
     One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), with
     weak Gaussian priors at zero; joints and intrinsics stay. Pixels outside the frame's loss mask do not count.
-    Costs about 8 * (6 * instruments + 8) small drawings. Raises NeecoError when the photograph cannot be read.
+    Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the photograph cannot be read.
     """
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)

@@ -20,8 +20,8 @@ from neeco.raster.types import Camera
 if TYPE_CHECKING:
     from neeco.scene import Scene
 
-MAX_VIEWS = 128  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
-FACTOR = 0.5  # of the image's resolution
+MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
+FACTOR = 0.25  # of the image's resolution
 TOLERANCE = 0.02  # of the depth
 TOLERANCE_MM = 1.0
 CHUNK = 16  # views tested at once; most points are found seen in the first chunk
@@ -70,7 +70,7 @@ class Coverage:
 
 @torch.no_grad()
 def observe(scene: Scene, frames: Sequence[Frame]) -> Coverage:
-    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, at half resolution, instrument included."""
+    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, at a quarter of the resolution, instrument included."""
     count = min(len(frames), MAX_VIEWS)
     chosen = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, count)] if count else []
     drawn = []

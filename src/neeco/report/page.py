@@ -131,8 +131,8 @@ def _numbers(evaluation: dict[str, Any]) -> str:
     return (
         "<h2>Numbers</h2>"
         "<p>A tracker that is off by a millimetre moves the drawn instrument by pixels, whatever the model knows. So "
-        "there are two scores: <b>as given</b> says what a user of these poses gets; <b>aligned</b> says what the model "
-        "knows, and how good its labels are, because a synthesised image and its label share one pose.</p>"
+        "there are two scores: <b>as given</b> says what a user of these poses gets; <b>aligned</b> says what the "
+        "model knows, and how good its labels are, because a synthesised image and its label share one pose.</p>"
         f"<div class='scroll'><table><thead><tr><th>split</th>{head}</tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div>"
         f"<details open><summary>What the numbers mean</summary><dl class='explain'>{meanings}</dl></details>"

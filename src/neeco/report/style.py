@@ -33,6 +33,7 @@ svg text { fill: var(--soft); font-size: 11px; font-family: inherit; } svg .titl
 svg .grid { stroke: var(--edge); } svg .line { fill: none; stroke: var(--accent); stroke-width: 1.8; }
 svg .end { fill: var(--accent); } svg .phase { stroke: var(--phase); stroke-dasharray: 4 3; }
   svg .phase-name { fill: var(--phase); }
+.frame > p { max-width: none; }
 .row { display: grid; grid-template-columns: repeat(4, 1fr); gap: 8px; margin: 4px 0 2px; }
 figure { margin: 0; break-inside: avoid; } figure img { width: 100%; height: auto; display: block;
   border-radius: 6px; }
