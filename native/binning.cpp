@@ -9,6 +9,14 @@
 #include "parallel.hpp"
 
 namespace neeco {
+
+template class Buffer<uint32_t>;
+template class Buffer<int32_t>;
+template class Buffer<float>;
+template class Buffer<double>;
+template class Buffer<Pair>;
+template class Buffer<Span>;
+
 namespace {
 
 constexpr int kDigitBits = 11, kDigits = 1 << kDigitBits;

@@ -69,6 +69,12 @@ private:
     size_t capacity_ = 0;
 };
 
+// Compiled once, in binning.cpp: never into the kernels' objects, whose instructions not every machine has.
+extern template class Buffer<uint32_t>;
+extern template class Buffer<int32_t>;
+extern template class Buffer<float>;
+extern template class Buffer<double>;
+
 struct Camera {
     float rotation[9];        // camera_from_world, row major
     float translation[3];     // camera_from_world, mm
@@ -144,6 +150,9 @@ struct Pair {
 struct Span {
     uint32_t first, count;
 };
+
+extern template class Buffer<Pair>;
+extern template class Buffer<Span>;
 
 constexpr int kChunkBits = 11;  // Gaussians are projected in chunks of 2048, whatever the number of threads
 constexpr int kChunk = 1 << kChunkBits;

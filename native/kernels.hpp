@@ -10,8 +10,8 @@ struct LossInputs {
     const float* image;         // [H, W, 3]
     const float* target;        // [H, W, 3]
     const float* mask;          // [H, W] 0 or 1, or null
-    const float* target_mean;   // [3, H, W] blurred target, or null: computed
-    const float* target_square; // [3, H, W] blurred squared target
+    const float* target_mean;   // [H, W, 3] blurred target, or null: computed
+    const float* target_square; // [H, W, 3] blurred squared target
     float ssim_weight;
     double pixels;              // unmasked pixels
 };

@@ -7,6 +7,8 @@ void bind_loss(nanobind::module_& m);
 }  // namespace neeco
 
 NB_MODULE(_native, m) {
+    // torch's autograd graph may hold drawings until after the interpreter has gone.
+    nanobind::set_leak_warnings(false);
     m.doc() = "CPU kernels of neeco: use neeco.raster, not this.";
     neeco::bind_raster(m);
     neeco::bind_loss(m);
