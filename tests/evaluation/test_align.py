@@ -14,8 +14,16 @@ def scene_and_frame(world, tmp_path_factory):
     return scene, world.make_capture(tmp_path_factory.mktemp("capture"), scene, ("train", "test")).frames[1]
 
 
-# the tiny image is 48 px wide, so millimetres move it by half as many pixels as in a real one
-LOOSE = AlignConfig(sigma_instrument_mm=5, sigma_instrument_deg=5, sigma_camera_mm=5, sigma_camera_deg=2, levels=(0.5, 1.0), steps=(4, 5))  # fmt: skip  # noqa: E501
+# the tiny image has a fortieth of a real one's pixels and no noise: each says more
+LOOSE = AlignConfig(
+    sigma_instrument_mm=5,
+    sigma_instrument_deg=5,
+    sigma_camera_mm=5,
+    sigma_camera_deg=2,
+    levels=(0.5, 1.0),
+    steps=(4, 5),
+    correlation_px=16,
+)
 
 
 def test_a_displaced_instrument_and_camera_are_found_again(world, scene_and_frame):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
 FACTOR = 0.25  # of the image's resolution
+MIN_SIDE = 48  # px; small images are shrunk no further
 TOLERANCE = 0.02  # of the depth
 TOLERANCE_MM = 1.0
 CHUNK = 16  # views tested at once; most points are found seen in the first chunk
@@ -70,12 +71,12 @@ class Coverage:
 
 @torch.no_grad()
 def observe(scene: Scene, frames: Sequence[Frame]) -> Coverage:
-    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, at a quarter of the resolution, instrument included."""
+    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
     count = min(len(frames), MAX_VIEWS)
     chosen = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, count)] if count else []
     drawn = []
     for frame in chosen:
-        camera = resize_camera(scene.camera(frame.camera), FACTOR)
+        camera = _small(scene.camera(frame.camera))
         rendering = rasterize(scene.at(frame.state), camera)
         drawn.append((camera, _filled(rendering.depth, rendering.alpha)))
     height = max((camera.height for camera, _ in drawn), default=1)
@@ -99,7 +100,7 @@ def unseen_tissue(coverage: Coverage, scene: Scene, frame: Frame) -> tuple[Tenso
     The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the
     nearest drawn pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
-    camera = resize_camera(scene.camera(frame.camera), FACTOR)
+    camera = _small(scene.camera(frame.camera))
     labels = scene.label_channels()
     rendering = rasterize(scene.at(frame.state), camera, channels=labels if labels.shape[1] else None)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
@@ -110,6 +111,11 @@ def unseen_tissue(coverage: Coverage, scene: Scene, frame: Frame) -> tuple[Tenso
     unseen[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)
     return resize_mask(unseen, *size), resize_mask(tissue, *size)
+
+
+def _small(camera: Camera) -> Camera:
+    """The camera at the resolution coverage is judged at."""
+    return resize_camera(camera, min(1.0, max(FACTOR, MIN_SIDE / min(camera.width, camera.height))))
 
 
 def _filled(depth: Tensor, alpha: Tensor) -> Tensor:

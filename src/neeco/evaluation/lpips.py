@@ -80,7 +80,7 @@ class Lpips:
             if mask is None:
                 total += float(difference.mean())
             else:
-                share = adaptive_avg_pool2d(mask[None].float(), difference.shape)[0]
+                share = adaptive_avg_pool2d(mask[None].float(), (difference.shape[0], difference.shape[1]))[0]
                 total += float((difference * share).sum() / share.sum())
         return total
 
