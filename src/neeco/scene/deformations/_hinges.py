@@ -16,7 +16,8 @@ class Hinges(nn.Module):
 
     The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer, instrument_from_shaft with z
     along the shaft) by two learned tilts (rad) and two shifts (mm). Joint j turns two parts about the axis at `hinge_angle[j]`
-    (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns by `offsets[j, k] + gains[j, k] * reading`.
+    (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns by `offsets[j, k] + gains[j, k] * reading`. The reading is the angle between the two parts, so
+    the gains are `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
     Parts are soft: a Gaussian turns by its part weights times the parts' angles.
     """
 
@@ -36,7 +37,13 @@ class Hinges(nn.Module):
         self.hinge_angle = nn.Parameter(torch.zeros(count))
         self.hinge_depth = nn.Parameter(torch.zeros(count))
         self.offsets = nn.Parameter(torch.zeros(count, 2))
-        self.gains = nn.Parameter(torch.tensor([0.5, -0.5]).repeat(count, 1))
+        self.share = nn.Parameter(torch.full((count,), 0.5))
+        self.scale = nn.Parameter(torch.ones(count))
+
+    @property
+    def gains(self) -> Tensor:
+        """[J, 2] rad of each part per rad of reading."""
+        return self.scale[:, None] * torch.stack([self.share, self.share - 1], -1)
 
     @property
     def part_count(self) -> int:
@@ -51,8 +58,11 @@ class Hinges(nn.Module):
         return origin, direction
 
     def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
-        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
-        origin, direction = self.shaft()
+        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame.
+
+        The shaft is taken as it is: only spinning it (see `spin`) teaches where it lies, or the hinge would drag it along.
+        """
+        origin, direction = (part.detach() for part in self.shaft())
         angle = self.hinge_angle[joint]
         around = self.base[:3, :3] @ torch.stack([angle.cos(), angle.sin(), torch.zeros(())])
         axis = nn.functional.normalize(around - (around @ direction) * direction, dim=0)

@@ -77,6 +77,6 @@ class Deformation(nn.Module):
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
         return {}
 
-    def learning_rates(self) -> dict[str, float]:
-        """Adam learning rate of each of this module's parameters, by name."""
+    def learning_rates(self, iteration: int) -> dict[str, float]:
+        """Adam learning rate of each of this module's parameters at `iteration`, by name; 0 holds one still."""
         return {}

@@ -17,6 +17,7 @@ from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Pert
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
 PART_LOGITS = "part_logits"
+HINGE_START = 600  # iteration
 
 
 class Kinematic(Deformation):
@@ -73,7 +74,7 @@ class Kinematic(Deformation):
             points, quats = hinges.spin(points, quats, perturbation.shaft_roll)
             _, turned = hinges.spin(points.detach(), turned, perturbation.shaft_roll)
         if hinges.joint_names:
-            points, turn = hinges.bend(points, self._weights(canonical, index), given.joints)
+            points, turn = hinges.bend(points, self.part_weights(canonical, index), given.joints)
             assert turn is not None
             quats, turned = quat_multiply(turn, quats), quat_multiply(turn, turned)
         pose = given.pose.to(points.dtype)
@@ -81,7 +82,7 @@ class Kinematic(Deformation):
         means = points @ pose[:3, :3].T + pose[:3, 3]
         return means, quat_multiply(world_quat, quats), quat_multiply(world_quat, turned).detach()
 
-    def _weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+    def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """Part weights [M, part_count] of one instrument's Gaussians."""
         logits = canonical.extras[PART_LOGITS][canonical.body(index + 1)]
         return torch.softmax(logits[:, : self.hinges_of(index).part_count], -1)
@@ -95,7 +96,7 @@ class Kinematic(Deformation):
                 labels[rows, column] = 1.0
                 column += 1
                 continue
-            weights = self._weights(canonical, index)
+            weights = self.part_weights(canonical, index)
             wrist = (hinges.along_shaft(canonical.means[rows]) >= hinges.wrist_start).to(weights.dtype)
             parts = [weights[:, 0] * (1 - wrist), weights[:, 0] * wrist]
             for joint in range(len(hinges.joint_names)):
@@ -135,15 +136,19 @@ class Kinematic(Deformation):
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
 
-    def learning_rates(self) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
+        """Hinges hold still until the Gaussians have taken shape around them, or unformed ones would drag them off."""
         rates = {
             "shaft_tilt": 8e-3,
             "shaft_shift": 8e-2,
             "hinge_angle": 1e-2,
             "hinge_depth": 8e-2,
             "offsets": 6e-3,
-            "gains": 6e-3,
+            "share": 6e-3,
+            "scale": 2e-4,
         }
+        if iteration < HINGE_START:
+            rates = dict.fromkeys(rates, 0.0)
         return {name: rates[name.rsplit(".", 1)[-1]] for name, _ in self.named_parameters()}
 
 

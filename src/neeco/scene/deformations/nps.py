@@ -175,7 +175,7 @@ class NPS(Deformation):
             return torch.zeros(len(canonical), len(self.label_names))
         return canonical.extras[MEMBERSHIP][:, None]
 
-    def learning_rates(self) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         return {name: 8e-4 for name, _ in self.named_parameters()}
 
 

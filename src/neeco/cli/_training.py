@@ -1,0 +1,37 @@
+"""The progress bar that `train` and `demo` share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from neeco.training.config import TrainConfig
+from neeco.training.train import ProgressRow, train
+
+
+def train_with_progress(capture: Path, output: Path, config: TrainConfig, *, resume: bool = False) -> Path:
+    """`train` with a bar on stderr: PSNR, Gaussians, phase, time left; news in words above it."""
+    console = Console(stderr=True)
+    columns = [
+        TextColumn("training"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    ]
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def show(row: ProgressRow) -> None:
+            if row.note:
+                bar.console.print(row.note, style="dim", highlight=False)
+                return
+            text = (
+                f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB  {row.num_gaussians} Gaussians  phase {row.phase}"
+            )
+            bar.update(task, completed=row.progress, description=text)
+
+        return train(capture, output, config, resume=resume, progress=show)

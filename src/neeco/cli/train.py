@@ -1,0 +1,62 @@
+"""`neeco train`: learn a scene from a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Learn a scene from a capture's training frames."""
+
+    capture: tyro.conf.Positional[Path]
+    """Capture folder (or a transforms file in one)."""
+    output: Path
+    """Run folder to write."""
+    method: str = "kinematic"
+    """kinematic, neeco (the paper) or 3dgs."""
+    iterations: int | None = None
+    """Optimisation steps; by default as the method has it."""
+    minutes: float | None = None
+    """Stop in time with a finished run."""
+    seed: int = 0
+    """The same seed gives the same scene on the same machine (without --minutes)."""
+    resume: bool = False
+    """Continue an interrupted run in --output, under the settings it was started with."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    joints: tuple[str, ...] | None = None
+    """Joints that move parts; by default those that the pose does not already explain."""
+    tissue_budget: int | None = None
+    """Most Gaussians of the tissue."""
+    instrument_budget: int | None = None
+    """Most Gaussians of each instrument."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Any other field of the training config, as NAME=VALUE (e.g. schedule.density=inverse); repeatable."""
+
+
+def run(args: Arguments) -> int:
+    """Train with a progress bar; print where the run lies."""
+    from neeco.cli._training import train_with_progress
+    from neeco.training.options import training_config
+
+    config = training_config(
+        args.method,
+        {
+            "iterations": args.iterations,
+            "minutes": args.minutes,
+            "seed": args.seed,
+            "transforms": args.transforms,
+            "joints": args.joints,
+            "tissue_budget": args.tissue_budget,
+            "instrument_budget": args.instrument_budget,
+        },
+        args.set,
+    )
+    path = train_with_progress(args.capture, args.output, config, resume=args.resume)
+    print(f"finished: {path}  (next: neeco evaluate {path})")
+    return 0

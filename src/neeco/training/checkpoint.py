@@ -1,0 +1,87 @@
+"""Checkpoints: one safetensors file with everything a session needs to go on bit for bit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.files import write_atomically
+from neeco.scene.io import pack_scene, unpack_scene
+from neeco.scene.scene import Scene
+from neeco.training.session import Session
+
+SCHEMA = "neeco-checkpoint/1"
+
+
+def checkpoint_path(run: Path) -> Path:
+    """Where a run keeps its checkpoint."""
+    return run / "checkpoint" / "session.safetensors"
+
+
+def save_checkpoint(session: Session, run: Path) -> None:
+    """Write the session's whole state atomically."""
+    tensors, scene_header = pack_scene(session.scene)
+    tensors = {f"scene/{name}": tensor for name, tensor in tensors.items()}
+    groups = {
+        "adam": session.adam.tensors(),
+        "refinement": session.refinement.tensors(),
+        "statistics": {"total": session.statistics.total, "seen": session.statistics.seen},
+        "random": {"torch": torch.get_rng_state(), "generator": session.generator.get_state()},
+    }
+    for group, members in groups.items():
+        tensors |= {f"{group}/{name}": tensor.detach().contiguous() for name, tensor in members.items()}
+    header = {
+        "schema": SCHEMA,
+        "scene": scene_header,
+        "adam_steps": session.adam.steps,
+        "schedule": session.schedule.state_dict(),
+        "rng": session.rng.bit_generator.state,
+        "queue": session.queue,
+        "queue_phase": session.queue_phase,
+        "iteration": session.iteration,
+        "seconds": session.seconds,
+    }
+    metadata = {"neeco": json.dumps(header)}
+    write_atomically(checkpoint_path(run), lambda temporary: save_file(tensors, temporary, metadata))
+
+
+def read_checkpoint(run: Path) -> tuple[Scene, dict[str, Any], dict[str, Tensor]]:
+    """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
+    path = checkpoint_path(run)
+    try:
+        with safe_open(path, framework="pt") as stream:
+            header = json.loads((stream.metadata() or {})["neeco"])
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        if header["schema"] != SCHEMA:
+            raise ValueError(f"schema {header['schema']!r}, this version reads {SCHEMA!r}")
+        parts = {name.removeprefix("scene/"): t for name, t in tensors.items() if name.startswith("scene/")}
+        scene = unpack_scene(parts, header["scene"])
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise NeecoError(
+            f"{path}: cannot resume from this checkpoint ({error}); train again without --resume"
+        ) from None
+    return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+
+
+def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Put a fresh session, made around the checkpoint's scene, where the checkpoint was."""
+
+    def group(name: str) -> dict[str, Tensor]:
+        return {key.removeprefix(f"{name}/"): t for key, t in tensors.items() if key.startswith(f"{name}/")}
+
+    session.adam.restore(group("adam"), header["adam_steps"])
+    session.refinement.restore(group("refinement"))
+    session.statistics.total, session.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
+    session.schedule.load_state_dict(header["schedule"])
+    session.rng.bit_generator.state = header["rng"]
+    session.generator.set_state(tensors["random/generator"])
+    torch.set_rng_state(tensors["random/torch"])
+    session.queue, session.queue_phase = header["queue"], header["queue_phase"]
+    session.iteration, session.seconds = header["iteration"], header["seconds"]

@@ -1,0 +1,101 @@
+"""Density control (Kerbl et al. 2023): clone, split and prune, within a hard budget per body."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.rotations import quat_to_matrix
+from neeco.training.optimizer import Adam
+
+MIN_OPACITY = 0.005
+SPLIT_SHRINK = 1.6
+
+
+class GradientStatistics:
+    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images in which it was drawn."""
+
+    def __init__(self, count: int) -> None:
+        self.total = torch.zeros(count)
+        self.seen = torch.zeros(count)
+
+    def record(self, center_gradients: Tensor, width: int, height: int) -> None:
+        """center_gradients [N, 2], d loss / d px."""
+        norm = (center_gradients * torch.tensor([width / 2, height / 2])).norm(dim=1)
+        self.total += norm
+        self.seen += norm > 0
+
+    def mean(self) -> Tensor:
+        """[N]."""
+        return self.total / self.seen.clamp_min(1)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How many Gaussians one body may have, and the size (mm) that divides cloning from splitting."""
+
+    most: int
+    dense_size: float
+    largest: float = math.inf  # mm; greater Gaussians are removed
+
+
+@torch.no_grad()
+def control_density(
+    canonical: CanonicalGaussians,
+    adam: Adam,
+    statistics: GradientStatistics,
+    budgets: list[Budget],
+    threshold: float,
+    generator: torch.Generator,
+) -> CanonicalGaussians:
+    """Prune the transparent, clone small and split large Gaussians whose gradient exceeds `threshold`, strongest first.
+
+    `threshold` = inf only prunes. Adam's moments follow their rows; new rows start at zero.
+    """
+    gradients, bodies = statistics.mean(), canonical.bodies
+    size = canonical.log_scales.max(1).values.exp()
+    dense = torch.tensor([budget.dense_size for budget in budgets])[bodies]
+    largest = torch.tensor([budget.largest for budget in budgets])[bodies]
+    keep = (torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY) & (size < largest)
+    grow = keep & (gradients > threshold)
+    for body, budget in enumerate(budgets):
+        rows = bodies == body
+        room = max(0, budget.most - int((keep & rows).sum()))
+        wanted = torch.nonzero(grow & rows)[:, 0]
+        if len(wanted) > room:
+            strongest = gradients[wanted].argsort(descending=True, stable=True)
+            grow[wanted[strongest[room:]]] = False
+    clone, split = grow & (size <= dense), grow & (size > dense)
+    kept, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
+    index = torch.cat([kept, cloned, halves, halves])
+    fresh = torch.zeros(len(index), dtype=torch.bool)
+    fresh[len(kept) :] = True
+    is_half = torch.zeros_like(fresh)
+    is_half[len(kept) + len(cloned) :] = True
+    order = bodies[index].argsort(stable=True)  # bodies stay contiguous
+    index, fresh, is_half = index[order], fresh[order], is_half[order]
+    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(budgets)))
+    adam.select_rows(list(canonical.tensors()), index, fresh)
+    changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
+    _scatter_halves(changed, is_half, generator)
+    return changed
+
+
+def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, generator: torch.Generator) -> None:
+    """Move each half of a split Gaussian to a random place inside its parent and shrink it."""
+    rotation = quat_to_matrix(torch.nn.functional.normalize(canonical.quats[is_half], dim=-1))
+    scales = canonical.log_scales[is_half].exp()
+    offset = torch.randn(scales.shape, generator=generator) * scales
+    canonical.means[is_half] += (rotation @ offset[..., None])[..., 0]
+    canonical.log_scales[is_half] -= math.log(SPLIT_SHRINK)
+
+
+@torch.no_grad()
+def reset_opacity(canonical: CanonicalGaussians, adam: Adam, ceiling: float = 0.01) -> None:
+    """Clamp every opacity to `ceiling` and forget its momentum (3DGS)."""
+    canonical.opacity_logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
+    adam.forget("opacity_logits")

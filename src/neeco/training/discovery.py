@@ -1,0 +1,159 @@
+"""Find each instrument and its joints from training frames alone, and seed its Gaussians (method `kinematic`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.deformations._hinges import Hinges
+from neeco.scene.deformations.kinematic import PART_LOGITS, Kinematic
+from neeco.scene.deformations.static import Static
+from neeco.scene.scene import Recording, Scene
+from neeco.training.carving import CarvedShape, carve
+from neeco.training.config import PLAIN, RefineConfig, TrainConfig
+from neeco.training.evidence import Evidence, gather_evidence
+from neeco.training.hinge_search import dominant_angle, search_hinge
+from neeco.training.refinement import Refinement
+from neeco.training.session import Session
+
+TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
+SEEDS = 3000  # Gaussians per instrument at the start
+BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
+
+Report = Callable[[str], None]
+
+
+def find_instruments(
+    scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig, report: Report
+) -> None:
+    """Add every instrument's body to `scene`, whose canonical set holds the tissue alone, and start its hinges.
+
+    Raises NeecoError when an instrument leaves no evidence in its own frame: its poses do not match the images.
+    """
+    deformation = scene.deformation
+    assert isinstance(deformation, Kinematic)
+    report("looking for the instruments: fitting the tissue alone")
+    evidence = tissue_evidence(scene, frames, images, config)
+    generator = torch.Generator().manual_seed(config.seed)
+    bodies = [_with_logits(scene.canonical, deformation.logit_count)]
+    for index, instrument in enumerate(scene.instruments):
+        shape = carve(evidence, instrument.name, generator, SEEDS)
+        if shape is None:
+            raise NeecoError(
+                f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its poses "
+                "are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
+            )
+        hinges = deformation.hinges_of(index)
+        start_hinges(hinges, evidence, instrument.name, shape, report)
+        body = seed_gaussians(shape.seeds, torch.full((SEEDS, 3), 0.4), torch.full((SEEDS,), 0.4 * shape.radius))
+        logits = seed_logits(hinges, shape.seeds, deformation.logit_count, generator)
+        bodies.append(body.with_extras(**{PART_LOGITS: logits}))
+    scene.canonical = join_bodies(bodies)
+
+
+def tissue_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig) -> Evidence:
+    """Fit a copy of the tissue with nothing moving for a few hundred steps; what is left over is the evidence."""
+    tissue = scene.canonical.map(lambda tensor: tensor.clone())
+    alone = Scene("3dgs", tissue, Static(()), (), Recording(), scene.center)
+    short = replace(
+        config,
+        iterations=TISSUE_STEPS,
+        minutes=None,
+        schedule=PLAIN,
+        refine=RefineConfig(),
+        density_start=10**9,
+        opacity_penalty=0.0,
+        label_sharpness=0.0,
+        shaft_roll=0.0,
+    )
+    session = new_session(alone, frames, images, [frame.load_mask() for frame in frames], short)
+    while session.iteration < TISSUE_STEPS:
+        session.step()
+    alone.requires_grad_(False)
+    return gather_evidence(alone, frames, images)
+
+
+def new_session(
+    scene: Scene,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    config: TrainConfig,
+) -> Session:
+    """A session at iteration 0."""
+    names = tuple(instrument.name for instrument in scene.instruments)
+    return Session(
+        config,
+        scene,
+        frames,
+        list(images),
+        list(masks),
+        pose_order(frames, names),
+        scene_extent(frames, scene.center),
+        Refinement(config.refine, frames, names),
+        np.random.default_rng(config.seed),
+        torch.Generator().manual_seed(config.seed),
+    )
+
+
+def scene_extent(frames: tuple[Frame, ...], center: Tensor) -> float:
+    """Half the median distance from the cameras to the scene's middle, mm: scales the positions' learning rate."""
+    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in frames]
+    return 0.5 * float(np.median(distances))
+
+
+def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
+    """Frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
+    from neeco.training.schedule import order_by_pose
+
+    if not instruments:
+        return np.arange(len(frames))
+    rows = [
+        np.concatenate([frame.state.instruments[name].pose[:3, 1:].double().numpy().ravel() for name in instruments])
+        for frame in frames
+    ]
+    return order_by_pose(np.stack(rows))
+
+
+def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> None:
+    """Put the shaft where it was carved and each joint at the best hypothesis of the search."""
+    hinges.base.copy_(shape.instrument_from_shaft)
+    hinges.extent.copy_(torch.tensor([shape.near, shape.tip]))
+    for index, joint in enumerate(hinges.joint_names):
+        guesses = search_hinge(evidence, name, joint, shape)
+        if not guesses:
+            report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
+            continue
+        with torch.no_grad():
+            hinges.hinge_angle[index] = dominant_angle(guesses)
+            hinges.hinge_depth[index] = guesses[0].depth
+            hinges.share[index] = 1.0 if guesses[0].gains[1] == 0 else 0.5
+            lowest = min(frame.state.instruments[name].joints[joint] for frame in evidence.frames)
+            hinges.offsets[index] = -lowest * hinges.gains[index]
+    if hinges.joint_names:
+        hinges.wrist_start.fill_(float(hinges.hinge_depth[0].detach()) - 5 * shape.radius)
+
+
+def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
+    """[M, columns] part logits: behind the first hinge the body, beyond it one of the moving parts at random."""
+    logits = 0.3 * torch.randn(len(seeds), columns, generator=generator)
+    if not hinges.joint_names:
+        return logits
+    with torch.no_grad():
+        along = hinges.along_shaft(seeds)
+        beyond = along > hinges.hinge_depth[0]
+        logits[:, 0] += torch.where(beyond, 0.0, BODY_LEAN)
+        side = torch.randint(1, hinges.part_count, (len(seeds),), generator=generator)
+        lean = nn.functional.one_hot(side, columns) * (BODY_LEAN / 2)
+        return logits + torch.where(beyond[:, None], lean, torch.zeros(()))
+
+
+def _with_logits(tissue: CanonicalGaussians, columns: int) -> CanonicalGaussians:
+    return tissue.with_extras(**{PART_LOGITS: torch.zeros(len(tissue), columns)})

@@ -1,0 +1,79 @@
+"""Where the instruments are, before anything is known of them: what a scene of tissue alone cannot explain.
+
+A short static fit explains the tissue; each image's residual is the evidence. No mask, CAD or label is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Frame
+from neeco.raster import rasterize
+from neeco.scene.scene import Scene
+
+FLOOR, RANGE = 0.04, 0.06  # residual at which evidence begins, and over which it saturates (images in [0, 1])
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """F frames' residuals as soft masks, and what is needed to look points up in them."""
+
+    hits: Tensor  # [F, H, W] in [0, 1]
+    depths: Tensor  # [F, H, W] mm, of the tissue
+    camera_from_world: Tensor  # [F, 4, 4]
+    intrinsics: Tensor  # [F, 4] fx, fy, cx, cy
+    frames: tuple[Frame, ...]
+
+    @cached_property
+    def distance(self) -> float:
+        """Median distance from camera to tissue, mm: the scale of the scene."""
+        return float(self.depths[self.depths.isfinite() & (self.depths > 0)].median())
+
+    def subset(self, index: Tensor) -> Evidence:
+        """The frames `index` [M] alone."""
+        frames = tuple(self.frames[i] for i in index.tolist())
+        return Evidence(
+            self.hits[index], self.depths[index], self.camera_from_world[index], self.intrinsics[index], frames
+        )
+
+    def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue: two [F, Q]."""
+        x, y, z = points.unbind(-1)
+        fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
+        u, v = x / z * fx + cx, y / z * fy + cy
+        height, width = self.hits.shape[1:]
+        inside = (z > 0.01 * self.distance) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        column, row = u.nan_to_num().clamp(0, width - 1).long(), v.nan_to_num().clamp(0, height - 1).long()
+        place = (torch.arange(len(self.frames))[:, None] * height + row) * width + column
+        inside &= z < 1.02 * self.depths.view(-1)[place]
+        return self.hits.view(-1)[place], inside
+
+
+@torch.no_grad()
+def gather_evidence(scene: Scene, frames: tuple[Frame, ...], images: list[Tensor], most: int = 120) -> Evidence:
+    """Residuals of a tissue-only `scene` against at most `most` training images ([H, W, 3] uint8), evenly picked."""
+    step = max(1, -(-len(frames) // most))
+    picked = list(range(0, len(frames), step))
+    hits, depths = [], []
+    for index in picked:
+        frame = frames[index]
+        rendering = rasterize(scene.at(frame.state), frame.camera)
+        residual = (rendering.color - images[index].float() / 255).abs().mean(-1)
+        mask = frame.load_mask()
+        if mask is not None:
+            residual = residual * mask
+        smooth = torch.nn.functional.avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
+        hits.append(((smooth - FLOOR) / RANGE).clamp(0, 1))
+        depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
+    cameras = [frames[i].camera for i in picked]
+    return Evidence(
+        torch.stack(hits),
+        torch.stack(depths),
+        torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]),
+        torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]),
+        tuple(frames[i] for i in picked),
+    )

@@ -1,0 +1,147 @@
+"""After learning: where the wrist begins, how long the instrument is, and whether its joints were really found."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import InstrumentState, State
+from neeco.raster import rasterize
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations._hinges import Hinges
+from neeco.scene.deformations.base import UNPERTURBED, Perturbation
+from neeco.scene.deformations.kinematic import Kinematic
+from neeco.training.session import Session
+
+ROLLS = (1.3, 2.6, -1.9)  # rad, with which rotational symmetry is tested
+WRIST_STEPS = 12
+SYMMETRY_TOLERANCE = 0.15  # of the largest loss that spinning causes
+FOUND = 0.25  # share of the moving parts' error that the readings must explain
+
+
+@torch.no_grad()
+def finish_instruments(session: Session) -> None:
+    """Set each instrument's wrist and extent and write the joints' verdicts into `scene.diagnostics`."""
+    deformation = session.scene.deformation
+    if not isinstance(deformation, Kinematic):
+        return
+    place_wrists(session)
+    verdicts: dict[str, Any] = {}
+    for index, instrument in enumerate(session.scene.instruments):
+        hinges = deformation.hinges_of(index)
+        hinges.extent.copy_(_extent(session.scene.canonical, index, hinges))
+        for joint, name in enumerate(hinges.joint_names):
+            verdicts[f"{instrument.name}.{name}"] = _verdict(session, index, joint)
+    session.scene.diagnostics["joints"] = verdicts
+    session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
+    session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
+
+
+@torch.no_grad()
+def place_wrists(session: Session) -> None:
+    """The wrist begins where the shaft stops being a surface of revolution: where spinning what lies behind starts to cost."""
+    scene = session.scene
+    deformation = scene.deformation
+    if not isinstance(deformation, Kinematic):
+        return
+    frames = _spread(session, 10)
+    for index in range(len(scene.instruments)):
+        hinges = deformation.hinges_of(index)
+        if not hinges.joint_names:
+            continue
+        hinge = float(hinges.hinge_depth[0])
+        rear = float(_extent(scene.canonical, index, hinges)[0])
+        starts = torch.linspace(rear + 0.3 * (hinge - rear), hinge, WRIST_STEPS)
+        base = sum(_image_error(session, f, UNPERTURBED) for f in frames)
+        costs = []
+        for start in starts:
+            hinges.wrist_start.fill_(float(start))
+            costs.append(sum(_image_error(session, f, Perturbation(ROLLS[k % 3])) for k, f in enumerate(frames)) - base)
+        limit = max(costs) * SYMMETRY_TOLERANCE + max(0.0, min(costs))
+        cheap = [float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit]
+        hinges.wrist_start.fill_(max(cheap) if cheap else float(starts[0]))
+
+
+def _spread(session: Session, count: int) -> list[int]:
+    """Indices of `count` training frames spread evenly along the walk through poses."""
+    order = session.pose_order
+    return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
+
+
+def _image_error(session: Session, index: int, perturbation: Perturbation) -> float:
+    frame = session.frames[index]
+    state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
+    rendering = rasterize(session.scene.at(state, perturbation), camera)
+    return float((rendering.color - session.images[index].float() / 255).abs().mean())
+
+
+def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor:
+    """[2] mm along the shaft between which the solid Gaussians lie."""
+    rows = canonical.body(index + 1)
+    solid = torch.sigmoid(canonical.opacity_logits[rows]) > 0.3
+    along = hinges.along_shaft(canonical.means[rows][solid])
+    if len(along) < 10:
+        return hinges.extent.clone()
+    return torch.quantile(along, torch.tensor([0.02, 0.985]))
+
+
+def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
+    """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving parts' image?
+
+    `explained` = 1 - error(reading) / error(reading replaced by the mean), over pixels that a moving part covers in either drawing.
+    """
+    scene = session.scene
+    deformation = scene.deformation
+    assert isinstance(deformation, Kinematic)
+    hinges, instrument = deformation.hinges_of(index), scene.instruments[index]
+    name = hinges.joint_names[joint]
+    readings = torch.tensor([frame.state.instruments[instrument.name].joints[name] for frame in session.frames])
+    ordered = readings.argsort()
+    extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
+    moving = _moving_weight(scene.canonical, deformation, index, joint)
+    given = middle = 0.0
+    for frame_index in extremes:
+        frame = session.frames[frame_index]
+        state, camera, _ = session.refinement.apply(frame_index, frame.state, frame.camera, session.iteration)
+        target = session.images[frame_index].float() / 255
+        drawings = [
+            rasterize(scene.at(variant), camera, channels=moving)
+            for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
+        ]
+        covered = torch.maximum(*(d.channels[..., 0] for d in drawings if d.channels is not None)) > 0.3
+        errors = [float((d.color - target).abs().mean(-1)[covered].sum()) for d in drawings]
+        given, middle = given + errors[0], middle + errors[1]
+    pivot, axis = hinges.hinge(joint)
+    explained = 1 - given / middle if middle > 0 else 0.0
+    found = bool(explained > FOUND and math.isfinite(explained))
+    return {
+        "found": found,
+        "explained": round(explained, 4),
+        "axis": [round(float(v), 5) for v in axis],
+        "pivot_mm": [round(float(v), 3) for v in pivot],
+        "gains": [round(float(v), 4) for v in hinges.gains[joint]],
+        "offsets_rad": [round(float(v), 4) for v in hinges.offsets[joint]],
+        "verdict": (
+            f"found: the reading explains {explained:.0%} of the moving parts' error"
+            if found
+            else f"NOT found: the reading explains only {explained:.0%} of the moving parts' error; "
+            "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
+        ),
+    }
+
+
+def _moving_weight(canonical: CanonicalGaussians, deformation: Kinematic, index: int, joint: int) -> Tensor:
+    """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
+    weight = torch.zeros(len(canonical), 1)
+    weights = deformation.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
+    weight[canonical.body(index + 1), 0] = weights.sum(1)
+    return weight
+
+
+def _with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
+    given = state.instruments[instrument]
+    changed = InstrumentState(given.pose, {**given.joints, joint: reading})
+    return State({**state.instruments, instrument: changed}, state.time)

@@ -1,0 +1,102 @@
+"""The scene before the first step, for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.scene.canonical import neighbour_spacing, seed_gaussians
+from neeco.scene.deformations.kinematic import Kinematic
+from neeco.scene.deformations.nps import NPS
+from neeco.scene.methods import make_deformation
+from neeco.scene.scene import Recording, Scene
+from neeco.training.config import TrainConfig
+from neeco.training.discovery import find_instruments
+
+REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
+
+Report = Callable[[str], None]
+
+
+def initial_scene(
+    capture: Capture, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig, report: Report
+) -> Scene:
+    """Seed Gaussians and deformation of `config.method` from the sparse points and the training frames alone.
+
+    images: [H, W, 3] uint8, one per frame. Raises NeecoError when a joint asked for is unknown.
+    """
+    instruments = tuple(
+        Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
+        for i in capture.instruments
+    )
+    recorded = Recording(
+        tuple(frame.name for frame in frames),
+        tuple(frame.split for frame in frames),
+        tuple(_reduced_state(frame.state, instruments) for frame in frames),
+        tuple(frame.camera for frame in frames),
+    )
+    positions, colors = _thinned_points(capture, config)
+    tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
+    deformation = make_deformation(config.method, instruments, config.deformation)
+    center = torch.from_numpy(np.median(positions, 0))
+    scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
+    if isinstance(deformation, NPS):
+        deformation.fit_ranges(list(recorded.states), tissue.means)
+    if isinstance(deformation, Kinematic):
+        find_instruments(scene, frames, images, config, report)
+    return scene
+
+
+def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [P, 3] mm and colours [P, 3] of at most `config.tissue_budget` sparse points."""
+    positions, colors = capture.points.positions, capture.points.colors
+    if len(positions) > config.tissue_budget:
+        chosen = np.random.default_rng(config.seed).choice(len(positions), config.tissue_budget, replace=False)
+        positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
+    return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
+
+
+def _reduced_state(state: State, instruments: tuple[Instrument, ...]) -> State:
+    """`state` with only the joints that move parts."""
+    kept = {}
+    for instrument in instruments:
+        given = state.instruments[instrument.name]
+        kept[instrument.name] = InstrumentState(given.pose, {joint: given.joints[joint] for joint in instrument.joints})
+    return State(kept, state.time)
+
+
+def moving_joints(
+    instrument: Instrument, frames: tuple[Frame, ...], wanted: tuple[str, ...] | None, report: Report
+) -> tuple[str, ...]:
+    """Joints that may move parts of the tracked body: those asked for, or those its pose does not already explain.
+
+    A robot arm's joints upstream of the tracked frame are a function of its pose; a jaw angle is not.
+    Raises NeecoError for an unknown name.
+    """
+    if wanted is not None:
+        unknown = [joint for joint in wanted if joint not in instrument.joints]
+        if unknown:
+            raise NeecoError(
+                f"--joints: {instrument.name} has no joint {unknown[0]!r}; it has {', '.join(instrument.joints)}"
+            )
+        return wanted
+    states = [frame.state.instruments[instrument.name] for frame in frames]
+    poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
+    poses = np.unique(np.round(poses, 6), axis=0, return_index=True)
+    design = np.column_stack([poses[0] - poses[0].mean(0), np.ones(len(poses[0]))])
+    kept = []
+    for joint in instrument.joints:
+        reading = np.array([states[i].joints[joint] for i in poses[1]])
+        spread = reading.var()
+        fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]
+        explained = 1 - (reading - fitted).var() / spread if spread > 1e-8 else 0.0
+        if explained > REDUNDANT:
+            report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
+        else:
+            kept.append(joint)
+    return tuple(kept)

@@ -1,0 +1,52 @@
+"""From command-line values to a TrainConfig."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+
+from neeco.errors import NeecoError
+from neeco.training.config import TrainConfig, method_defaults
+from neeco.training.run import config_from_dict, config_to_dict
+
+
+def training_config(method: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """The method's defaults with `values` that are not None, then NAME=VALUE `assignments` (dots reach nested fields).
+
+    Raises NeecoError naming the option when a name is unknown or a value does not fit.
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    config = dataclasses.replace(method_defaults(method), **given)
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+    plain = config_to_dict(config)
+    for assignment in assignments:
+        _assign(plain, assignment)
+    return config_from_dict(plain)
+
+
+def _assign(plain: dict[str, Any], assignment: str) -> None:
+    name, equals, text = assignment.partition("=")
+    if not equals:
+        raise NeecoError(f"--set: {assignment!r} is not NAME=VALUE")
+    *path, last = name.split(".")
+    target: Any = plain
+    for part in path:
+        target = target.get(part) if isinstance(target, dict) else None
+    open_ended = path == ["deformation"]
+    if not isinstance(target, dict) or (last not in target and not open_ended):
+        raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
+    value = yaml.safe_load(text)
+    old = target.get(last)
+    if isinstance(old, bool) is not isinstance(value, bool) and old is not None:
+        raise NeecoError(f"--set {name}: {text!r} does not fit a field that holds {old!r}")
+    if isinstance(old, int | float) and not isinstance(value, int | float):
+        raise NeecoError(f"--set {name}: {text!r} is not a number")
+    if isinstance(old, str) and not isinstance(value, str):
+        value = text
+    target[last] = value

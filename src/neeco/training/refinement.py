@@ -1,0 +1,130 @@
+"""Corrections to the recorded geometry: instrument poses per frame, one latency, cameras per frame.
+
+The constant tracker-to-world correction is the scene's own (`Scene.registration`), since new states need it as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.scene.rotations import rigid_from_vector, vector_from_rotation
+from neeco.training.config import RefineConfig, decayed
+
+RATES = torch.tensor([6e-4] * 3 + [4e-2] * 3)  # rad, mm
+PRIOR_SIGMA = torch.tensor([4.4e-3] * 3 + [0.3] * 3)  # a tracker's 0.25 deg and 0.3 mm
+PRIOR_WEIGHT = 2e-5
+CAMERA_RATE = 0.2  # of the instruments' rates: SfM cameras are better than tracked instruments
+LATENCY_RATE = 2e-5  # s
+
+
+class Refinement:
+    """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
+
+    Tensors: `poses` [F, I, 6], `cameras` [F, 6], `latency` [1].
+    """
+
+    def __init__(self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> None:
+        self.config = config
+        self.instruments = instruments
+        self.poses = torch.zeros(len(frames), len(instruments), 6)
+        self.cameras = torch.zeros(len(frames), 6)
+        self.latency = torch.zeros(1)
+        self.velocities = _velocities(frames, instruments)  # [F, I, 6] per s, body frame
+        self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
+        self.frame_steps = torch.zeros(len(frames))
+        self._leaves: dict[str, Tensor] = {}
+
+    def _moment_shapes(self) -> dict[str, Tensor]:
+        tensors = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency}
+        return {f"{order}.{name}": tensor for order in ("first", "second") for name, tensor in tensors.items()}
+
+    def apply(self, index: int, state: State, camera: Camera, iteration: int) -> tuple[State, Camera, Tensor | None]:
+        """The corrected state and camera of frame `index`, and the prior's penalty; leaves wait for `step`."""
+        self._leaves = {}
+        if iteration < self.config.start:
+            return state, camera, None
+        penalty = None
+        if self.instruments and (self.config.frame_poses or self.config.latency):
+            offset = torch.zeros(len(self.instruments), 6)
+            if self.config.frame_poses:
+                leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
+                offset = offset + leaf
+                penalty = PRIOR_WEIGHT * (leaf / PRIOR_SIGMA).square().mean()
+            if self.config.latency:
+                leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
+                offset = offset + self.velocities[index] * leaf
+            moved = dict(state.instruments)
+            for k, name in enumerate(self.instruments):
+                given = state.instruments[name]
+                moved[name] = InstrumentState(given.pose.float() @ rigid_from_vector(offset[k]), given.joints)
+            state = replace(state, instruments=moved)
+        if self.config.cameras:
+            leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
+            corrected = camera.world_from_camera.float() @ rigid_from_vector(leaf)
+            camera = replace(camera, world_from_camera=corrected)
+            prior = PRIOR_WEIGHT * (leaf / PRIOR_SIGMA).square().mean()
+            penalty = prior if penalty is None else penalty + prior
+        return state, camera, penalty
+
+    @torch.no_grad()
+    def step(self, index: int, progress: float) -> None:
+        """Adam on what `apply` used for this frame."""
+        if not self._leaves:
+            return
+        self.frame_steps[index] += 1
+        count = float(self.frame_steps[index])
+        decay = decayed(1.0, progress, 0.1)
+        for name, leaf in self._leaves.items():
+            if leaf.grad is None:
+                continue
+            row = slice(None) if name == "latency" else index
+            steps = float(self.frame_steps.sum()) if name == "latency" else count
+            first, second = self.moments[f"first.{name}"], self.moments[f"second.{name}"]
+            first[row] = 0.9 * first[row] + 0.1 * leaf.grad
+            second[row] = 0.99 * second[row] + 0.01 * leaf.grad.square()
+            update = first[row] / (1 - 0.9**steps) / ((second[row] / (1 - 0.99**steps)).sqrt() + 1e-12)
+            rate = {"poses": RATES, "cameras": RATES * CAMERA_RATE, "latency": torch.tensor(LATENCY_RATE)}[name]
+            getattr(self, name)[row] -= decay * rate * update
+        self._leaves = {}
+
+    @torch.no_grad()
+    def center(self) -> None:
+        """Take the mean correction out: a constant one belongs to the instrument's shape (and to `Scene.registration`)."""
+        seen = self.frame_steps > 0
+        if seen.any():
+            self.poses[seen] -= self.poses[seen].mean(0)
+            self.cameras[seen] -= self.cameras[seen].mean(0)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that changes, for a checkpoint."""
+        plain = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency, "frame_steps": self.frame_steps}
+        return plain | self.moments
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """The inverse of `tensors`."""
+        for name in ("poses", "cameras", "latency", "frame_steps"):
+            setattr(self, name, tensors[name])
+        self.moments = {name: tensors[name] for name in self.moments}
+
+
+def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:
+    """[F, I, 6] body-frame velocity (rad/s, mm/s) by differences between neighbours in time; 0 where time stands still."""
+    count = len(frames)
+    velocity = torch.zeros(count, len(instruments), 6)
+    order = sorted(range(count), key=lambda i: frames[i].state.time)
+    for place, index in enumerate(order):
+        before, after = frames[order[max(place - 1, 0)]], frames[order[min(place + 1, count - 1)]]
+        elapsed = after.state.time - before.state.time
+        if not 0 < elapsed < 0.5:
+            continue
+        for k, name in enumerate(instruments):
+            earlier, later = before.state.instruments[name].pose.double(), after.state.instruments[name].pose.double()
+            rotation = vector_from_rotation(earlier[:3, :3].T @ later[:3, :3])
+            here = frames[index].state.instruments[name].pose.double()
+            translation = here[:3, :3].T @ (later[:3, 3] - earlier[:3, 3])
+            velocity[index, k] = (torch.cat([rotation, translation]) / elapsed).float()
+    return velocity

@@ -1,0 +1,146 @@
+"""The paper's dynamic training adjustment: four settings that switch together when the scene has settled.
+
+Phase 1 looks for the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the encoded
+state. Phase 2 refines. Each of the four parts can be turned off (3DGS's behaviour) or inverted (phases swapped), as the paper's
+ablations do.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Part = Literal["on", "off", "inverse"]
+
+
+@dataclass(frozen=True)
+class DensityPhase:
+    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC)."""
+
+    interval: int
+    opacity_reset: int
+    threshold: float
+
+
+NEECO_PHASES = {1: DensityPhase(500, 10_000, 4e-4), 2: DensityPhase(200, 3_000, 2e-4)}
+GAUSSIAN_SPLATTING = DensityPhase(100, 3_000, 2e-4)
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Which parts of the adjustment act, and the choices where the paper is silent."""
+
+    density: Part = "on"
+    sh_order: Part = "on"
+    frame_order: Part = "on"
+    compensation: Part = "on"
+    beta: float = 0.3  # the paper's strength of the compensation noise
+    sigma: float = 1.0  # standard deviation of its normal variable
+    psnr_threshold: float = 20.0
+    window: int = 200  # iterations in the moving averages
+    earliest: int = 1_000
+    latest_fraction: float = 0.4  # of the run; then phase 2 is forced
+    sh_interval: int = 1_000  # iterations between SH orders in phase 2
+    max_sh_degree: int = 3
+    plain_density: DensityPhase = GAUSSIAN_SPLATTING  # in force when `density` is off
+
+
+class Schedule:
+    """What to do at each iteration. `observe` after every step; everything else asks."""
+
+    def __init__(self, config: ScheduleConfig) -> None:
+        self.config = config
+        self.phase = 1
+        self.phase_started = 0
+        self.forced = False
+        self.history: deque[tuple[float, float]] = deque(maxlen=2 * config.window)
+
+    def observe(self, iteration: int, loss: float, psnr: float, progress: float) -> None:
+        """Note one step's loss and PSNR; `progress` in [0, 1] is how much of the run is done. May begin phase 2."""
+        self.history.append((loss, psnr))
+        if self.phase == 2:
+            return
+        ready = iteration >= self.config.earliest and self._settled()
+        late = progress >= self.config.latest_fraction
+        if ready or late:
+            self.phase, self.phase_started, self.forced = 2, iteration, not ready
+
+    def _settled(self) -> bool:
+        """PSNR's moving average is above the threshold and the loss fell from one window to the next."""
+        window = self.config.window
+        if len(self.history) < 2 * window:
+            return False
+        values = np.array(self.history)
+        loss_before, loss_now = values[:window, 0].mean(), values[window:, 0].mean()
+        return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
+
+    def _acting_phase(self, part: Part) -> int:
+        return self.phase if part == "on" else 3 - self.phase
+
+    def density(self) -> DensityPhase:
+        """The density settings in force."""
+        if self.config.density == "off":
+            return self.config.plain_density
+        return NEECO_PHASES[self._acting_phase(self.config.density)]
+
+    def sh_degree(self, iteration: int) -> int:
+        """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start (3DGS)."""
+        config = self.config
+        grown_since = 0 if config.sh_order == "off" else self.phase_started
+        grown = min(config.max_sh_degree, (iteration - grown_since) // config.sh_interval)
+        if config.sh_order == "off" or self._acting_phase(config.sh_order) == 2:
+            return grown if config.sh_order != "inverse" else min(config.max_sh_degree, iteration // config.sh_interval)
+        return 0
+
+    def state_noise(self, progress: float) -> float:
+        """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in its phase."""
+        config = self.config
+        if config.compensation == "off" or self._acting_phase(config.compensation) == 2:
+            return 0.0
+        return config.sigma * config.beta * max(0.0, 1.0 - progress)
+
+    def frames(self, pose_order: np.ndarray, rng: np.random.Generator) -> list[int]:
+        """One epoch of frame indices: sorted by instrument pose (either way round), or at random."""
+        part = self.config.frame_order
+        if part != "off" and self._acting_phase(part) == 1:
+            return list(map(int, pose_order if rng.random() < 0.5 else pose_order[::-1]))
+        return list(map(int, rng.permutation(len(pose_order))))
+
+    def state_dict(self) -> dict[str, object]:
+        """JSON-able; restores an interrupted run exactly."""
+        return {
+            "phase": self.phase,
+            "phase_started": self.phase_started,
+            "forced": self.forced,
+            "history": [list(pair) for pair in self.history],
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """The inverse of `state_dict`."""
+        self.phase, self.phase_started, self.forced = state["phase"], state["phase_started"], state["forced"]
+        self.history = deque((tuple(pair) for pair in state["history"]), maxlen=2 * self.config.window)
+
+
+def order_by_pose(states: np.ndarray) -> np.ndarray:
+    """Indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform motion).
+
+    Starts at the state of smallest first principal coordinate, so that the walk sweeps the range once.
+    """
+    if states.shape[1] == 0 or len(states) < 3:
+        return np.arange(len(states))
+    centred = (states - states.mean(0)) / (states.std(0) + 1e-9)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    current = int((centred @ directions[0]).argmin())
+    left = np.ones(len(states), bool)
+    walk = []
+    for _ in range(len(states)):
+        walk.append(current)
+        left[current] = False
+        if left.any():
+            distance = ((centred - centred[current]) ** 2).sum(1)
+            distance[~left] = np.inf
+            current = int(distance.argmin())
+    return np.array(walk)

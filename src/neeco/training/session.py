@@ -1,0 +1,211 @@
+"""Everything that changes while training, and how one step changes it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.raster import Rendering, rasterize
+from neeco.raster.losses import photometric_loss
+from neeco.scene.deformations.base import UNPERTURBED, Perturbation
+from neeco.scene.scene import Scene
+from neeco.training.config import TrainConfig, decayed
+from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
+from neeco.training.optimizer import Adam
+from neeco.training.refinement import Refinement
+from neeco.training.schedule import Schedule
+
+POSITION_RATE = 1.6e-4  # times the scene's extent (3DGS)
+GAUSSIAN_RATES = {
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "opacity_logits": 5e-2,
+    "sh_dc": 2.5e-3,
+    "sh_rest": 1.25e-4,
+    "extras.part_logits": 1e-2,
+}
+LIGHT_RATE = 3e-3
+REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
+MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
+SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step saw."""
+
+    loss: float
+    psnr: float
+
+
+@dataclass
+class Session:
+    """One training run in memory. `images` [H, W, 3] uint8 and `masks` ([H, W] bool or None), one per training frame."""
+
+    config: TrainConfig
+    scene: Scene
+    frames: tuple[Frame, ...]
+    images: list[Tensor]
+    masks: list[Tensor | None]
+    pose_order: np.ndarray
+    extent: float  # mm; positions' learning rates and the dense size scale with it
+    refinement: Refinement
+    rng: np.random.Generator
+    generator: torch.Generator
+    adam: Adam = field(default_factory=Adam)
+    schedule: Schedule = field(init=False)
+    statistics: GradientStatistics = field(init=False)
+    queue: list[int] = field(default_factory=list)
+    queue_phase: int = 1
+    iteration: int = 0
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.schedule = Schedule(self.config.schedule)
+        self.statistics = GradientStatistics(len(self.scene.canonical))
+        self.scene.requires_grad_(True)
+        self.scene.registration.requires_grad_(self.config.refine.registration)
+        self.watch_gradients()
+
+    def watch_gradients(self) -> None:
+        """Make the canonical tensors leaves again after they were replaced."""
+        for name, tensor in self.scene.canonical.tensors().items():
+            tensor.requires_grad_(name in GAUSSIAN_RATES or name == "means")
+
+    @property
+    def progress(self) -> float:
+        """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
+        done = self.iteration / self.config.iterations
+        if self.config.minutes is not None:
+            done = max(done, self.seconds / (60 * self.config.minutes))
+        return min(1.0, done)
+
+    def step(self) -> StepResult:
+        """Draw one frame, compare, learn, and from time to time add and remove Gaussians."""
+        self.iteration += 1
+        progress = self.progress
+        index = self._next_frame()
+        scene, frame = self.scene, self.frames[index]
+        scene.sh_degree = self.schedule.sh_degree(self.iteration)
+        state, camera, penalty = self.refinement.apply(index, frame.state, frame.camera, self.iteration)
+        labels = scene.label_channels().sum(1, keepdim=True) if self._sharpens() else None
+        rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=labels)
+        target = self.images[index].float() / 255
+        loss = photometric_loss(rendering.color, target, self.masks[index], ssim_weight=self.config.ssim_weight)
+        total = loss + self._regularisation(rendering, penalty)
+        if not math.isfinite(float(total.detach())):
+            raise NeecoError(
+                f"training: the loss became {float(total.detach())} at iteration {self.iteration}, frame {frame.name}; "
+                "resume from the last checkpoint with another --seed, or run `neeco check`"
+            )
+        total.backward()
+        self._learn(rendering, index, progress)
+        mse = self._error(rendering.color.detach(), target, self.masks[index])
+        result = StepResult(float(loss.detach()), -10 * math.log10(max(mse, 1e-10)))
+        self.schedule.observe(self.iteration, result.loss, result.psnr, progress)
+        self._control_density(progress)
+        return result
+
+    @staticmethod
+    def _error(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+        squared = (image - target).square()
+        return float(squared.mean() if mask is None else squared[mask].mean())
+
+    def _next_frame(self) -> int:
+        phase = self.schedule.phase
+        if not self.queue or self.queue_phase != phase:
+            self.queue = self.schedule.frames(self.pose_order, self.rng)
+        self.queue_phase = phase
+        return self.queue.pop(0)
+
+    def _perturbation(self, progress: float) -> Perturbation:
+        noise = self.schedule.state_noise(progress)
+        roll = 0.0
+        if (
+            self.config.shaft_roll > 0
+            and self.iteration > self.config.shaft_roll_start
+            and self.rng.random() < self.config.shaft_roll
+        ):
+            roll = float(self.rng.uniform(-math.pi, math.pi))
+        return Perturbation(roll, noise) if roll or noise else UNPERTURBED
+
+    def _sharpens(self) -> bool:
+        return self.config.label_sharpness > 0 and self.iteration > 1000 and bool(self.scene.label_names)
+
+    def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor:
+        """Sparse instruments, sharp labels, small corrections."""
+        total = torch.zeros(()) if penalty is None else penalty
+        canonical, config = self.scene.canonical, self.config
+        if config.opacity_penalty > 0 and len(canonical.counts) > 1:
+            weight = config.opacity_penalty * (1.0 if self.iteration < 1500 else 0.1)
+            total = total + weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean()
+        if rendering.channels is not None:
+            label = rendering.channels[..., 0]
+            total = total + config.label_sharpness * (label * (1 - label)).mean()
+        return total
+
+    def _learn(self, rendering: Rendering, index: int, progress: float) -> None:
+        """One optimiser step on everything that has a gradient."""
+        gradient = rendering.center_offsets.grad
+        assert gradient is not None
+        self.statistics.record(gradient, self.frames[index].camera.width, self.frames[index].camera.height)
+        scene, fall = self.scene, decayed(1.0, progress)
+        for name, tensor in scene.canonical.tensors().items():
+            rate = POSITION_RATE * self.extent * fall if name == "means" else GAUSSIAN_RATES.get(name)
+            if rate is not None:
+                self.adam.step(name, tensor, rate)
+        rates = scene.deformation.learning_rates(self.iteration)
+        for name, parameter in scene.deformation.named_parameters():
+            if rates[name] > 0:
+                self.adam.step(f"deformation.{name}", parameter, rates[name] * max(fall, MODULE_FLOOR))
+            parameter.grad = None
+        self.adam.step("falloff", scene.falloff, LIGHT_RATE)
+        self.adam.step("vignette", scene.vignette, LIGHT_RATE)
+        self._learn_registration(fall)
+        self.refinement.step(index, progress)
+
+    def _learn_registration(self, fall: float) -> None:
+        """Adam on unit-free coordinates, so that radians and millimetres each move at their own rate."""
+        registration = self.scene.registration
+        if registration.grad is None:
+            return
+        if self.iteration < self.config.refine.start:
+            registration.grad = None
+            return
+        with torch.no_grad():
+            before = registration.detach().clone()
+            self.adam.step("registration", registration, 1.0)
+            change = registration.detach() - before
+            registration.copy_(before + change * REGISTRATION_RATES * max(fall, MODULE_FLOOR))
+
+    def _control_density(self, progress: float) -> None:
+        settings, config, scene = self.schedule.density(), self.config, self.scene
+        if self.iteration % SETTLE_INTERVAL == 0:
+            self.refinement.center()
+        if self.iteration < config.density_start:
+            return
+        grows = self.iteration % settings.interval == 0 and progress < config.density_stop
+        if grows or (self.iteration % SETTLE_INTERVAL == 0 and progress < 0.95):
+            scene.canonical = control_density(
+                scene.canonical,
+                self.adam,
+                self.statistics,
+                self._budgets(),
+                settings.threshold if grows else math.inf,
+                self.generator,
+            )
+            self.statistics = GradientStatistics(len(scene.canonical))
+            self.watch_gradients()
+        if settings.opacity_reset and self.iteration % settings.opacity_reset == 0 and progress < config.density_stop:
+            reset_opacity(scene.canonical, self.adam)
+
+    def _budgets(self) -> list[Budget]:
+        dense = 0.01 * self.extent
+        tissue = Budget(self.config.tissue_budget, dense)
+        return [tissue] + [Budget(self.config.instrument_budget, dense)] * (len(self.scene.canonical.counts) - 1)

@@ -1,0 +1,187 @@
+"""`train`: from a capture to a run folder."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from neeco.capture import Capture, read_capture
+from neeco.capture.check import check_capture, errors_only
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.files import write_text
+from neeco.scene.deformations.nps import NPS, mark_moving
+from neeco.scene.io import save_scene
+from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
+from neeco.training.config import TrainConfig
+from neeco.training.discovery import new_session
+from neeco.training.finish import finish_instruments, place_wrists
+from neeco.training.initial import initial_scene
+from neeco.training.run import config_from_dict, read_config, write_config
+from neeco.training.session import Session
+
+CHECKPOINT_INTERVAL = 500  # iterations
+WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
+ROW_INTERVAL = 50  # iterations averaged into one row of metrics.jsonl
+
+
+@dataclass(frozen=True)
+class ProgressRow:
+    """One row of metrics.jsonl, and what a progress bar shows. `progress` in [0, 1]; `note` is news in words."""
+
+    iteration: int
+    loss: float
+    psnr: float
+    num_gaussians: int
+    phase: int
+    seconds: float
+    progress: float
+    note: str = ""
+
+
+Progress = Callable[[ProgressRow], None]
+
+
+def train(
+    capture_path: Path,
+    output: Path,
+    config: TrainConfig,
+    *,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Learn a scene from the `train` split of a capture; returns the run folder.
+
+    Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an interrupted
+    run under the settings it was started with. The same seed gives the same scene, interrupted or not, unless `minutes` is set.
+    Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is no number.
+    """
+    capture_path, output = Path(capture_path), Path(output)
+    resuming = resume and checkpoint_path(output).exists()
+    if resume and (output / "config.yaml").exists():
+        stored = read_config(output)
+        config = config_from_dict(stored)
+        if Path(stored["capture"]) != capture_path.absolute():
+            raise NeecoError(
+                f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
+            )
+        if (output / "scene.safetensors").exists():
+            return output
+    elif output.exists() and any(output.iterdir()):
+        raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
+    capture, frames = _open_capture(capture_path, config)
+    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
+    masks = [frame.load_mask() for frame in frames]
+    write_config(output, capture_path, config)
+    log = _Log(output / "metrics.jsonl", progress)
+    started = time.monotonic()
+    torch.manual_seed(config.seed)
+    if resuming:
+        scene, header, tensors = read_checkpoint(output)
+        session = new_session(scene, frames, images, masks, config)
+        restore_session(session, header, tensors)
+        log.keep_until(session.iteration)
+    else:
+        scene = initial_scene(capture, frames, images, config, log.note)
+        session = new_session(scene, frames, images, masks, config)
+    session.seconds += time.monotonic() - started
+    _run(session, output, log)
+    log.note("finishing: labels, shaft, diagnostics")
+    _finish(session)
+    save_scene(session.scene, output / "scene.safetensors")
+    return output
+
+
+def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame, ...]]:
+    problems = errors_only(check_capture(path, config.transforms))
+    if problems:
+        more = f" (and {len(problems) - 1} more: run `neeco check {path}`)" if len(problems) > 1 else ""
+        raise NeecoError(f"{problems[0]}{more}")
+    capture = read_capture(path, config.transforms)
+    frames = capture.split("train")
+    if not frames:
+        raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
+    if config.method == "neeco" and not capture.instruments:
+        raise NeecoError(f"{path}: no instrument states are recorded; method neeco needs them (3dgs does not)")
+    return capture, frames
+
+
+def _run(session: Session, output: Path, log: _Log) -> None:
+    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and when interrupted."""
+    losses, psnrs, phase = [], [], session.schedule.phase
+    clock = time.monotonic()
+    try:
+        while session.progress < 1:
+            result = session.step()
+            losses.append(result.loss)
+            psnrs.append(result.psnr)
+            now = time.monotonic()
+            session.seconds, clock = session.seconds + now - clock, now
+            if session.schedule.phase != phase:
+                phase = session.schedule.phase
+                log.note(f"phase {phase} begins" + (" (forced)" if session.schedule.forced else ""))
+            if session.iteration == int(WRIST_FRACTION * session.config.iterations):
+                place_wrists(session)
+            if session.iteration % ROW_INTERVAL == 0:
+                log.row(session, sum(losses) / len(losses), sum(psnrs) / len(psnrs))
+                losses, psnrs = [], []
+            if session.iteration % CHECKPOINT_INTERVAL == 0:
+                save_checkpoint(session, output)
+    except KeyboardInterrupt:
+        log.note(f"interrupted at iteration {session.iteration}; --resume continues from the last checkpoint")
+        raise
+
+
+def _finish(session: Session) -> None:
+    """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
+    scene = session.scene
+    scene.requires_grad_(False)
+    for tensor in scene.canonical.tensors().values():
+        tensor.requires_grad_(False)
+    scene.diagnostics["iterations"] = session.iteration
+    scene.diagnostics["phase_2_began"] = session.schedule.phase_started
+    scene.diagnostics["phase_2_forced"] = session.schedule.forced
+    if isinstance(scene.deformation, NPS) and scene.instruments:
+        scene.canonical = mark_moving(scene.deformation, scene.canonical, list(scene.recorded.states[::4]))
+    finish_instruments(session)
+
+
+class _Log:
+    """metrics.jsonl and the progress callback."""
+
+    def __init__(self, path: Path, progress: Progress | None) -> None:
+        self.path = path
+        self.progress = progress
+        self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
+
+    def row(self, session: Session, loss: float, psnr: float) -> None:
+        self.last = ProgressRow(
+            session.iteration,
+            round(loss, 6),
+            round(psnr, 3),
+            len(session.scene.canonical),
+            session.schedule.phase,
+            round(session.seconds, 2),
+            round(session.progress, 4),
+        )
+        entry = {key: value for key, value in vars(self.last).items() if key != "note"}
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(entry) + "\n")
+        if self.progress:
+            self.progress(self.last)
+
+    def note(self, text: str) -> None:
+        if self.progress:
+            self.progress(replace(self.last, note=text))
+
+    def keep_until(self, iteration: int) -> None:
+        """Drop rows beyond the checkpoint: they will be written again."""
+        if self.path.exists():
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+            kept = [line for line in lines if line.endswith("}") and json.loads(line)["iteration"] <= iteration]
+            write_text(self.path, "".join(line + "\n" for line in kept))
