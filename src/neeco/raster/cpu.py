@@ -11,7 +11,10 @@ from torch.autograd.function import once_differentiable
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Gaussians, Rendering
 
-def rasterize_cpu(gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None) -> Rendering:
+
+def rasterize_cpu(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
     """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
     if channels is not None and channels.shape[1] == 0:
         rendering = rasterize_cpu(gaussians, camera, None, background)
@@ -61,7 +64,9 @@ def _native_module() -> Any:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None) -> Any:
+    def forward(
+        ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
+    ) -> Any:
         native = _native_module()
         plain = [None if t is None else t.detach() for t in tensors]
         means, quats, scales, opacities, sh, falloff, channels, vignette, world_from_camera, background = plain

@@ -116,7 +116,9 @@ class _Photometric(torch.autograd.Function):
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if image.dim() != 3 or image.shape[2] != 3 or image.shape != target.shape:
-        raise NeecoError(f"photometric_loss: shapes {tuple(image.shape)}, {tuple(target.shape)}; expected twice [H, W, 3]")
+        raise NeecoError(
+            f"photometric_loss: shapes {tuple(image.shape)}, {tuple(target.shape)}; expected twice [H, W, 3]"
+        )
     if mask is not None and mask.shape != image.shape[:2]:
         raise NeecoError(f"photometric_loss: mask: shape {tuple(mask.shape)}; expected {tuple(image.shape[:2])}")
 

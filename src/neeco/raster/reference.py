@@ -37,7 +37,7 @@ def rasterize_reference(
     offsets = torch.zeros(len(gaussians), 2, dtype=means.dtype, device=means.device)
     offsets.requires_grad_(torch.is_grad_enabled())
     rotation, translation = camera_from_world(camera.world_from_camera.to(means))
-    usable = _usable(gaussians, camera, channels)
+    usable = usable_gaussians(gaussians, camera, channels)
     chosen, usable_channels = _take(gaussians, usable), None if channels is None else channels[usable]
     camera_means = chosen.means @ rotation.T + translation
     values = torch.cat([_colors(chosen, camera, camera_means), camera_means[:, 2:]], dim=-1)
@@ -75,7 +75,9 @@ def depth_keys(means: Tensor, camera: Camera) -> Tensor:
         return (((axis[0] * m[:, 0] + axis[1] * m[:, 1]) + axis[2] * m[:, 2]) + offset).float()
 
 
-def project(gaussians: Gaussians, camera: Camera, camera_means: Tensor, rotation: Tensor, offsets: Tensor) -> Projection:
+def project(
+    gaussians: Gaussians, camera: Camera, camera_means: Tensor, rotation: Tensor, offsets: Tensor
+) -> Projection:
     """Project Gaussians to the image (EWA splatting, Zwicker et al. 2001).
 
     camera_means [N, 3] mm, rotation [3, 3] camera_from_world, offsets [N, 2] px added to the centres.
@@ -130,11 +132,18 @@ def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tenso
     return colors
 
 
-def _usable(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
+def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
     """Indices of Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
     n = len(gaussians)
     light = gaussians.headlight
-    tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, gaussians.sh_frames]
+    tensors = [
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        gaussians.sh_frames,
+    ]
     tensors += [channels, None if light is None else light.falloff]
     good = depth_keys(gaussians.means, camera) > camera.near
     for tensor in tensors:

@@ -1,0 +1,92 @@
+"""The CUDA backend: gsplat (an extra, `pip install neeco[cuda]`) draws, plain torch evaluates the colours."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from neeco.raster.reference import camera_from_world, usable_gaussians
+from neeco.raster.sh import headlight_factor, sh_colors
+from neeco.raster.types import Camera, Gaussians, Rendering
+
+
+def rasterize_cuda(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> Rendering:
+    """`rasterize` through gsplat >= 1.4, float32, on the device of the means.
+
+    gsplat orders equal depths as it likes; everything else follows the reference to float32 accuracy.
+    """
+    from gsplat import rasterization
+
+    n, device = len(gaussians), gaussians.means.device
+    empty = torch.zeros(n, 2, device=device, requires_grad=torch.is_grad_enabled())
+    index = usable_gaussians(gaussians, camera, channels)
+    pose = camera.world_from_camera.to(device=device, dtype=torch.float32)
+    rotation, translation = camera_from_world(pose)
+    if len(index) == 0:
+        return _nothing(camera, channels, background, empty)
+    means = gaussians.means[index].float()
+    frames = None if gaussians.sh_frames is None else gaussians.sh_frames[index].float()
+    values = sh_colors(gaussians.sh[index].float(), means, pose[:3, 3], frames).clamp(min=0)
+    if gaussians.headlight is not None:
+        light = type(gaussians.headlight)(gaussians.headlight.falloff[index], gaussians.headlight.vignette)
+        values = values * headlight_factor(light, means @ rotation.T + translation)[:, None]
+    if channels is not None:
+        values = torch.cat([values, channels[index].float()], dim=-1)
+
+    last_row = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=device)
+    view = torch.cat([torch.cat([rotation, translation[:, None]], dim=1), last_row])  # camera_from_world
+    intrinsics = torch.tensor(
+        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device
+    )
+    images, alphas, info = rasterization(
+        means,
+        gaussians.quats[index].float(),
+        gaussians.scales[index].float(),
+        gaussians.opacities[index].float(),
+        values,
+        view[None],
+        intrinsics[None],
+        camera.width,
+        camera.height,
+        near_plane=camera.near,
+        render_mode="RGB+ED",
+        packed=False,
+    )
+    alpha = alphas[0, ..., 0]
+    color = images[0, ..., :3]
+    if background is not None:
+        color = color + (1 - alpha)[..., None] * background.to(color)
+    depth = torch.where(alpha > 0, images[0, ..., -1], 0.0)
+    radii = torch.zeros(n, device=device)
+    radii[index] = _largest(info["radii"][0]).float()
+    offsets = _center_gradients(info["means2d"], index, empty)
+    return Rendering(color, alpha, depth, None if channels is None else images[0, ..., 3:-1], radii, offsets)
+
+
+def _largest(radii: Tensor) -> Tensor:
+    """gsplat gives one radius per Gaussian up to 1.4 and two, per axis, from 1.5 on."""
+    return radii.amax(dim=-1) if radii.dim() == 2 else radii
+
+
+def _center_gradients(centers: Tensor, index: Tensor, offsets: Tensor) -> Tensor:
+    """Makes `offsets.grad` receive the gradient of gsplat's projected centres [1, M, 2] when it is computed."""
+    if centers.requires_grad:
+
+        def receive(gradient: Tensor) -> None:
+            full = torch.zeros_like(offsets)
+            full[index] = gradient.reshape(-1, 2)
+            offsets.grad = full if offsets.grad is None else offsets.grad + full
+
+        centers.register_hook(receive)
+    return offsets
+
+
+def _nothing(camera: Camera, channels: Tensor | None, background: Tensor | None, offsets: Tensor) -> Rendering:
+    blank = torch.zeros(camera.height, camera.width, device=offsets.device)
+    color = blank[..., None].expand(-1, -1, 3)
+    if background is not None:
+        color = color + background.to(color)
+    drawn = None if channels is None else blank[..., None].expand(-1, -1, channels.shape[1])
+    return Rendering(color, blank, blank, drawn, torch.zeros(len(offsets), device=offsets.device), offsets)

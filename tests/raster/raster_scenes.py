@@ -1,0 +1,114 @@
+"""Random Gaussians, and drawing them with gradients of everything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neeco.raster import Camera, Gaussians, Headlight, Rendering, rasterize
+from neeco.raster.reference import (
+    FAINTEST,
+    FULL,
+    OPAQUE,
+    alphas_at_pixels,
+    camera_from_world,
+    depth_keys,
+    project,
+    usable_gaussians,
+)
+from neeco.raster.sh import rotation_matrices
+
+
+@dataclass
+class Scene:
+    """float32 values; `draw` copies them into leaves of the wanted type."""
+
+    tensors: dict[str, Tensor]
+    width: int
+    height: int
+    focal: float = 60.0
+    near: float = 0.01
+
+
+def make_scene(
+    count: int, sh_count: int = 16, channels: int = 1, seed: int = 0, width: int = 45, height: int = 37,
+    frames: bool = True, light: bool = True, size: float = 3.0, opacity: float | None = None,
+) -> Scene:  # fmt: skip
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g)
+
+    tensors = {
+        "means": normal(count, 3) * torch.tensor([40.0, 30.0, 20.0]) + torch.tensor([0.0, 0.0, 100.0]),
+        "quats": normal(count, 4),
+        "scales": torch.exp(normal(count, 3) * 0.5) * size,
+        "opacities": torch.sigmoid(normal(count)) if opacity is None else torch.full((count,), opacity),
+        "sh": normal(count, sh_count, 3) * 0.4,
+        "background": torch.rand(3, generator=g),
+    }
+    if light:
+        tensors |= {"falloff": normal(count) * 0.3 + 1, "vignette": normal(2) * 0.3}
+    if frames:
+        tensors["sh_frames"] = torch.nn.functional.normalize(normal(count, 4), dim=-1)
+    if channels:
+        tensors["channels"] = normal(count, channels)
+    pose = torch.eye(4)
+    pose[:3, :3] = rotation_matrices(torch.nn.functional.normalize(torch.tensor([[1.0, 0.05, -0.08, 0.1]]), dim=-1))[0]
+    pose[:3, 3] = torch.tensor([3.0, -5.0, 2.0])
+    tensors["world_from_camera"] = pose
+    return Scene(tensors, width, height)
+
+
+def leaves(scene: Scene, dtype: torch.dtype) -> tuple[dict[str, Tensor], Gaussians, Camera]:
+    t = {k: v.to(dtype).clone().requires_grad_(k != "sh_frames") for k, v in scene.tensors.items()}
+    light = Headlight(t["falloff"], t["vignette"]) if "falloff" in t else None
+    gaussians = Gaussians(t["means"], t["quats"], t["scales"], t["opacities"], t["sh"], t.get("sh_frames"), light)
+    camera = Camera(
+        t["world_from_camera"], scene.focal, scene.focal * 1.03, scene.width / 2 + 1.3, scene.height / 2 - 0.7,
+        scene.width, scene.height, scene.near,
+    )  # fmt: skip
+    return t, gaussians, camera
+
+
+def draw(scene: Scene, dtype: torch.dtype, backend: str, weights: Tensor) -> tuple[Rendering, dict[str, Tensor]]:
+    """The image, and the gradients of a weighted sum of everything drawn. weights [H, W], 0 where a pixel is left out."""
+    t, gaussians, camera = leaves(scene, dtype)
+    out = rasterize(gaussians, camera, channels=t.get("channels"), background=t["background"], backend=backend)
+    g = torch.Generator().manual_seed(1)
+    loss = torch.zeros((), dtype=dtype)
+    for image in (out.color, out.alpha, 0.01 * out.depth, out.channels):
+        if image is not None:
+            pixels = weights.reshape(weights.shape + (1,) * (image.dim() - 2))
+            loss = loss + (image * (pixels * torch.randn(image.shape, generator=g)).to(dtype)).sum()
+    loss.backward()
+    t["center_offsets"] = out.center_offsets
+    return out, {k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in t.items() if k != "sh_frames"}
+
+
+def decided_pixels(scene: Scene, tolerance: float = 1e-4) -> Tensor:
+    """[H, W] 1 where no cut-off is so close that float32 may decide it otherwise than float64, else 0."""
+    _, gaussians, camera = leaves(scene, torch.float64)
+    with torch.no_grad():
+        index = usable_gaussians(gaussians, camera, scene.tensors.get("channels"))
+        rotation, translation = camera_from_world(camera.world_from_camera)
+        means = gaussians.means[index]
+        chosen = Gaussians(
+            means, gaussians.quats[index], gaussians.scales[index], gaussians.opacities[index], gaussians.sh[index]
+        )
+        projection = project(chosen, camera, means @ rotation.T + translation, rotation, torch.zeros(len(index), 2))
+        alphas = alphas_at_pixels(projection, chosen.opacities, camera)
+        alphas = alphas[:, torch.argsort(depth_keys(means, camera), stable=True)]
+        close = ((alphas / FAINTEST - 1).abs() < tolerance) | ((alphas / OPAQUE - 1).abs() < tolerance)
+        left = torch.cumprod(1 - torch.where(alphas >= FAINTEST, alphas.clamp(max=OPAQUE), 0.0), dim=1)
+        close |= (left / FULL - 1).abs() < 100 * tolerance
+    return (~close.any(dim=1)).reshape(camera.height, camera.width).float()
+
+
+def error(actual: Tensor, expected: Tensor) -> float:
+    """|actual - expected| / |expected|, or |actual| where nothing is expected."""
+    expected = expected.detach().double()
+    scale = expected.norm()
+    return float((actual.detach().double() - expected).norm() / (scale if scale > 1e-9 else 1.0))

@@ -1,0 +1,237 @@
+"""The kernels draw what the float64 reference defines, gradients included."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+sys.path.insert(0, str(Path(__file__).parent))
+from raster_scenes import Scene, decided_pixels, draw, error, leaves, make_scene
+
+from neeco.errors import NeecoError
+from neeco.raster import rasterize
+from neeco.raster.threads import set_threads
+
+TOLERANCE = 1e-3
+
+
+def assert_same_as_reference(scene: Scene) -> None:
+    decided = decided_pixels(scene)
+    expected, expected_gradients = draw(scene, torch.float64, "reference", decided)
+    actual, gradients = draw(scene, torch.float32, "cpu", decided)
+    for name in ("color", "alpha", "depth", "channels"):
+        image, wanted = getattr(actual, name), getattr(expected, name)
+        assert (image is None) == (wanted is None)
+        if image is not None:
+            pixels = decided.reshape(decided.shape + (1,) * (image.dim() - 2))
+            assert error(image * pixels, wanted * pixels) < TOLERANCE, name
+    for name, wanted in expected_gradients.items():
+        assert error(gradients[name], wanted) < TOLERANCE, f"gradient of {name}"
+    assert bool((actual.visible | (expected.radii == 0)).all()), "a Gaussian that is drawn counts as visible"
+    both = actual.visible & (expected.radii > 0)
+    assert error(actual.radii[both], expected.radii[both]) < TOLERANCE
+
+
+@pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
+@pytest.mark.parametrize("channels", [0, 1, 3, 32])
+def test_image_and_every_gradient_match_the_reference(simd: str, sh_count: int, channels: int) -> None:
+    assert_same_as_reference(make_scene(90, sh_count, channels, seed=sh_count + channels))
+
+
+@pytest.mark.parametrize(("frames", "light"), [(False, False), (True, False), (False, True)])
+def test_without_sh_frames_or_headlight(simd: str, frames: bool, light: bool) -> None:
+    assert_same_as_reference(make_scene(100, 9, 1, seed=5, frames=frames, light=light))
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    count=st.sampled_from([1, 2, 7, 40, 120]),
+    sh_count=st.sampled_from([1, 4, 9, 16]),
+    channels=st.integers(0, 9),
+    seed=st.integers(0, 10_000),
+    width=st.integers(1, 40),
+    height=st.integers(1, 70),
+    size=st.sampled_from([0.01, 0.5, 3.0, 40.0]),
+    opacity=st.sampled_from([None, 1 / 255 + 1e-4, 0.5, 0.9999]),
+)
+def test_any_scene_matches_the_reference(simd: str, **shape: object) -> None:
+    assert_same_as_reference(make_scene(**shape))  # type: ignore[arg-type]
+
+
+def test_many_opaque_layers_fill_pixels(simd: str) -> None:
+    scene = make_scene(300, 1, 1, seed=3, size=25.0, opacity=0.6)
+    assert_same_as_reference(scene)
+
+
+def test_equal_depths_are_drawn_by_index(simd: str) -> None:
+    scene = make_scene(60, 1, 1, seed=4)
+    scene.tensors["world_from_camera"] = torch.eye(4)
+    scene.tensors["means"][:, 2] = 100.0
+    assert_same_as_reference(scene)
+
+
+def test_a_pixel_is_one_gaussian_by_hand(simd: str) -> None:
+    scene = make_scene(1, 1, 0, frames=False, light=False, width=9, height=9)
+    t = scene.tensors
+    t["world_from_camera"], t["background"] = torch.eye(4), torch.tensor([0.0, 0.0, 1.0])
+    t["means"], t["scales"] = torch.tensor([[-1.3 + 0.0, 0.7 / 1.03, 60.0]]), torch.full((1, 3), 5.0)
+    t["opacities"], t["sh"] = torch.tensor([0.25]), torch.full((1, 1, 3), 0.5 / 0.28209479177387814)
+    _, gaussians, camera = leaves(scene, torch.float32)
+    out = rasterize(gaussians, camera, background=t["background"])
+    assert torch.allclose(out.color[4, 4], torch.tensor([0.25, 0.25, 1.0]), atol=1e-4)
+    assert out.alpha[4, 4].item() == pytest.approx(0.25, abs=1e-4)
+    assert out.depth[4, 4].item() == pytest.approx(60.0, abs=1e-3)
+
+
+def test_gaussians_behind_the_camera_and_off_screen_draw_nothing(simd: str) -> None:
+    scene = make_scene(4, seed=6)
+    scene.tensors["means"] = torch.tensor([[0.0, 0, -100], [4000, 0, 50], [0, -4000, 50], [0, 0, 2.001]])
+    scene.tensors["world_from_camera"] = torch.eye(4)
+    scene.near = 5.0
+    out, gradients = draw(scene, torch.float32, "cpu", torch.ones(scene.height, scene.width))
+    assert not out.visible.any()
+    assert torch.equal(out.color, scene.tensors["background"].expand_as(out.color))
+    assert not out.alpha.any()
+    assert not out.depth.any()
+    assert all(not gradients[name].any() for name in ("means", "quats", "sh", "world_from_camera", "center_offsets"))
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh", "channels", "falloff", "sh_frames"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_gaussians_that_are_not_finite_draw_nothing(simd: str, field: str, value: float) -> None:
+    scene = make_scene(50, 4, 1, seed=7)
+    scene.tensors[field].view(50, -1)[10, -1] = value
+    weights = torch.ones(scene.height, scene.width)
+    out, gradients = draw(scene, torch.float32, "cpu", weights)
+    keep = torch.arange(50) != 10
+    without = Scene(
+        {k: v[keep] if v.dim() and v.shape[0] == 50 else v for k, v in scene.tensors.items()}, scene.width, scene.height
+    )
+    expected, expected_gradients = draw(without, torch.float32, "cpu", weights)
+    assert torch.equal(out.color, expected.color)
+    for name, gradient in gradients.items():
+        per_gaussian = gradient.dim() > 0 and gradient.shape[0] == 50
+        assert error(gradient[keep] if per_gaussian else gradient, expected_gradients[name]) < 1e-5, name
+        assert not per_gaussian or not gradient[10].any(), name
+
+
+def test_a_quaternion_of_length_zero_draws_nothing(simd: str) -> None:
+    scene = make_scene(3, seed=8)
+    scene.tensors["quats"][1] = 0
+    assert_same_as_reference(scene)
+    assert not draw(scene, torch.float32, "cpu", torch.ones(37, 45))[0].visible[1]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_no_gaussians_show_the_background(backend: str) -> None:
+    scene = make_scene(0)
+    out, gradients = draw(scene, torch.float32, backend, torch.ones(scene.height, scene.width))
+    assert torch.equal(out.color, scene.tensors["background"].expand_as(out.color))
+    assert out.radii.shape == (0,)
+    assert error(gradients["background"], torch.zeros(3)) > 0
+
+
+def everything_drawn(scene: Scene) -> list[torch.Tensor]:
+    out, gradients = draw(scene, torch.float32, "cpu", torch.ones(scene.height, scene.width))
+    return [out.color, out.alpha, out.depth, out.radii, *gradients.values()]
+
+
+def test_the_same_bits_every_time_and_with_any_number_of_threads(simd: str) -> None:
+    scene = make_scene(20_000, 4, 1, seed=9, size=1.0, width=133, height=97)
+    try:
+        runs = []
+        for threads in (1, 2, 2, 5):
+            set_threads(threads)
+            runs.append(everything_drawn(scene))
+    finally:
+        set_threads(0)
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], run, strict=True))
+
+
+def test_drawing_without_gradients_gives_the_same_image_and_no_graph() -> None:
+    scene = make_scene(80)
+    t, gaussians, camera = leaves(scene, torch.float32)
+    first = rasterize(gaussians, camera, channels=t["channels"])
+    with torch.no_grad():
+        second = rasterize(gaussians, camera, channels=t["channels"])
+    assert torch.equal(first.color, second.color)
+    assert not second.color.requires_grad
+
+
+def test_an_input_changed_before_the_backward_pass_is_noticed() -> None:
+    _, gaussians, camera = leaves(make_scene(20), torch.float32)
+    loss = rasterize(gaussians, camera).color.sum()
+    with torch.no_grad():
+        gaussians.means.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_two_drawings_can_wait_for_their_gradients() -> None:
+    scene = make_scene(60)
+    t, gaussians, camera = leaves(scene, torch.float32)
+    first, second = rasterize(gaussians, camera), rasterize(gaussians, camera)
+    (first.color.sum() + second.color.sum()).backward()
+    both = t["means"].grad.clone()
+    t["means"].grad = None
+    rasterize(gaussians, camera).color.sum().backward()
+    assert torch.allclose(both, 2 * t["means"].grad, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"quats": torch.zeros(3, 3)}, "quats"),
+        ({"sh": torch.zeros(3, 5, 3)}, "sh: 5 coefficients"),
+        ({"channels": torch.zeros(3, 33)}, "channels"),
+        ({"background": torch.zeros(4)}, "background"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_named(change: dict[str, torch.Tensor], message: str) -> None:
+    scene = make_scene(3)
+    scene.tensors |= change
+    t, gaussians, camera = leaves(scene, torch.float32)
+    with pytest.raises(NeecoError, match=message):
+        rasterize(gaussians, camera, channels=t["channels"], background=t["background"])
+
+
+def test_unknown_and_missing_backends_are_named() -> None:
+    _, gaussians, camera = leaves(make_scene(3), torch.float32)
+    with pytest.raises(NeecoError, match="unknown"):
+        rasterize(gaussians, camera, backend="metal")
+    if not torch.cuda.is_available():
+        with pytest.raises(NeecoError, match=r"neeco\[cuda\]"):
+            rasterize(gaussians, camera, backend="cuda")
+
+
+def test_an_instruction_set_that_is_not_there_is_refused() -> None:
+    code = "from neeco.raster.threads import simd\nfrom neeco.errors import NeecoError\ntry: simd()\nexcept NeecoError as e: print(e)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "NEECO_SIMD": "altivec"}, capture_output=True, text=True
+    )
+    assert "NEECO_SIMD: 'altivec' cannot run here" in result.stdout
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(
+    not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None, reason="needs CUDA and gsplat"
+)
+def test_cuda_draws_what_the_reference_defines() -> None:
+    scene = make_scene(150, 16, 3)
+    t, gaussians, camera = leaves(scene, torch.float64)
+    expected = rasterize(gaussians, camera, channels=t["channels"], backend="reference")
+    moved = {k: v.float().cuda() for k, v in scene.tensors.items()}
+    t, gaussians, camera = leaves(Scene(moved, scene.width, scene.height), torch.float32)
+    actual = rasterize(gaussians, camera, channels=t["channels"])
+    assert error(actual.color.cpu(), expected.color) < 5e-3
+    assert error(actual.depth.cpu(), expected.depth) < 5e-3
+    assert error(actual.channels.cpu(), expected.channels) < 5e-3
