@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from neeco.capture import check_capture, errors_only
-from neeco.cli.demo import Demo, run, sample_capture
+from neeco.cli.demo import Arguments, run, sample_capture
 from neeco.errors import NeecoError
 
 
@@ -20,12 +20,12 @@ def test_the_bundled_sample_is_found_and_sound() -> None:
 def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("precious")
     with pytest.raises(NeecoError, match="exists already"):
-        run(Demo(output=tmp_path))
+        run(Arguments(output=tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 @pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
 def test_no_time_to_train_is_refused(minutes: float, tmp_path: Path) -> None:
     with pytest.raises(NeecoError, match="--minutes"):
-        run(Demo(output=tmp_path / "new", minutes=minutes))
+        run(Arguments(output=tmp_path / "new", minutes=minutes))
     assert not (tmp_path / "new").exists()

@@ -15,7 +15,7 @@ IMAGES = 24
 
 
 @dataclass(frozen=True)
-class Demo:
+class Arguments:
     """The whole main job on the bundled sample capture: check, train, evaluate, synthesize, report."""
 
     output: Path = Path("neeco-demo")
@@ -24,7 +24,7 @@ class Demo:
     """How long to train."""
 
 
-def run(args: Demo) -> int:
+def run(args: Arguments) -> int:
     """Do it all and say where everything lies."""
     from neeco.errors import NeecoError
 
