@@ -119,7 +119,8 @@ def test_a_reader_that_goes_away_makes_no_noise() -> None:
         "sys.exit(cli.main([]))"
     )
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout is not None and process.stderr is not None
+    assert process.stdout is not None
+    assert process.stderr is not None
     process.stdout.read(10)
     process.stdout.close()
     assert process.stderr.read() == b""
