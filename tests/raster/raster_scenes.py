@@ -74,7 +74,7 @@ def leaves(scene: Scene, dtype: torch.dtype) -> tuple[dict[str, Tensor], Gaussia
 
 
 def draw(scene: Scene, dtype: torch.dtype, backend: str, weights: Tensor) -> tuple[Rendering, dict[str, Tensor]]:
-    """The image, and the gradients of a weighted sum of everything drawn. weights [H, W], 0 where a pixel is left out."""
+    """The image, and the gradients of a weighted sum of everything drawn. weights [H, W], 0: left out."""
     t, gaussians, camera = leaves(scene, dtype)
     out = rasterize(gaussians, camera, channels=t.get("channels"), background=t["background"], backend=backend)
     g = torch.Generator().manual_seed(1)

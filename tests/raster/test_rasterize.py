@@ -214,7 +214,14 @@ def test_unknown_and_missing_backends_are_named() -> None:
 
 
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:
-    code = "from neeco.raster.threads import simd\nfrom neeco.errors import NeecoError\ntry: simd()\nexcept NeecoError as e: print(e)"
+    code = """
+from neeco.errors import NeecoError
+from neeco.raster.threads import simd
+try:
+    simd()
+except NeecoError as error:
+    print(error)
+"""
     result = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "NEECO_SIMD": "altivec"}, capture_output=True, text=True
     )

@@ -24,7 +24,7 @@ def rasterize(
 ) -> Rendering:
     """Draw Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
 
-    channels [N, C], C <= 32: composited like colour over background 0. background [3]: colour behind everything, default black.
+    channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind, default black.
     backend: "cpu" (native, float32), "reference" (plain torch, any float type, slow), "cuda" (gsplat), or "auto":
     cuda for tensors on a CUDA device, cpu otherwise.
 
@@ -37,8 +37,8 @@ def rasterize(
     - Gaussians nearer than `camera.near`, or with a NaN or an infinity in any parameter, or with a quaternion of length
       zero, draw nothing and get zero gradients.
 
-    Gradients reach means, quats, scales, opacities, sh, headlight, channels, background and `camera.world_from_camera`, whose
-    inverse is taken as [R^T | -R^T t].
+    Gradients reach means, quats, scales, opacities, sh, headlight, channels, background and
+    `camera.world_from_camera`, whose inverse is taken as [R^T | -R^T t].
 
     Raises NeecoError where shapes do not fit, or the backend cannot be had.
     """

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
+from neeco.raster.native import native
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 
@@ -45,7 +46,7 @@ def rasterize_cpu(
 
 def last_statistics() -> dict[str, float]:
     """Stage times in ms, and visible Gaussians and (tile, Gaussian) pairs, of the latest drawing and its gradient."""
-    return _native_module().last_statistics()
+    return native().last_statistics()
 
 
 def _prepared(tensor: Tensor) -> Tensor:
@@ -54,25 +55,16 @@ def _prepared(tensor: Tensor) -> Tensor:
     return tensor.to(torch.float32).contiguous()
 
 
-def _native_module() -> Any:
-    try:
-        from neeco import _native
-    except ImportError as error:
-        raise NeecoError("backend: cpu: neeco's compiled part is missing; install with `pip install .`") from error
-    return _native
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
     ) -> Any:
-        native = _native_module()
         plain = [None if t is None else t.detach() for t in tensors]
         means, quats, scales, opacities, sh, falloff, channels, vignette, world_from_camera, background = plain
         assert means is not None
         try:
-            drawing = native.Drawing(
+            drawing = native().Drawing(
                 means, quats, scales, opacities, sh, frames, falloff, vignette, channels, background, world_from_camera,
                 camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The photometric loss of 3D Gaussian splatting, (1 - w) L1 + w (1 - SSIM): a fused native kernel and its definition."""
+"""The photometric loss of 3DGS, (1 - w) L1 + w (1 - SSIM): a fused native kernel and its definition."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from neeco.errors import NeecoError
+from neeco.raster.native import native
 
 WINDOW = 11  # px, side of the Gaussian window
 SIGMA = 1.5  # px
@@ -29,7 +30,7 @@ class PhotometricTarget:
         self.pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
         self.mean = torch.empty_like(self.image)  # [H, W, 3] blurred target
         self.square = torch.empty_like(self.image)  # [H, W, 3] blurred squared target
-        _native().blur_target(self.image, self.mask, self.mean, self.square)
+        native().blur_target(self.image, self.mask, self.mean, self.square)
 
 
 def photometric_loss(
@@ -37,15 +38,16 @@ def photometric_loss(
 ) -> Tensor:
     """(1 - w) * mean |image - target| + w * (1 - mean SSIM), w = `ssim_weight`; a scalar, differentiable in `image`.
 
-    image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where the loss must not look. A mask multiplies both images before
-    anything is compared, and both means run over its True pixels; with none of those the loss is 0. SSIM (Wang et al. 2004)
-    with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, each colour apart, as in 3DGS.
+    image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where the loss must not look. A mask multiplies both
+    images before anything is compared, and both means run over its True pixels; with none of those the loss is 0.
+    SSIM (Wang et al. 2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, each
+    colour apart, as in 3DGS. Raises NeecoError where shapes do not fit.
     A `PhotometricTarget` brings its own mask and saves two blurs.
     """
     if isinstance(target, PhotometricTarget):
         if mask is not None:
             raise NeecoError("photometric_loss: mask: given twice; the PhotometricTarget has its own")
-        known = target
+        known: PhotometricTarget | _Plain = target
     else:
         known = _Plain(target, mask)
     _check(image, known.image, None)
@@ -92,7 +94,8 @@ class _Plain:
         self.image = target.detach().to(torch.float32).contiguous()
         self.mask = None if mask is None else mask.to(torch.float32).contiguous()
         self.pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
-        self.mean = self.square = None
+        self.mean: Tensor | None = None
+        self.square: Tensor | None = None
 
 
 class _Photometric(torch.autograd.Function):
@@ -100,7 +103,7 @@ class _Photometric(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, target: PhotometricTarget | _Plain, ssim_weight: float) -> Tensor:
         plain = image.detach().to(torch.float32).contiguous()
         gradient = torch.empty_like(plain) if ctx.needs_input_grad[0] else None
-        loss = _native().photometric(
+        loss = native().photometric(
             plain, target.image, target.mask, target.mean, target.square, ssim_weight, target.pixels, gradient
         )
         if gradient is not None:
@@ -121,11 +124,3 @@ def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
         )
     if mask is not None and mask.shape != image.shape[:2]:
         raise NeecoError(f"photometric_loss: mask: shape {tuple(mask.shape)}; expected {tuple(image.shape[:2])}")
-
-
-def _native() -> Any:
-    try:
-        from neeco import _native
-    except ImportError as error:
-        raise NeecoError("photometric_loss: neeco's compiled part is missing; install with `pip install .`") from error
-    return _native

@@ -1,5 +1,7 @@
-"""Adam in one native pass per tensor. The moments are plain tensors that belong to the caller: density control edits their
-rows, checkpoints save them."""
+"""Adam in one native pass per tensor.
+
+The moments are plain tensors that belong to the caller: density control edits their rows, checkpoints save them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.raster.native import native
 
 
 @torch.no_grad()
@@ -24,11 +27,10 @@ def adam_step(
 ) -> None:
     """One step of Adam (Kingma and Ba 2015), in place, without autograd.
 
-    All tensors have param's shape [N, ...], float32, contiguous, CPU. step counts from 1. row_lr [N] multiplies the learning
-    rate row by row. The same inputs give the same bits, whatever the number of threads. Raises NeecoError where tensors do not fit.
+    All tensors have param's shape [N, ...], float32, contiguous, CPU. step counts from 1. row_lr [N] multiplies the
+    learning rate row by row. The same inputs give the same bits, whatever the number of threads. Raises NeecoError where
+    tensors do not fit.
     """
-    from neeco import _native
-
     if step < 1:
         raise NeecoError(f"adam_step: step: {step}; counts from 1")
     for name, tensor in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
@@ -36,7 +38,7 @@ def adam_step(
             raise NeecoError(f"adam_step: {name}: must be a contiguous float32 tensor on the CPU")
     row = None if row_lr is None else row_lr.detach().to(torch.float32).contiguous()
     try:
-        _native.adam(
+        native().adam(
             param.detach(), grad.detach().to(torch.float32).contiguous(), exp_avg, exp_avg_sq, row,
             lr, step, betas[0], betas[1], eps,
         )  # fmt: skip

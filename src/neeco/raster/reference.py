@@ -66,7 +66,7 @@ def camera_from_world(world_from_camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def depth_keys(means: Tensor, camera: Camera) -> Tensor:
-    """Depths [N] to sort by: in float64, summed in a fixed order, rounded once to float32. Every backend sorts these."""
+    """Depths [N] to sort by: in float64, summed in a fixed order, rounded once to float32: what is sorted."""
     with torch.no_grad():
         pose = camera.world_from_camera.double()
         axis, centre = pose[:3, 2], pose[:3, 3]
@@ -101,9 +101,8 @@ def project(
 
 def alphas_at_pixels(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
     """Alpha [P, N] of every Gaussian at every pixel centre, before any of the cut-offs."""
-    options = {"dtype": opacities.dtype, "device": opacities.device}
-    rows = torch.arange(camera.height, **options) + 0.5
-    columns = torch.arange(camera.width, **options) + 0.5
+    rows = torch.arange(camera.height).to(opacities) + 0.5
+    columns = torch.arange(camera.width).to(opacities) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     dx = x.reshape(-1, 1) - projection.centers[:, 0]
     dy = y.reshape(-1, 1) - projection.centers[:, 1]
@@ -136,15 +135,8 @@ def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | No
     """Indices of Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
     n = len(gaussians)
     light = gaussians.headlight
-    tensors = [
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        gaussians.sh_frames,
-    ]
-    tensors += [channels, None if light is None else light.falloff]
+    tensors: list[Tensor | None] = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    tensors += [gaussians.sh, gaussians.sh_frames, channels, None if light is None else light.falloff]
     good = depth_keys(gaussians.means, camera) > camera.near
     for tensor in tensors:
         if tensor is not None and n > 0:

@@ -1,4 +1,4 @@
-"""Colour of Gaussians in plain torch: spherical harmonics and the headlight. Differentiable, any float type, any device."""
+"""Colour of Gaussians in plain torch, any float type and device: spherical harmonics and the headlight."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tensor | None) -> Tensor:
-    """Colours [N, 3] = sh . basis(direction) + 0.5, not yet clamped; sh [N, K, 3], means [N, 3], centre [3] in the world."""
+    """Colours [N, 3] = sh . basis(direction) + 0.5, not clamped; sh [N, K, 3]; means [N, 3], centre [3]: world."""
     directions = torch.nn.functional.normalize(means - camera_centre, dim=-1)
     if sh_frames is not None:
         world_from_sh = rotation_matrices(sh_frames.detach())

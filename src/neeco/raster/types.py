@@ -64,9 +64,7 @@ class Rendering:
     depth: Tensor  # [H, W] mm, expected depth (accumulated z / alpha; 0 where nothing was drawn)
     channels: Tensor | None  # [H, W, C] composited like colour, background 0
     radii: Tensor  # [N] px, 3-sigma-like extent of the drawn ellipse, 0 where not drawn; no gradient
-    center_offsets: (
-        Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward is d loss / d centre
-    )
+    center_offsets: Tensor  # [N, 2] px, zeros added to the projected centres; `.grad` after backward: d loss / d centre
 
     @property
     def visible(self) -> Tensor:
