@@ -28,8 +28,8 @@ def adam_step(
     """One step of Adam (Kingma and Ba 2015), in place, without autograd.
 
     All tensors have param's shape [N, ...], float32, contiguous, CPU. step counts from 1. row_lr [N] multiplies the
-    learning rate row by row. The same inputs give the same bits, whatever the number of threads. Raises NeecoError where
-    tensors do not fit.
+    learning rate row by row. The same inputs give the same bits, whatever the number of threads. Raises NeecoError
+    where tensors do not fit.
     """
     if step < 1:
         raise NeecoError(f"adam_step: step: {step}; counts from 1")
