@@ -14,6 +14,7 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.scene.deformations.kinematic import Kinematic
+from neeco.training.extend import extend_shaft
 from neeco.training.session import Session
 
 ROLLS = (1.3, 2.6, -1.9)  # rad, with which rotational symmetry is tested
@@ -32,9 +33,13 @@ def finish_instruments(session: Session) -> None:
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = deformation.hinges_of(index)
-        hinges.extent.copy_(_extent(session.scene.canonical, index, hinges))
         for joint, name in enumerate(hinges.joint_names):
             verdicts[f"{instrument.name}.{name}"] = _verdict(session, index, joint)
+        scene = session.scene
+        hinges.extent.copy_(_extent(scene.canonical, index, hinges))
+        scene.canonical = extend_shaft(
+            scene.canonical, index + 1, instrument.name, hinges, scene.recorded, 1.5 * session.extent
+        )
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]

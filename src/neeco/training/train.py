@@ -81,6 +81,8 @@ def train(
     log = _Log(output / "metrics.jsonl", progress)
     started = time.monotonic()
     torch.manual_seed(config.seed)
+    if config.method != "neeco":
+        torch.set_num_threads(1)  # the kernels have their own threads; torch's small operations only wait for each other
     if resuming:
         scene, header, tensors = read_checkpoint(output)
         session = new_session(scene, frames, images, masks, config)
