@@ -45,7 +45,8 @@ NEECO_INLINE void prefetch_record(const Frame& frame, uint32_t gaussian, int val
 template <int V>
 struct TileState {
     alignas(64) float transmittance[kTilePixels];
-    alignas(64) float sums[kTileHeight / kRows][V][W];
+    alignas(64) float sums[kTileHeight / kRows][V + 1][W];  // of weight * value, then of weights: 1 - transmittance
+                                                            // would lose faint alphas' digits, and depth with them
     alignas(64) int32_t last[kTilePixels];
 };
 
@@ -89,6 +90,7 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
             weight = select(drawn, weight, all(0.f));
             vf* sums = (vf*)s.sums[row];
             for (int c = 0; c < V; c++) sums[c] += weight * value[c];
+            sums[V] += weight;
             *transmittance = before - weight;
         }
         if ((k & 7) == 7 && filled) {  // rows that are full at both ends need no more visits
@@ -109,7 +111,7 @@ static void write_tile(Frame& frame, const Tile& tile, const TileState<V>& s, co
             const size_t pixel = (size_t)(tile.y + y) * frame.camera.width + tile.x + x;
             const int i = y * kStrip + x, lane = y % kRows * kStrip + x;
             const float(*sums)[W] = s.sums[y / kRows];
-            const float left = s.transmittance[i] < 0 ? -s.transmittance[i] : s.transmittance[i], alpha = 1.f - left;
+            const float left = s.transmittance[i] < 0 ? -s.transmittance[i] : s.transmittance[i], alpha = sums[V][lane];
             for (int c = 0; c < 3; c++) out.color[3 * pixel + c] = sums[c][lane] + (background ? left * background[c] : 0.f);
             out.alpha[pixel] = alpha;
             out.depth[pixel] = alpha > 0 ? sums[3][lane] / alpha : 0.f;

@@ -13,6 +13,7 @@ template <int V>
 struct TileGradients {
     alignas(64) float transmittance[kTilePixels];
     alignas(64) float behind[kTilePixels];  // sum over what lies behind of weight * (gradient . value), minus dL/dalpha * T
+    alignas(64) float depth[kTilePixels];   // as drawn
     alignas(64) float wanted[kTileHeight / kRows][V][W];
     alignas(64) int32_t last[kTilePixels];
 };
@@ -22,6 +23,7 @@ template <int V>
 static int load_tile(const Frame& frame, const Tile& tile, const ImageGradients& from, int channels, TileGradients<V>& s) {
     std::memset(s.wanted, 0, sizeof s.wanted);
     std::memset(s.behind, 0, sizeof s.behind);
+    std::memset(s.depth, 0, sizeof s.depth);
     for (int i = 0; i < kTilePixels; i++) {
         s.transmittance[i] = 1.f;
         s.last[i] = -1;
@@ -32,12 +34,10 @@ static int load_tile(const Frame& frame, const Tile& tile, const ImageGradients&
             const size_t pixel = (size_t)(tile.y + y) * frame.camera.width + tile.x + x;
             const int i = y * kStrip + x, lane = y % kRows * kStrip + x;
             float(*wanted)[W] = s.wanted[y / kRows];
-            float to_alpha = from.alpha ? from.alpha[pixel] : 0.f;
-            if (from.depth && from.drawn_alpha[pixel] > 0) {  // depth = sum / alpha
-                const float scaled = from.depth[pixel] / from.drawn_alpha[pixel];
-                wanted[3][lane] = scaled;
-                to_alpha -= scaled * from.drawn_depth[pixel];
-            }
+            const float to_alpha = from.alpha ? from.alpha[pixel] : 0.f;
+            // depth = sum of weight * z / alpha, so d depth / d weight = (z - depth) / alpha
+            s.depth[i] = from.drawn_depth[pixel];
+            if (from.depth && from.drawn_alpha[pixel] > 0) wanted[3][lane] = from.depth[pixel] / from.drawn_alpha[pixel];
             float behind = -to_alpha;
             if (from.color)
                 for (int c = 0; c < 3; c++) {
@@ -87,7 +87,8 @@ NEECO_INLINE void backward_pair(const float* record, const Pair& pair, int k, co
         vf agreement = all(0.f);
         for (int c = 0; c < V; c++) {
             const vf w = wanted[c];
-            agreement += value[c] * w;
+            // z and depth nearly cancel: subtract them before anything is rounded
+            agreement += (c == 3 ? value[c] - *(const vf*)(s.depth + row * W) : value[c]) * w;
             to_value[c] += weight * w;
         }
         const vf to_alpha = before * agreement - *behind * scale;
