@@ -43,11 +43,16 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path` atomically (see `write_atomically`)."""
-    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+    def write(temporary: Path) -> None:
+        temporary.write_text(text, encoding="utf-8")
+
+    write_atomically(path, write)
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such numbers."""
+    """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such
+    numbers."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 

@@ -19,7 +19,8 @@ SH_COEFFICIENTS = 16  # degree 3
 class CanonicalGaussians:
     """Raw (unactivated) parameters, ordered by body: tissue first, then instrument 1, 2, ...
 
-    `extras` holds whatever per-Gaussian parameters a deformation adds ([N, ...] each); density control carries them along.
+    `extras` holds whatever per-Gaussian parameters a deformation adds ([N, ...] each); density control carries them
+    along.
     """
 
     means: Tensor  # [N, 3] mm; tissue in the world frame, an instrument in the frame its deformation says
@@ -75,7 +76,8 @@ class CanonicalGaussians:
 
 
 def seed_gaussians(positions: Tensor, colors: Tensor, spacing: Tensor, *, opacity: float = 0.1) -> CanonicalGaussians:
-    """Round Gaussians of one body at `positions` [N, 3] mm with `colors` [N, 3] and standard deviation `spacing` [N] mm (3DGS)."""
+    """Round Gaussians of one body at `positions` [N, 3] mm with `colors` [N, 3] and standard deviation `spacing` [N] mm
+    (3DGS)."""
     count = positions.shape[0]
     return CanonicalGaussians(
         means=positions.float().clone(),

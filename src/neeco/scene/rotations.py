@@ -95,7 +95,8 @@ def rigid_from_vector(vector: Tensor) -> Tensor:
 
 
 def rotate_about(points: Tensor, axis: Tensor, pivot: Tensor, angle: Tensor) -> Tensor:
-    """Turn points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along the unit `axis` [3] (Rodrigues)."""
+    """Turn points [M, 3] by `angle` [M] rad about the line through `pivot` [3] along the unit `axis` [3]
+    (Rodrigues)."""
     arm = points - pivot
     cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
     along = (arm @ axis)[:, None] * axis

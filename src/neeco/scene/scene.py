@@ -29,11 +29,12 @@ class Recording:
 class Scene(nn.Module):
     """`scene.at(state)` is the one way from canonical to posed Gaussians, for every method.
 
-    `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation in mm,
-    log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue, instruments) and `vignette` are the
-    headlight (see `Headlight`).
+    `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
+    instruments) and `vignette` are the headlight (see `Headlight`).
     """
 
+    center: Tensor
     registration: Tensor
 
     def __init__(

@@ -1,7 +1,7 @@
 """An instrument's rough shape by space carving in its own tracked frame: which points are evidence in every image?
 
-Points of the rigid instrument fall on residual in all frames whatever its pose; points of tissue do not. From the carved volume come the
-shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
+Points of the rigid instrument fall on residual in all frames whatever its pose; points of tissue do not. From the
+carved volume come the shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int 
 
 
 def _shaft_frame(evidence: Evidence, transforms: Tensor, solid: Tensor) -> Tensor:
-    """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames see."""
+    """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
+    see."""
     center = solid.mean(0)
     _, _, axes = torch.linalg.svd(solid - center, full_matrices=False)
     direction = axes[0]
@@ -125,7 +126,8 @@ def center_line(evidence: Evidence, name: str, shape: CarvedShape) -> Tensor:
 
 
 def _slice_centers(evidence: Evidence, transforms: Tensor, spacing: float, half: float) -> Tensor:
-    """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that see it."""
+    """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
+    see it."""
     ticks = torch.linspace(-half, half, 21)
     cell = float(ticks[1] - ticks[0]) ** 2
     x, y = torch.meshgrid(ticks, ticks, indexing="ij")
@@ -146,7 +148,8 @@ def _slice_centers(evidence: Evidence, transforms: Tensor, spacing: float, half:
 
 
 def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying slices."""
+    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying
+    slices."""
     design = torch.stack([positions, torch.ones_like(positions)], 1)
     robust = torch.ones_like(positions)
     for _ in range(10):

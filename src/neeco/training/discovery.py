@@ -47,8 +47,8 @@ def find_instruments(
         shape = carve(evidence, instrument.name, generator, SEEDS)
         if shape is None:
             raise NeecoError(
-                f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its poses "
-                "are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
+                f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
+                "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
         hinges = deformation.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)

@@ -5,6 +5,7 @@ A short static fit explains the tissue; each image's residual is the evidence. N
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,7 +42,8 @@ class Evidence:
         )
 
     def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue: two [F, Q]."""
+        """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue: both
+        [F, Q]."""
         x, y, z = points.unbind(-1)
         fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
         u, v = x / z * fx + cx, y / z * fy + cy
@@ -54,7 +56,7 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(scene: Scene, frames: tuple[Frame, ...], images: list[Tensor], most: int = 120) -> Evidence:
+def gather_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], most: int = 120) -> Evidence:
     """Residuals of a tissue-only `scene` against at most `most` training images ([H, W, 3] uint8), evenly picked."""
     step = max(1, -(-len(frames) // most))
     picked = list(range(0, len(frames), step))

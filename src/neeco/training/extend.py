@@ -1,7 +1,7 @@
 """Prolong a shaft beyond what the training images showed of it.
 
-The camera sees a shaft only up to the image's border; in a new state more of it comes into view. A shaft is the same all along, so the
-rearmost well-seen slab is repeated towards the rear.
+The camera sees a shaft only up to the image's border; in a new state more of it comes into view. A shaft is the same
+all along, so the rearmost well-seen slab is repeated towards the rear.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
 def extend_shaft(
     canonical: CanonicalGaussians, body: int, name: str, hinges: Hinges, recorded: Recording, length: float
 ) -> CanonicalGaussians:
-    """Canonical Gaussians with instrument `body` (row group index) prolonged by about `length` mm; unchanged when its end is real."""
+    """Canonical Gaussians with instrument `body` (row group index) prolonged by about `length` mm; unchanged when its
+    end is real."""
     rows = canonical.body(body)
     along = hinges.along_shaft(canonical.means[rows])  # [M]
     solid = torch.sigmoid(canonical.opacity_logits[rows]) > 0.3

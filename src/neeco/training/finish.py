@@ -47,7 +47,8 @@ def finish_instruments(session: Session) -> None:
 
 @torch.no_grad()
 def place_wrists(session: Session) -> None:
-    """The wrist begins where the shaft stops being a surface of revolution: where spinning what lies behind starts to cost."""
+    """The wrist begins where the shaft stops being a surface of revolution: where spinning what lies behind starts to
+    cost."""
     scene = session.scene
     deformation = scene.deformation
     if not isinstance(deformation, Kinematic):
@@ -94,9 +95,11 @@ def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor
 
 
 def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
-    """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving parts' image?
+    """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving
+    parts' image?
 
-    `explained` = 1 - error(reading) / error(reading replaced by the mean), over pixels that a moving part covers in either drawing.
+    `explained` = 1 - error(reading) / error(reading replaced by the mean), over pixels that a moving part covers in
+    either drawing.
     """
     scene = session.scene
     deformation = scene.deformation

@@ -1,7 +1,8 @@
 """Where is a joint's hinge? A global search over stick figures against the evidence, before anything is trained.
 
-A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the pivot, turned about
-the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above all where the reading is large.
+A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the pivot,
+turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above all where the
+reading is large.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ STICK_POINTS = 16
 
 @dataclass(frozen=True)
 class HingeGuess:
-    """One hypothesis: angle rad around and depth mm along the carved shaft, gains of the two parts, and its score in [0, 1]."""
+    """One hypothesis: angle rad around and depth mm along the carved shaft, gains of the two parts, and its score in
+    [0, 1]."""
 
     angle: float
     depth: float
@@ -59,7 +61,8 @@ def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) 
 
 
 def dominant_angle(guesses: list[HingeGuess]) -> float:
-    """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its peak alone."""
+    """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its peak
+    alone."""
     best: dict[float, float] = {}
     for guess in guesses:
         best[guess.angle] = max(best.get(guess.angle, 0.0), guess.score)
@@ -68,7 +71,8 @@ def dominant_angle(guesses: list[HingeGuess]) -> float:
 
 
 def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
-    """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the tip."""
+    """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the
+    tip."""
     known = line.numpy()
     along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICK_POINTS)
     across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
@@ -84,7 +88,8 @@ def _stick_scores(
     turns: Tensor,
     weight: Tensor,
 ) -> Tensor:
-    """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by `weight` [F]."""
+    """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by
+    `weight` [F]."""
     axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
     arm = (stick - torch.tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
     cosine, sine = turns.cos()[None, :, None, None], turns.sin()[None, :, None, None]

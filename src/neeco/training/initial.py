@@ -87,11 +87,11 @@ def moving_joints(
         return wanted
     states = [frame.state.instruments[instrument.name] for frame in frames]
     poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
-    poses = np.unique(np.round(poses, 6), axis=0, return_index=True)
-    design = np.column_stack([poses[0] - poses[0].mean(0), np.ones(len(poses[0]))])
+    distinct, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
+    design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
     kept = []
     for joint in instrument.joints:
-        reading = np.array([states[i].joints[joint] for i in poses[1]])
+        reading = np.array([states[i].joints[joint] for i in first])
         spread = reading.var()
         fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]
         explained = 1 - (reading - fitted).var() / spread if spread > 1e-8 else 0.0

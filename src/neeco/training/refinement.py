@@ -93,7 +93,8 @@ class Refinement:
 
     @torch.no_grad()
     def center(self) -> None:
-        """Take the mean correction out: a constant one belongs to the instrument's shape (and to `Scene.registration`)."""
+        """Take the mean correction out: a constant one belongs to the instrument's shape (and to
+        `Scene.registration`)."""
         seen = self.frame_steps > 0
         if seen.any():
             self.poses[seen] -= self.poses[seen].mean(0)
@@ -112,7 +113,8 @@ class Refinement:
 
 
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:
-    """[F, I, 6] body-frame velocity (rad/s, mm/s) by differences between neighbours in time; 0 where time stands still."""
+    """[F, I, 6] body-frame velocity (rad/s, mm/s) by differences between neighbours in time; 0 where time stands
+    still."""
     count = len(frames)
     velocity = torch.zeros(count, len(instruments), 6)
     order = sorted(range(count), key=lambda i: frames[i].state.time)

@@ -1,8 +1,8 @@
 """The paper's dynamic training adjustment: four settings that switch together when the scene has settled.
 
-Phase 1 looks for the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the encoded
-state. Phase 2 refines. Each of the four parts can be turned off (3DGS's behaviour) or inverted (phases swapped), as the paper's
-ablations do.
+Phase 1 looks for the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the
+encoded state. Phase 2 refines. Each of the four parts can be turned off (3DGS's behaviour) or inverted (phases
+swapped), as the paper's ablations do.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ class Schedule:
         return NEECO_PHASES[self._acting_phase(self.config.density)]
 
     def sh_degree(self, iteration: int) -> int:
-        """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start (3DGS)."""
+        """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
+        (3DGS)."""
         config = self.config
         grown_since = 0 if config.sh_order == "off" else self.phase_started
         grown = min(config.max_sh_degree, (iteration - grown_since) // config.sh_interval)
@@ -96,7 +97,8 @@ class Schedule:
         return 0
 
     def state_noise(self, progress: float) -> float:
-        """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in its phase."""
+        """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in
+        its phase."""
         config = self.config
         if config.compensation == "off" or self._acting_phase(config.compensation) == 2:
             return 0.0
@@ -125,7 +127,8 @@ class Schedule:
 
 
 def order_by_pose(states: np.ndarray) -> np.ndarray:
-    """Indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform motion).
+    """Indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform
+    motion).
 
     Starts at the state of smallest first principal coordinate, so that the walk sweeps the range once.
     """

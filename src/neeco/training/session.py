@@ -46,7 +46,8 @@ class StepResult:
 
 @dataclass
 class Session:
-    """One training run in memory. `images` [H, W, 3] uint8 and `masks` ([H, W] bool or None), one per training frame."""
+    """One training run in memory. `images` [H, W, 3] uint8 and `masks` ([H, W] bool or None), one per training
+    frame."""
 
     config: TrainConfig
     scene: Scene

@@ -57,9 +57,10 @@ def train(
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
-    Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an interrupted
-    run under the settings it was started with. The same seed gives the same scene, interrupted or not, unless `minutes` is set.
-    Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is no number.
+    Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an
+    interrupted run under the settings it was started with. The same seed gives the same scene, interrupted or not,
+    unless `minutes` is set. Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without
+    `resume`, or a loss that is no number.
     """
     capture_path, output = Path(capture_path), Path(output)
     resuming = resume and checkpoint_path(output).exists()
@@ -82,7 +83,8 @@ def train(
     started = time.monotonic()
     torch.manual_seed(config.seed)
     if config.method != "neeco":
-        torch.set_num_threads(1)  # the kernels have their own threads; torch's small operations only wait for each other
+        # the kernels have their own threads; torch's small operations only wait for each other
+        torch.set_num_threads(1)
     if resuming:
         scene, header, tensors = read_checkpoint(output)
         session = new_session(scene, frames, images, masks, config)

@@ -14,14 +14,17 @@ from neeco.scene.rotations import axis_angle_quat, quat_multiply, rotate_about
 class Hinges(nn.Module):
     """A straight shaft and joints whose hinge axes cross it at right angles.
 
-    The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer, instrument_from_shaft with z
-    along the shaft) by two learned tilts (rad) and two shifts (mm). Joint j turns two parts about the axis at `hinge_angle[j]`
-    (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns by `offsets[j, k] + gains[j, k] * reading`. The reading is the angle between the two parts, so
-    the gains are `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
+    The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer,
+    instrument_from_shaft with z along the shaft) by two learned tilts (rad) and two shifts (mm). Joint j turns two
+    parts about the axis at `hinge_angle[j]` (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns
+    by `offsets[j, k] + gains[j, k] * reading`. The reading is the angle between the two parts, so the gains are
+    `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
     Parts are soft: a Gaussian turns by its part weights times the parts' angles.
     """
 
     base: Tensor
+    wrist_start: Tensor
+    extent: Tensor
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         super().__init__()
@@ -60,7 +63,8 @@ class Hinges(nn.Module):
     def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
         """(pivot [3] mm, unit axis [3]) of one joint, instrument frame.
 
-        The shaft is taken as it is: only spinning it (see `spin`) teaches where it lies, or the hinge would drag it along.
+        The shaft is taken as it is: only spinning it (see `spin`) teaches where it lies, or the hinge would drag it
+        along.
         """
         origin, direction = (part.detach() for part in self.shaft())
         angle = self.hinge_angle[joint]
@@ -80,7 +84,8 @@ class Hinges(nn.Module):
         return rotate_about(points, direction, origin, angle), quat_multiply(axis_angle_quat(direction, angle), quats)
 
     def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
-        """Move points [M, 3] by the joints; returns them and each one's turn as a quaternion [M, 4] (None without joints).
+        """Move points [M, 3] by the joints; returns them and each one's turn as a quaternion [M, 4] (None without
+        joints).
 
         weights [M, part_count] sum to 1 over parts: body, then two per joint.
         """
@@ -97,8 +102,8 @@ class Hinges(nn.Module):
     def left_part(self, joint: int) -> int:
         """Which of a joint's two parts (0 or 1) is the left one.
 
-        The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left part opens
-        towards (shaft direction x axis).
+        The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
+        part opens towards (shaft direction x axis).
         """
         _, axis = self.hinge(joint)
         sign = torch.sign(axis[axis.abs().argmax()])

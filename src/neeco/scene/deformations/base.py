@@ -26,8 +26,8 @@ class Posed:
 class Perturbation:
     """What training may disturb on purpose; drawing never does.
 
-    `shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution looks the
-    same). `state_noise`: standard deviation added to the encoded state (the paper's compensation).
+    `shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
+    looks the same). `state_noise`: standard deviation added to the encoded state (the paper's compensation).
     """
 
     shaft_roll: float = 0.0
@@ -39,7 +39,8 @@ UNPERTURBED = Perturbation()
 
 @dataclass(frozen=True)
 class Deltas:
-    """Change of each Gaussian between two states of the scene, or from canonical to posed (the paper's d_mu, d_r, d_s)."""
+    """Change of each Gaussian between two states of the scene, or from canonical to posed (the paper's d_mu,
+    d_r, d_s)."""
 
     means: Tensor  # [N, 3] mm
     quats: Tensor  # [N, 4]

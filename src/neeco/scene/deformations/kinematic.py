@@ -1,7 +1,7 @@
 """Rigid parts on learned hinges, method `kinematic`.
 
-Tissue is static. Each instrument's Gaussians live in its own tracked frame and move rigidly with its pose; joints turn parts
-about hinges that are learned from the images, with soft part assignment per Gaussian.
+Tissue is static. Each instrument's Gaussians live in its own tracked frame and move rigidly with its pose; joints turn
+parts about hinges that are learned from the images, with soft part assignment per Gaussian.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ class Kinematic(Deformation):
         return labels
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
-        """Change from canonical to posed; tissue does not change, so the thresholds of the paper's labels separate exactly."""
+        """Change from canonical to posed; tissue does not change, so the thresholds of the paper's labels separate
+        exactly."""
         deltas = super().deltas(canonical, state)
         tissue = canonical.body(0)
         for tensor in (deltas.means, deltas.quats, deltas.scales):
