@@ -12,8 +12,10 @@ from neeco.training.train import ProgressRow, train
 
 
 def train_with_progress(capture: Path, output: Path, config: TrainConfig, *, resume: bool = False) -> Path:
-    """`train` with a bar on stderr: PSNR, Gaussians, phase, time left; news in words above it."""
-    console = Console(stderr=True)
+    """`train` with a bar on stderr: PSNR, Gaussians, phase, time left; news in words above it.
+
+    Nothing is printed before training has news, so that bad input ends in its one line alone.
+    """
     columns = [
         TextColumn("training"),
         BarColumn(),
@@ -22,16 +24,19 @@ def train_with_progress(capture: Path, output: Path, config: TrainConfig, *, res
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     ]
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("starting", total=1.0)
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task("starting", total=1.0)
 
-        def show(row: ProgressRow) -> None:
-            if row.note:
-                bar.console.print(row.note, style="dim", highlight=False)
-                return
-            text = (
-                f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB  {row.num_gaussians} Gaussians  phase {row.phase}"
-            )
-            bar.update(task, completed=row.progress, description=text)
+    def show(row: ProgressRow) -> None:
+        bar.start()
+        if row.note:
+            bar.console.print(row.note, style="dim", highlight=False)
+            return
+        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB  {row.num_gaussians} Gaussians  phase {row.phase}"
+        bar.update(task, completed=row.progress, description=text)
 
+    try:
         return train(capture, output, config, resume=resume, progress=show)
+    finally:
+        if bar.live.is_started:
+            bar.stop()
