@@ -53,7 +53,7 @@ METHOD_DEFAULTS: dict[str, TrainConfig] = {
     "kinematic": TrainConfig(
         method="kinematic",
         schedule=replace(PLAIN, sh_interval=500, plain_density=DensityPhase(200, 0, 2e-4)),
-        refine=RefineConfig(registration=True, latency=True, frame_poses=True),
+        refine=RefineConfig(latency=True, frame_poses=True),
         density_start=400,
         density_stop=0.7,
         opacity_penalty=0.002,

@@ -17,19 +17,18 @@ from neeco.scene.deformations.kinematic import Kinematic
 from neeco.training.extend import extend_shaft
 from neeco.training.session import Session
 
-ROLLS = (1.3, 2.6, -1.9)  # rad, with which rotational symmetry is tested
-WRIST_STEPS = 12
-SYMMETRY_TOLERANCE = 0.15  # of the largest loss that spinning causes
+ROLLS = (0.5, -0.5)  # rad, with which rotational symmetry is tested: small, so that seen sides stay in view
+WRIST_STEPS = 14
+SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
 FOUND = 0.25  # share of the moving parts' error that the readings must explain
 
 
 @torch.no_grad()
 def finish_instruments(session: Session) -> None:
-    """Set each instrument's wrist and extent and write the joints' verdicts into `scene.diagnostics`."""
+    """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`."""
     deformation = session.scene.deformation
     if not isinstance(deformation, Kinematic):
         return
-    place_wrists(session)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = deformation.hinges_of(index)
@@ -53,7 +52,7 @@ def place_wrists(session: Session) -> None:
     deformation = scene.deformation
     if not isinstance(deformation, Kinematic):
         return
-    frames = _spread(session, 10)
+    frames = _spread(session, 16)
     for index in range(len(scene.instruments)):
         hinges = deformation.hinges_of(index)
         if not hinges.joint_names:
@@ -65,8 +64,8 @@ def place_wrists(session: Session) -> None:
         costs = []
         for start in starts:
             hinges.wrist_start.fill_(float(start))
-            costs.append(sum(_image_error(session, f, Perturbation(ROLLS[k % 3])) for k, f in enumerate(frames)) - base)
-        limit = max(costs) * SYMMETRY_TOLERANCE + max(0.0, min(costs))
+            costs.append(sum(_image_error(session, f, Perturbation(ROLLS[k % 2])) for k, f in enumerate(frames)) - base)
+        limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
         cheap = [float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit]
         hinges.wrist_start.fill_(max(cheap) if cheap else float(starts[0]))
 

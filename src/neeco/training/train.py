@@ -121,6 +121,7 @@ def _run(session: Session, output: Path, log: _Log) -> None:
     clock = time.monotonic()
     try:
         while session.progress < 1:
+            before = session.progress
             result = session.step()
             losses.append(result.loss)
             psnrs.append(result.psnr)
@@ -129,7 +130,7 @@ def _run(session: Session, output: Path, log: _Log) -> None:
             if session.schedule.phase != phase:
                 phase = session.schedule.phase
                 log.note(f"phase {phase} begins" + (" (forced)" if session.schedule.forced else ""))
-            if session.iteration == int(WRIST_FRACTION * session.config.iterations):
+            if before < WRIST_FRACTION <= session.progress:
                 place_wrists(session)
             if session.iteration % ROW_INTERVAL == 0:
                 log.row(session, sum(losses) / len(losses), sum(psnrs) / len(psnrs))

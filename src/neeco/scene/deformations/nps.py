@@ -1,8 +1,9 @@
 """The paper's network (NeeCo, "neural pose-state" field F), method `neeco`.
 
-G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to changes of
-mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised head (the untrained
-scene is the canonical one), rotation added to the unit quaternion and scale to its logarithm, means detached (Deformable-3DGS).
+G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to
+changes of mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised
+head (the untrained scene is the canonical one), rotation added to the unit quaternion and scale to its logarithm, means
+detached (Deformable-3DGS).
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation
 from neeco.scene.rotations import matrix_to_quat
 
 MEMBERSHIP = "membership"
+# What one unit of the head's output means. With unit features a first Adam step moves every output by about
+# width * rate = 0.2; without these the first steps throw Gaussians across the scene.
+MEAN_UNIT = 0.05  # of the points' half extent
+SHAPE_UNIT = 0.1  # of quaternion and log scale
 
 
 def encode(values: Tensor, frequencies: int, *, identity: bool = False) -> Tensor:
@@ -33,7 +38,7 @@ class NPS(Deformation):
     """Fields: depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
-    `half`: evaluate hidden layers in bfloat16. `chunk`: Gaussians per evaluation when no gradient is wanted.
+    `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per evaluation when no gradient is wanted.
     """
 
     state_center: Tensor
@@ -51,7 +56,7 @@ class NPS(Deformation):
         L_state: int = 10,
         identity: bool = False,
         state: str = "full",
-        half: bool = True,
+        half: bool = False,
         chunk: int = 65536,
     ) -> None:
         super().__init__()
@@ -145,9 +150,9 @@ class NPS(Deformation):
         if not self.instruments:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         change = self.network(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
-        quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
-        means = canonical.means + change[:, :3] * self.mean_halfwidth
-        return Posed(means, quats, (canonical.log_scales + change[:, 7:]).exp())
+        means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
+        quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
+        return Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
 
     def _encoded_state(self, state: State, noise: float) -> Tensor:
         """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""
@@ -155,7 +160,7 @@ class NPS(Deformation):
         return encoded + noise * torch.randn_like(encoded) if noise > 0 else encoded
 
     def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
-        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean / halfwidth, quaternion, log scale)."""
+        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above)."""
         if not torch.is_grad_enabled() and means.shape[0] > self.chunk:
             return torch.cat([self.network(part, encoded_state) for part in means.split(self.chunk)])
         encoded = encode((means - self.mean_center) / self.mean_halfwidth, self.L_mean, identity=self.identity)
@@ -181,7 +186,8 @@ class NPS(Deformation):
 
 @torch.no_grad()
 def mark_moving(deformation: NPS, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its logarithm."""
+    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its
+    logarithm."""
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
     threshold = otsu(spread.clamp_min(1e-6).log())
