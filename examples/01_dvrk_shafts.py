@@ -1,8 +1,9 @@
 """List a da Vinci arm's shaft as an instrument of its own, beside its wrist.
 
-A dVRK log's pose is the wrist-yaw frame's: the shaft moves against it by the wrist's two joints, so the two are two rigid bodies.
-The shaft's pose follows from the joints by the standard PSM kinematics (modified Denavit-Hartenberg, lengths in mm). The arm's base
-is placed in the pose's frame by fitting the kinematics' wrist positions to the recorded ones.
+A dVRK log's pose is the wrist-yaw frame's: the shaft moves against it by the wrist's two joints, so the two are two
+rigid bodies. The shaft's pose follows from the joints by the standard PSM kinematics (modified Denavit-Hartenberg,
+lengths in mm). The arm's base is placed in the pose's frame by fitting the kinematics' wrist positions to the recorded
+ones.
 
     python examples/01_dvrk_shafts.py CAPTURE OUTPUT [--transforms transforms_registered.json]
 """

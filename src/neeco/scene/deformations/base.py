@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from neeco.capture.model import State
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
 
 
@@ -81,3 +82,14 @@ class Deformation(nn.Module):
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Adam learning rate of each of this module's parameters at `iteration`, by name; 0 holds one still."""
         return {}
+
+
+def state_of(instrument: Instrument, state: State) -> InstrumentState:
+    """What `state` says of `instrument`. Raises NeecoError when the instrument or one of its joints is missing."""
+    if instrument.name not in state.instruments:
+        raise NeecoError(f"state: instrument {instrument.name!r} is missing; give its pose and joints")
+    given = state.instruments[instrument.name]
+    missing = [joint for joint in instrument.joints if joint not in given.joints]
+    if missing:
+        raise NeecoError(f"state: instrument {instrument.name!r}: joint {missing[0]!r} is missing; give it in rad")
+    return given

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinges
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation, Posed, state_of
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
 PART_LOGITS = "part_logits"
@@ -61,12 +60,7 @@ class Kinematic(Deformation):
         perturbation: Perturbation,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """World means [M, 3], quats [M, 4] and SH frames [M, 4] of one instrument's Gaussians."""
-        if instrument.name not in state.instruments:
-            raise NeecoError(f"state: instrument {instrument.name!r} is missing; give its pose and joints")
-        given = state.instruments[instrument.name]
-        missing = [joint for joint in instrument.joints if joint not in given.joints]
-        if missing:
-            raise NeecoError(f"state: instrument {instrument.name!r}: joint {missing[0]!r} is missing; give it in rad")
+        given = state_of(instrument, state)
         hinges, rows = self.hinges_of(index), canonical.body(index + 1)
         points, quats = canonical.means[rows], nn.functional.normalize(canonical.quats[rows], dim=-1)
         turned = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(points.shape[0], 4)  # [M, 4] instrument_from_sh
@@ -118,7 +112,7 @@ class Kinematic(Deformation):
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
         found: dict[str, dict[str, Tensor]] = {}
         for index, instrument in enumerate(self.instruments):
-            hinges, given = self.hinges_of(index), state.instruments[instrument.name]
+            hinges, given = self.hinges_of(index), state_of(instrument, state)
             origin, direction = hinges.shaft()
             points = {"shaft_far": origin + hinges.extent[0] * direction}
             end = hinges.extent[1]

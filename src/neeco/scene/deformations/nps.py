@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed, state_of
 from neeco.scene.rotations import matrix_to_quat
 
 MEMBERSHIP = "membership"
@@ -38,7 +38,8 @@ class NPS(Deformation):
     """Fields: depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
-    `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per evaluation when no gradient is wanted.
+    `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
+    evaluation when no gradient is wanted.
     """
 
     state_center: Tensor
@@ -134,7 +135,7 @@ class NPS(Deformation):
         """p before normalisation [S]: position mm, sign-continuous quaternion, joints rad."""
         parts = []
         for index, instrument in enumerate(self.instruments):
-            given = state.instruments[instrument.name]
+            given = state_of(instrument, state)
             pose = given.pose.float()
             quat = matrix_to_quat(pose[:3, :3])
             quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
