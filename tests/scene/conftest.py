@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from scene_worlds import make_scene
+
+from neeco.scene import Scene
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def kinematic() -> Scene:
+    return make_scene("kinematic")
+
+
+@pytest.fixture
+def neeco() -> Scene:
+    return make_scene("neeco")
+
+
+@pytest.fixture(params=["kinematic", "neeco", "3dgs"])
+def any_scene(request: pytest.FixtureRequest) -> Scene:
+    return make_scene(request.param)

@@ -1,0 +1,78 @@
+"""A grasper of random Gaussians over a few of tissue: 20 of tissue, 40 of the instrument."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.raster.types import Camera
+from neeco.scene import CanonicalGaussians, Recording, Scene
+from neeco.scene.deformations.kinematic import PART_LOGITS
+from neeco.scene.methods import make_deformation
+from neeco.scene.rotations import rigid_from_vector
+
+TISSUE, INSTRUMENT = 20, 40
+GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.5)})
+SURE = 30.0  # a part logit that leaves no doubt
+CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=61.0, cx=32.0, cy=24.0, width=64, height=48)
+
+
+def pose_of(*vector: float) -> Tensor:
+    """[4, 4] float64 from a rotation vector (rad) and a translation (mm)."""
+    return rigid_from_vector(torch.tensor(vector, dtype=torch.float64))
+
+
+def grasper_state(pose: Tensor, jaw: float = 0.4, time: float = 0.0) -> State:
+    return State({"grasper": InstrumentState(pose, {"jaw_angle": jaw})}, time)
+
+
+def random_canonical(generator: torch.Generator, counts: tuple[int, ...] = (TISSUE, INSTRUMENT)) -> CanonicalGaussians:
+    count = sum(counts)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return CanonicalGaussians(
+        means=10 * normal(count, 3),
+        quats=normal(count, 4),
+        log_scales=0.3 * normal(count, 3),
+        opacity_logits=normal(count),
+        sh_dc=normal(count, 1, 3),
+        sh_rest=0.1 * normal(count, 15, 3),
+        counts=counts,
+    )
+
+
+def make_scene(method: str) -> Scene:
+    """A scene of `method` with everything that is learned at random, and eight recorded states."""
+    generator = torch.Generator().manual_seed(3)
+    canonical = random_canonical(generator)
+    if method == "kinematic":
+        canonical = canonical.with_extras(**{PART_LOGITS: torch.randn(len(canonical), 3, generator=generator)})
+    instruments = () if method == "3dgs" else (GRASPER,)
+    states = tuple(
+        grasper_state(pose_of(0.3 * k - 1, 0.2 * k, 0.1, k, 2 * k, 60 - k), 0.1 * k, 0.04 * k)
+        if instruments
+        else State()
+        for k in range(8)
+    )
+    names = tuple(f"{k:06d}" for k in range(8))
+    recorded = Recording(names, ("train",) * 8, states, (CAMERA,) * 8)
+    config = {"half": False} if method == "neeco" else {}
+    deformation = make_deformation(method, instruments, config)
+    scene = Scene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
+    scene.sh_degree = 2
+    if method == "kinematic":
+        hinges = scene.deformation.hinges_of(0)
+        hinges.base.copy_(pose_of(0.4, -0.3, 0.2, 1.0, -2.0, 3.0))
+        hinges.wrist_start.fill_(2.0)
+        hinges.extent.copy_(torch.tensor([-20.0, 15.0]))
+        with torch.no_grad():
+            for parameter in hinges.parameters():
+                parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+            hinges.hinge_depth.fill_(5.0)
+    if method == "neeco":
+        torch.manual_seed(0)
+        deformation.fit_ranges(list(states), canonical.means)
+    return scene

@@ -1,0 +1,109 @@
+"""A scene on disk is the scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from neeco.errors import NeecoError
+from neeco.scene import Scene
+from neeco.scene.io import load_scene, save_scene
+
+
+def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
+    any_scene.diagnostics = {"joints": {"grasper.jaw_angle": {"found": True}}}
+    with torch.no_grad():
+        any_scene.falloff.copy_(torch.tensor([1.9, 2.1]))
+        save_scene(any_scene, tmp_path / "scene.safetensors")
+        loaded = load_scene(tmp_path / "scene.safetensors")
+        assert loaded.canonical.counts == any_scene.canonical.counts
+        for name, tensor in any_scene.canonical.tensors().items():
+            assert torch.equal(loaded.canonical.tensors()[name], tensor), name
+        assert loaded.instruments == any_scene.instruments
+        assert loaded.recorded.names == any_scene.recorded.names
+        assert loaded.diagnostics == any_scene.diagnostics
+        assert loaded.label_names == any_scene.label_names
+        assert torch.equal(loaded.label_channels(), any_scene.label_channels())
+        for before, after in zip(any_scene.recorded.states, loaded.recorded.states, strict=True):
+            assert before.time == after.time
+            a, b = any_scene.at(before), loaded.at(after)
+            assert torch.equal(a.means, b.means)
+            assert torch.equal(a.quats, b.quats)
+            assert torch.equal(a.sh, b.sh)
+            assert torch.equal(a.headlight.falloff, b.headlight.falloff)
+
+
+def test_saving_again_gives_the_same_bytes(any_scene: Scene, tmp_path: Path) -> None:
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    save_scene(any_scene, first)
+    save_scene(load_scene(first), second)
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_loaded_scene_wants_no_gradients(kinematic: Scene, tmp_path: Path) -> None:
+    save_scene(kinematic, tmp_path / "scene.safetensors")
+    loaded = load_scene(tmp_path / "scene.safetensors")
+    assert not loaded.at(loaded.recorded.states[0]).means.requires_grad
+
+
+def test_the_file_is_tensors_and_json_alone(kinematic: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    assert json.loads(header["__metadata__"]["neeco"])["schema"] == "neeco-scene/1"
+    assert b"pickle" not in content
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.safetensors"]
+
+
+@pytest.mark.parametrize("kept", [0, 5, 200, -10])
+def test_a_cut_file_is_refused(kinematic: Scene, tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(NeecoError, match=r"scene\.safetensors: .*; train again"):
+        load_scene(path)
+
+
+def rewrite(path: Path, header_change, drop: str | None = None) -> None:
+    """Save the scene at `path` again with another header, perhaps without one tensor."""
+    with safe_open(path, framework="pt") as stream:
+        header = json.loads(stream.metadata()["neeco"])
+        tensors = {name: stream.get_tensor(name) for name in stream.keys() if name != drop}  # noqa: SIM118
+    header_change(header)
+    save_file(tensors, path, {"neeco": json.dumps(header)})
+
+
+def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    rewrite(path, lambda header: header.update(schema="neeco-scene/9"))
+    with pytest.raises(NeecoError, match="schema 'neeco-scene/9', this version reads 'neeco-scene/1'"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("drop", ["canonical.means", "module.falloff", "recorded.poses"])
+def test_a_missing_tensor_is_refused(kinematic: Scene, tmp_path: Path, drop: str) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    rewrite(path, lambda header: None, drop)
+    with pytest.raises(NeecoError, match="damaged scene"):
+        load_scene(path)
+
+
+def test_a_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_file({"a": torch.zeros(2)}, path)
+    with pytest.raises(NeecoError, match="not a readable neeco scene"):
+        load_scene(path)
+
+
+def test_no_file_is_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(NeecoError, match="no such scene"):
+        load_scene(tmp_path / "scene.safetensors")

@@ -1,0 +1,158 @@
+"""An instrument is rigid but for its hinges."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scene_worlds import SURE, TISSUE, grasper_state, pose_of
+
+from neeco.capture.model import InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.scene import Scene
+from neeco.scene.deformations.base import Perturbation
+from neeco.scene.deformations.kinematic import PART_LOGITS
+from neeco.scene.rotations import quat_to_matrix, rotate_about
+
+POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
+UNIT = torch.nn.functional.normalize
+
+
+def assign(scene: Scene, part: int) -> None:
+    """Give every Gaussian of the instrument to one part."""
+    logits = torch.zeros(len(scene.canonical), 3)
+    logits[:, part] = SURE
+    scene.canonical = scene.canonical.with_extras(**{PART_LOGITS: logits})
+
+
+def test_an_instruments_gaussians_move_with_its_pose(kinematic: Scene) -> None:
+    before, after = kinematic.at(grasper_state(pose_of(0, 0, 0, 0, 0, 0))), kinematic.at(grasper_state(POSE))
+    rotation, translation = POSE[:3, :3].float(), POSE[:3, 3].float()
+    expected = before.means[TISSUE:] @ rotation.T + translation
+    assert torch.allclose(after.means[TISSUE:], expected, atol=1e-4)
+    turned = rotation @ quat_to_matrix(UNIT(before.quats[TISSUE:], dim=-1))
+    assert torch.allclose(quat_to_matrix(UNIT(after.quats[TISSUE:], dim=-1)), turned, atol=1e-5)
+
+
+def test_tissue_never_moves(kinematic: Scene) -> None:
+    posed = kinematic.at(grasper_state(POSE, 1.2))
+    assert torch.equal(posed.means[:TISSUE], kinematic.canonical.means[:TISSUE])
+    deltas = kinematic.deltas(grasper_state(POSE, 1.2))
+    assert not deltas.means[:TISSUE].any()
+    assert deltas.means[TISSUE:].norm(dim=1).min() > 0
+
+
+def test_a_joint_leaves_the_shaft_alone(kinematic: Scene) -> None:
+    assign(kinematic, 0)
+    shut, open_ = kinematic.at(grasper_state(POSE, 0.0)), kinematic.at(grasper_state(POSE, 1.5))
+    assert torch.allclose(shut.means, open_.means, atol=1e-5)
+
+
+@pytest.mark.parametrize("part", [1, 2])
+def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic: Scene, part: int) -> None:
+    assign(kinematic, part)
+    identity = pose_of(0, 0, 0, 0, 0, 0)
+    shut, open_ = (kinematic.at(grasper_state(identity, jaw)).means[TISSUE:] for jaw in (0.0, 0.7))
+    hinges = kinematic.deformation.hinges_of(0)
+    pivot, axis = hinges.hinge(0)
+    turn = (0.7 * hinges.gains[0, part - 1]).expand(len(shut))
+    assert turn[0].abs() > 0.1
+    assert torch.allclose(open_, rotate_about(shut, axis, pivot, turn), atol=1e-4)
+    assert (open_ - shut).norm(dim=1).max() > 1
+
+
+def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
+    assign(kinematic, 1)
+    pivot, axis = kinematic.deformation.hinges_of(0).hinge(0)
+    with torch.no_grad():
+        along = torch.linspace(-8, 8, len(kinematic.canonical) - TISSUE)
+        kinematic.canonical.means[TISSUE:] = pivot + along[:, None] * axis
+    shut, open_ = kinematic.at(grasper_state(POSE, 0.0)), kinematic.at(grasper_state(POSE, 1.5))
+    assert torch.allclose(shut.means, open_.means, atol=1e-4)
+
+
+def test_the_hinge_crosses_the_shaft_at_a_right_angle(kinematic: Scene) -> None:
+    hinges = kinematic.deformation.hinges_of(0)
+    (origin, direction), (pivot, axis) = hinges.shaft(), hinges.hinge(0)
+    assert float((axis @ direction).detach().abs()) < 1e-6
+    assert torch.allclose(torch.linalg.cross(pivot - origin, direction), torch.zeros(3), atol=1e-5)
+
+
+def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene) -> None:
+    state, hinges = grasper_state(POSE), kinematic.deformation.hinges_of(0)
+    still, spun = kinematic.at(state).means, kinematic.at(state, Perturbation(shaft_roll=1.0)).means
+    beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
+    moved = (spun - still).norm(dim=1)
+    assert moved[:TISSUE].max() == 0
+    assert moved[TISSUE:][beyond].max() < 1e-4
+    assert moved[TISSUE:][~beyond].min() > 0.1
+    assert 5 < int(beyond.sum()) < 35
+
+
+def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
+    hinges, points = kinematic.deformation.hinges_of(0), kinematic.canonical.means[TISSUE:]
+    origin, direction = hinges.shaft()
+    spun, _ = hinges.spin(points, kinematic.canonical.quats[TISSUE:], 2.0)
+    distances = [torch.linalg.cross(p - origin, direction.expand_as(p)).norm(dim=1) for p in (points, spun)]
+    assert torch.allclose(*distances, atol=1e-4)
+    assert torch.allclose(hinges.along_shaft(spun), hinges.along_shaft(points), atol=1e-4)
+
+
+def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene) -> None:
+    labels = kinematic.label_channels()
+    assert labels.shape[1] == len(kinematic.label_names) == 4
+    assert not labels[:TISSUE].any()
+    assert torch.allclose(labels[TISSUE:].sum(1), torch.ones(len(labels) - TISSUE), atol=1e-6)
+    assert labels.min() >= 0
+    assert labels.sum(1).max() <= 1 + 1e-6
+
+
+def test_shaft_and_wrist_meet_at_wrist_start(kinematic: Scene) -> None:
+    assign(kinematic, 0)
+    labels, hinges = kinematic.label_channels()[TISSUE:], kinematic.deformation.hinges_of(0)
+    beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
+    assert [name for _, name in kinematic.label_names[:2]] == ["shaft", "wrist"]
+    assert torch.equal(labels[:, 1] > 0.5, beyond)
+    assert torch.equal(labels[:, 0] > 0.5, ~beyond)
+
+
+def test_gradients_reach_the_pose(kinematic: Scene) -> None:
+    pose = POSE.clone().requires_grad_()
+    kinematic.at(grasper_state(pose)).means.sum().backward()
+    assert pose.grad is not None
+    assert torch.allclose(pose.grad[:3, 3], torch.full((3,), 40.0, dtype=torch.float64))
+    assert pose.grad[:3, :3].abs().min() > 0
+
+
+def test_keypoints_ride_along(kinematic: Scene) -> None:
+    at_home = kinematic.keypoints(grasper_state(pose_of(0, 0, 0, 0, 0, 0)))["grasper"]
+    moved = kinematic.keypoints(grasper_state(POSE))["grasper"]
+    assert set(at_home) == {"hinge", "tip_left", "tip_right", "shaft_near", "shaft_far"}
+    for name, point in at_home.items():
+        assert torch.allclose(moved[name], POSE[:3, :3].float() @ point + POSE[:3, 3].float(), atol=1e-4), name
+
+
+def test_a_registration_moves_all_instruments_and_no_tissue(kinematic: Scene) -> None:
+    before = kinematic.at(grasper_state(POSE)).means
+    with torch.no_grad():
+        kinematic.registration.copy_(torch.tensor([0, 0, 0, 1.0, -2.0, 3.0, 0]))
+        after = kinematic.at(grasper_state(POSE)).means
+    assert torch.equal(after[:TISSUE], before[:TISSUE])
+    assert torch.allclose(after[TISSUE:] - before[TISSUE:], torch.tensor([1.0, -2.0, 3.0]), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("state", "named"),
+    [
+        (State(), "'grasper'"),
+        (State({"grasper": InstrumentState(POSE)}), "'jaw_angle'"),
+        (State({"scissors": InstrumentState(POSE, {"jaw_angle": 0.1})}), "'grasper'"),
+    ],
+)
+def test_a_state_that_lacks_something_is_refused(kinematic: Scene, state: State, named: str) -> None:
+    with pytest.raises(NeecoError, match=named):
+        kinematic.at(state)

@@ -1,0 +1,135 @@
+"""The paper's network: what goes in, what comes out untrained, and what counts as moving."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonical
+
+from neeco.capture.model import InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.scene import Scene
+from neeco.scene.deformations.nps import NPS, encode, mark_moving, otsu
+from neeco.scene.methods import make_deformation
+
+
+def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: Scene) -> None:
+    for state in neeco.recorded.states:
+        posed = neeco.at(state)
+        assert torch.equal(posed.means, neeco.canonical.means)
+        assert torch.equal(posed.scales, neeco.canonical.log_scales.exp())
+        assert torch.allclose(posed.quats, torch.nn.functional.normalize(neeco.canonical.quats, dim=-1))
+
+
+def test_the_head_starts_at_zero_and_still_learns(neeco: Scene) -> None:
+    neeco.at(neeco.recorded.states[0]).means.square().sum().backward()
+    assert not neeco.deformation.head.weight.any()
+    assert neeco.deformation.head.weight.grad[:3].abs().max() > 0
+
+
+def test_encoding_by_hand() -> None:
+    encoded = encode(torch.tensor([0.25]), 3)
+    root = 0.5**0.5
+    # sin, then cos, of pi/4, pi/2, pi
+    assert torch.allclose(encoded, torch.tensor([root, 1.0, 0.0, root, 0.0, -1.0]), atol=1e-6)
+    assert torch.allclose(encode(torch.tensor([0.25]), 3, identity=True)[-1], torch.tensor(0.25))
+
+
+@pytest.mark.parametrize(("identity", "expected"), [(False, 60), (True, 63)])
+def test_a_position_becomes_sixty_numbers(identity: bool, expected: int) -> None:
+    assert encode(torch.zeros(5, 3), 10, identity=identity).shape == (5, expected)
+    assert NPS((GRASPER,), identity=identity).mean_in.in_features == expected
+
+
+def test_the_network_has_the_papers_size() -> None:
+    network = NPS((GRASPER,))
+    layers = [network.mean_in, *network.hidden]
+    assert len(layers) == 12
+    assert {layer.out_features for layer in layers} == {256}
+    assert network.head.out_features == 10
+    assert network.state_in.in_features == 20 * (3 + 4 + 1)
+
+
+def test_recorded_states_span_minus_one_to_one(neeco: Scene) -> None:
+    vectors = torch.stack([neeco.deformation.state_vector(state) for state in neeco.recorded.states])
+    assert vectors.abs().max() <= 1 + 1e-5
+    spans = (vectors.max(0).values - vectors.min(0).values)[[0, 1, 2, 7]]  # position and jaw, which surely vary
+    assert torch.allclose(spans, torch.full((4,), 2.0), atol=1e-4)
+
+
+def test_the_quaternion_does_not_jump_where_its_sign_is_a_convention() -> None:
+    """w passes through 0 at half a turn; the state must pass on smoothly."""
+    states = [grasper_state(pose_of(angle, 0, 0, 0, 0, 0)) for angle in torch.linspace(2.6, 3.6, 41).tolist()]
+    network = NPS((GRASPER,), depth=2, width=8)
+    network.fit_ranges(states, torch.randn(50, 3, generator=torch.Generator().manual_seed(0)))
+    quats = torch.stack([network._raw_state(state)[3:7] for state in states])
+    assert (quats[1:] - quats[:-1]).norm(dim=1).max() < 0.02
+
+
+def test_noise_perturbs_the_encoded_state_only_when_asked(neeco: Scene) -> None:
+    network, state = neeco.deformation, neeco.recorded.states[2]
+    clean = network._encoded_state(state, 0.0)
+    noisy = torch.stack([network._encoded_state(state, 0.3) for _ in range(200)])
+    assert torch.equal(clean, network._encoded_state(state, 0.0))
+    assert abs(float((noisy - clean).std()) - 0.3) < 0.01
+
+
+def test_evaluation_in_chunks_changes_nothing(neeco: Scene) -> None:
+    torch.manual_seed(1)
+    torch.nn.init.normal_(neeco.deformation.head.weight)
+    with torch.no_grad():
+        whole = neeco.at(neeco.recorded.states[1]).means
+        neeco.deformation.chunk = 7
+        parts = neeco.at(neeco.recorded.states[1]).means
+    assert torch.allclose(whole, parts, atol=1e-4)
+    assert not torch.allclose(whole, neeco.canonical.means, atol=0.01)
+
+
+def test_otsu_parts_two_clusters() -> None:
+    generator = torch.Generator().manual_seed(5)
+    low, high = torch.randn(400, generator=generator), 8 + torch.randn(100, generator=generator)
+    assert low.max() < otsu(torch.cat([low, high])) < high.min()
+
+
+class HalfMoves(NPS):
+    """A network that has learned to move the instrument's rows and leaves a trace of movement on the others."""
+
+    def deltas(self, canonical, state):
+        shift = state.instruments["grasper"].pose[:3, 3].float()
+        deltas = super().deltas(canonical, state)
+        share = torch.full((len(canonical), 1), 1e-3)
+        share[TISSUE:] = 1.0
+        deltas.means.copy_(share * (0.5 + torch.rand(len(canonical), 1, generator=self.generator)) * shift)
+        return deltas
+
+
+def test_what_moves_is_told_from_what_does_not() -> None:
+    network = HalfMoves((GRASPER,), depth=2, width=8)
+    network.generator = torch.Generator().manual_seed(0)
+    canonical = random_canonical(torch.Generator().manual_seed(0))
+    states = [grasper_state(pose_of(0, 0, 0, 5.0 * k, 0, 0)) for k in range(5)]
+    network.fit_ranges(states, canonical.means)
+    assert not network.label_channels(canonical).any()
+    labels = network.label_channels(mark_moving(network, canonical, states))
+    assert labels.shape == (len(canonical), 1)
+    assert not labels[:TISSUE].any()
+    assert bool((labels[TISSUE:] == 1).all())
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(NeecoError, match="'telepathy' is unknown"):
+        make_deformation("telepathy", (), {})
+
+
+@pytest.mark.parametrize(
+    "state",
+    [State(), State({"grasper": InstrumentState(torch.eye(4, dtype=torch.float64))})],
+)
+def test_a_state_that_lacks_something_is_refused(neeco: Scene, state: State) -> None:
+    with pytest.raises(NeecoError, match="is missing"):
+        neeco.at(state)
