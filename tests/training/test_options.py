@@ -1,0 +1,45 @@
+"""A config survives YAML, and wrong settings are refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from neeco.errors import NeecoError
+from neeco.training.config import METHOD_DEFAULTS
+from neeco.training.options import training_config
+from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
+
+
+@pytest.mark.parametrize("method", list(METHOD_DEFAULTS))
+def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
+    values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
+    config = training_config(method, values, ["schedule.density=inverse", "refine.cameras=true"])
+    assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
+    write_config(tmp_path, tmp_path / "capture", config)
+    assert config_from_dict(read_config(tmp_path)) == config
+    assert config.schedule.density == "inverse"
+    assert config.refine.cameras
+
+
+@pytest.mark.parametrize(
+    ("assignment", "named"),
+    [
+        ("ssim_weight", "is not NAME=VALUE"),
+        ("sim_weight=0.2", "unknown field 'sim_weight'"),
+        ("schedule.speed=2", "unknown field 'schedule.speed'"),
+        ("ssim_weight=much", "is not a number"),
+        ("refine.cameras=3", "does not fit"),
+    ],
+)
+def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
+    with pytest.raises(NeecoError, match=f"--set.*{named}"):
+        training_config("kinematic", {}, [assignment])
+
+
+@pytest.mark.parametrize("values", [{"iterations": 0}, {"minutes": 0.0}, {"minutes": float("nan")}])
+def test_a_run_of_no_length_is_refused(values: dict) -> None:
+    with pytest.raises(NeecoError, match="is not a positive number"):
+        training_config("3dgs", values)

@@ -1,0 +1,89 @@
+"""The paper's dynamic training adjustment, and what its ablations turn off or round."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from neeco.training.schedule import GAUSSIAN_SPLATTING, DensityPhase, Schedule, ScheduleConfig, order_by_pose
+
+SPARSE, DENSE = DensityPhase(500, 10_000, 4e-4), DensityPhase(200, 3_000, 2e-4)
+
+
+def in_phase_2(config: ScheduleConfig | None = None, began: int = 2000) -> Schedule:
+    schedule = Schedule(config or ScheduleConfig())
+    schedule.phase, schedule.phase_started = 2, began
+    return schedule
+
+
+@pytest.mark.parametrize(
+    ("part", "first", "second"),
+    [("on", SPARSE, DENSE), ("inverse", DENSE, SPARSE), ("off", GAUSSIAN_SPLATTING, GAUSSIAN_SPLATTING)],
+)
+def test_density_constants(part: str, first: DensityPhase, second: DensityPhase) -> None:
+    config = ScheduleConfig(density=part)
+    assert Schedule(config).density() == first
+    assert in_phase_2(config).density() == second
+
+
+def test_colour_is_flat_in_phase_1_and_gains_an_order_every_thousand_in_phase_2() -> None:
+    assert [Schedule(ScheduleConfig()).sh_degree(i) for i in (1, 999, 5000)] == [0, 0, 0]
+    degrees = [in_phase_2(began=2000).sh_degree(i) for i in (2000, 2999, 3000, 4000, 5000, 9000)]
+    assert degrees == [0, 0, 1, 2, 3, 3]
+
+
+def test_state_noise_fades_in_phase_1_and_is_none_in_phase_2() -> None:
+    config = ScheduleConfig(beta=0.3, sigma=2.0)
+    assert [Schedule(config).state_noise(p) for p in (0.0, 0.25, 1.0)] == pytest.approx([0.6, 0.45, 0.0])
+    assert in_phase_2(config).state_noise(0.25) == 0
+    assert Schedule(ScheduleConfig(compensation="off")).state_noise(0.0) == 0
+
+
+def test_frames_come_by_pose_in_phase_1_and_at_random_in_phase_2() -> None:
+    order, rng = np.array([3, 1, 4, 0, 2, 5, 9, 7, 8, 6]), np.random.default_rng(0)
+    for _ in range(10):
+        assert Schedule(ScheduleConfig()).frames(order, rng) in (order.tolist(), order[::-1].tolist())
+    epochs = [in_phase_2().frames(order, rng) for _ in range(10)]
+    assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 10
+
+
+def settle(schedule: Schedule, iterations: int, psnr: float = 25.0, total: int = 100_000) -> int | None:
+    """The iteration at which phase 2 begins while the loss keeps falling."""
+    for iteration in range(1, iterations + 1):
+        schedule.observe(iteration, 1 / iteration, psnr, iteration / total)
+        if schedule.phase == 2:
+            return iteration
+    return None
+
+
+def test_phase_2_never_begins_before_iteration_1000() -> None:
+    schedule = Schedule(ScheduleConfig())
+    assert settle(schedule, 3000) == 1000
+    assert not schedule.forced
+
+
+def test_phase_2_waits_for_the_psnr_and_is_forced_at_forty_percent() -> None:
+    schedule = Schedule(ScheduleConfig())
+    assert settle(schedule, 5000, psnr=15.0, total=10_000) == 4000
+    assert schedule.forced
+    assert schedule.phase_started == 4000
+
+
+def test_a_restored_schedule_goes_on_the_same() -> None:
+    first, second = Schedule(ScheduleConfig()), Schedule(ScheduleConfig())
+    settle(first, 700)
+    second.load_state_dict(first.state_dict())
+    for iteration in range(701, 1001):
+        for schedule in (first, second):
+            schedule.observe(iteration, 1 / iteration, 25.0, 0.1)
+    assert first.state_dict() == second.state_dict()
+    assert second.phase == 2
+
+
+def test_poses_on_a_line_are_walked_from_end_to_end() -> None:
+    places = np.random.default_rng(1).permutation(20).astype(float)
+    walk = order_by_pose(np.stack([places, 2 * places, -places], 1))
+    walked = places[walk].tolist()
+    assert walked in (sorted(walked), sorted(walked, reverse=True))
+    assert sorted(walk.tolist()) == list(range(20))
