@@ -91,6 +91,7 @@ def train(
         restore_session(session, header, tensors)
         log.keep_until(session.iteration)
     else:
+        log.keep_until(0)  # interrupted before its first checkpoint, a resumed run begins again
         scene = initial_scene(capture, frames, images, config, log.note)
         session = new_session(scene, frames, images, masks, config)
     session.seconds += time.monotonic() - started
@@ -116,7 +117,7 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
 
 
 def _run(session: Session, output: Path, log: _Log) -> None:
-    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and when interrupted."""
+    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL."""
     losses, psnrs, phase = [], [], session.schedule.phase
     clock = time.monotonic()
     try:

@@ -1,0 +1,103 @@
+"""The same seed gives the same scene, interrupted or not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import neeco.training.session
+from neeco.errors import NeecoError
+from neeco.training import train as module
+from neeco.training.options import training_config
+from neeco.training.train import ProgressRow, train
+
+FRAMES = 8
+
+
+def write_capture(root: Path) -> Path:
+    """8 frames of 32x24 noise around a blob of points; the instrument's poses and jaw vary."""
+    rng = np.random.default_rng(7)
+    (root / "images").mkdir(parents=True)
+    header = ["ply", "format ascii 1.0", "element vertex 150", *(f"property float {axis}" for axis in "xyz")]
+    header += [*(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header"]
+    rows = [f"{x:.4f} {y:.4f} {z:.4f} 200 100 50" for x, y, z in rng.normal(0, 6, (150, 3))]
+    (root / "sparse.ply").write_text("\n".join(header + rows) + "\n")
+    frames = []
+    for k in range(FRAMES):
+        Image.fromarray(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)).save(root / f"images/{k:06d}.png")
+        camera, pose = np.eye(4), np.eye(4)
+        camera[:3, :3] = Rotation.from_rotvec([0, 0.1 * k - 0.4, 0]).as_matrix()
+        camera[:3, 3] = camera[:3, 2] * 100
+        pose[:3, :3] = Rotation.from_rotvec([0.8 * np.sin(k), 0.6 * np.cos(2 * k), 0.25 * k]).as_matrix()
+        pose[:3, 3] = [1.5 * k - 5, -k, 2 + k]
+        state = {"name": "grasper", "pose": pose.tolist(), "joints": {"jaw_angle": 0.1 * k}}
+        frame = {"file_path": f"images/{k:06d}.png", "transform_matrix": camera.tolist(), "time": 0.04 * k}
+        frames.append({**frame, "split": "train", "instruments": [state]})
+    document = {"camera_model": "PINHOLE", "fl_x": 40.0, "fl_y": 41.0, "cx": 16.5, "cy": 12.0, "w": 32, "h": 24}
+    document |= {"ply_file_path": "sparse.ply", "frames": frames}
+    document["instruments"] = [{"name": "grasper", "joints": {"jaw_angle": {"limits": [0, 1.5]}}}]
+    (root / "transforms.json").write_text(json.dumps(document))
+    return root
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write_capture(tmp_path / "capture")
+
+
+@pytest.fixture(autouse=True)
+def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ROW_INTERVAL", 5)
+    monkeypatch.setattr(module, "CHECKPOINT_INTERVAL", 20)
+
+
+def config_of(method: str):
+    small = ["deformation.width=16", "deformation.depth=2"] if method == "neeco" else []
+    return training_config(method, {"iterations": 60}, [*small, "density_start=10", "density_stop=0.9"])
+
+
+@pytest.mark.parametrize("method", ["3dgs", "neeco"])
+def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path) -> None:
+    scenes = [train(capture, tmp_path / name, config_of(method)) / "scene.safetensors" for name in ("a", "b")]
+    assert scenes[0].read_bytes() == scenes[1].read_bytes()
+    rows = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == list(range(5, 61, 5))
+    assert rows[-1]["psnr"] > rows[0]["psnr"]
+
+
+@pytest.mark.parametrize("method", ["3dgs", "neeco"])
+@pytest.mark.parametrize("stop", [10, 35, 55])
+def test_an_interrupted_run_ends_in_the_same_bytes(method: str, stop: int, capture: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == stop and not row.note:
+            raise KeyboardInterrupt
+
+    whole = train(capture, tmp_path / "whole", config_of(method))
+    with pytest.raises(KeyboardInterrupt):
+        train(capture, tmp_path / "cut", config_of(method), progress=interrupt)
+    assert not (tmp_path / "cut" / "scene.safetensors").exists()
+    resumed = train(capture, tmp_path / "cut", config_of(method), resume=True)
+    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+    iterations = [json.loads(line)["iteration"] for line in (resumed / "metrics.jsonl").read_text().splitlines()]
+    assert iterations == list(range(5, 61, 5))
+
+
+def test_a_full_folder_is_left_alone(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.txt").write_text("all of it")
+    with pytest.raises(NeecoError, match="not empty"):
+        train(capture, tmp_path / "run", config_of("3dgs"))
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
+
+
+def test_a_loss_that_is_no_number_ends_the_run(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = neeco.training.session.photometric_loss
+    monkeypatch.setattr(neeco.training.session, "photometric_loss", lambda *a, **k: real(*a, **k) * float("nan"))
+    with pytest.raises(NeecoError, match="the loss became nan at iteration 1, frame 0000"):
+        train(capture, tmp_path / "run", config_of("3dgs"))
+    assert not (tmp_path / "run" / "scene.safetensors").exists()
