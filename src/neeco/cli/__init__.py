@@ -45,13 +45,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except NeecoError as error:
         print(f"neeco: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            # the interpreter flushes stdout once more on its way out; give it somewhere to go
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return PIPE_CLOSED
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"neeco: error: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("\nneeco: interrupted; what was finished is kept", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
-        # the interpreter flushes stdout once more on its way out; give it somewhere to go
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return PIPE_CLOSED
 
 
 def _dispatch(words: list[str]) -> int:

@@ -25,9 +25,19 @@ SCHEMA = "neeco-scene/1"
 def save_scene(scene: Scene, path: Path) -> None:
     """Write `scene` atomically. The same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
-    write_atomically(
-        path, lambda temporary: save_file(tensors, temporary, {"neeco": json.dumps(header, sort_keys=True)})
-    )
+    save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True)}, path)
+
+
+def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:
+    """Write a safetensors file atomically. Raises NeecoError when the disk refuses."""
+
+    def write(temporary: Path) -> None:
+        try:
+            save_file(tensors, temporary, metadata)
+        except SafetensorError as error:
+            raise OSError(str(error)) from error
+
+    write_atomically(path, write)
 
 
 def load_scene(path: Path) -> Scene:

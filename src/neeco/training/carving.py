@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -74,8 +75,9 @@ def _shaft_frame(evidence: Evidence, transforms: Tensor, solid: Tensor) -> Tenso
     """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
     see."""
     center = solid.mean(0)
-    _, _, axes = torch.linalg.svd(solid - center, full_matrices=False)
-    direction = axes[0]
+    arm = (solid - center).double()
+    covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)  # [3, 3]
+    direction = torch.from_numpy(np.linalg.eigh(covariance.numpy())[1][:, -1].copy()).float()
     along = (solid - center) @ direction
     ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
     _, seen = score_points(evidence, transforms, ends)
@@ -148,16 +150,22 @@ def _slice_centers(evidence: Evidence, transforms: Tensor, spacing: float, half:
 
 
 def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying
-    slices."""
-    design = torch.stack([positions, torch.ones_like(positions)], 1)
+    """[2, 2] slope and intercept of values [Z, 2] over positions [Z]; iteratively reweighted against outlying slices.
+
+    In closed form: a library's least squares may differ in the last bit from run to run with the memory's alignment.
+    """
     robust = torch.ones_like(positions)
     for _ in range(10):
-        root = (weights * robust + 1e-9).sqrt()[:, None]
-        solution = torch.linalg.lstsq(design * root, values * root).solution
-        residual = (values - design @ solution).norm(dim=1)
+        weight = (weights * robust + 1e-9)[:, None]
+        total = weight.sum(0)
+        x = positions[:, None]
+        middle_x, middle_y = (weight * x).sum(0) / total, (weight * values).sum(0) / total
+        spread = (weight * (x - middle_x).square()).sum(0).clamp_min(1e-12)
+        slope = (weight * (x - middle_x) * (values - middle_y)).sum(0) / spread
+        intercept = middle_y - slope * middle_x
+        residual = (values - x * slope - intercept).norm(dim=1)
         robust = 1 / (1 + (residual / residual.median().clamp_min(1e-3)) ** 2)
-    return solution
+    return torch.stack([slope, intercept])
 
 
 def _sample_seeds(

@@ -8,12 +8,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.files import write_atomically
-from neeco.scene.io import pack_scene, unpack_scene
+from neeco.scene.io import pack_scene, save_tensors, unpack_scene
 from neeco.scene.scene import Scene
 from neeco.training.session import Session
 
@@ -49,7 +47,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         "seconds": session.seconds,
     }
     metadata = {"neeco": json.dumps(header)}
-    write_atomically(checkpoint_path(run), lambda temporary: save_file(tensors, temporary, metadata))
+    save_tensors(tensors, metadata, checkpoint_path(run))
 
 
 def read_checkpoint(run: Path) -> tuple[Scene, dict[str, Any], dict[str, Tensor]]:
