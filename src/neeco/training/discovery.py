@@ -19,7 +19,7 @@ from neeco.scene.scene import Recording, Scene
 from neeco.training.carving import CarvedShape, carve
 from neeco.training.config import PLAIN, RefineConfig, TrainConfig
 from neeco.training.evidence import Evidence, gather_evidence
-from neeco.training.hinge_search import dominant_angle, search_hinge
+from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.refinement import Refinement
 from neeco.training.session import Session
 
@@ -133,7 +133,7 @@ def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedSha
             continue
         with torch.no_grad():
             hinges.hinge_angle[index] = dominant_angle(guesses)
-            hinges.hinge_depth[index] = guesses[0].depth
+            hinges.hinge_depth[index] = balanced_depth(guesses)
             hinges.share[index] = 1.0 if guesses[0].gains[1] == 0 else 0.5
             lowest = min(frame.state.instruments[name].joints[joint] for frame in evidence.frames)
             hinges.offsets[index] = -lowest * hinges.gains[index]

@@ -20,6 +20,8 @@ from neeco.training.session import Session
 ROLLS = (0.5, -0.5)  # rad, with which rotational symmetry is tested: small, so that seen sides stay in view
 WRIST_STEPS = 14
 SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
+COLOR_BINS = 24
+COLOR_SCATTER = 0.4  # of the profile's scatter that may be left when two colours explain it
 FOUND = 0.25  # share of the moving parts' error that the readings must explain
 
 
@@ -32,6 +34,9 @@ def finish_instruments(session: Session) -> None:
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = deformation.hinges_of(index)
+        boundary = color_boundary(session.scene.canonical, deformation, index) if hinges.joint_names else None
+        if boundary is not None:
+            hinges.wrist_start.fill_(boundary)
         for joint, name in enumerate(hinges.joint_names):
             verdicts[f"{instrument.name}.{name}"] = _verdict(session, index, joint)
         scene = session.scene
@@ -46,28 +51,60 @@ def finish_instruments(session: Session) -> None:
 
 @torch.no_grad()
 def place_wrists(session: Session) -> None:
-    """The wrist begins where the shaft stops being a surface of revolution: where spinning what lies behind starts to
-    cost."""
-    scene = session.scene
-    deformation = scene.deformation
+    """Find where each shaft ends and the wrist begins: where the colour along it changes, or, on an instrument of one
+    colour, where it stops being a surface of revolution."""
+    deformation = session.scene.deformation
     if not isinstance(deformation, Kinematic):
         return
-    frames = _spread(session, 16)
-    for index in range(len(scene.instruments)):
+    for index in range(len(session.scene.instruments)):
         hinges = deformation.hinges_of(index)
-        if not hinges.joint_names:
-            continue
-        hinge = float(hinges.hinge_depth[0])
-        rear = float(_extent(scene.canonical, index, hinges)[0])
-        starts = torch.linspace(rear + 0.3 * (hinge - rear), hinge, WRIST_STEPS)
-        base = sum(_image_error(session, f, UNPERTURBED) for f in frames)
-        costs = []
-        for start in starts:
-            hinges.wrist_start.fill_(float(start))
-            costs.append(sum(_image_error(session, f, Perturbation(ROLLS[k % 2])) for k, f in enumerate(frames)) - base)
-        limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
-        cheap = [float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit]
-        hinges.wrist_start.fill_(max(cheap) if cheap else float(starts[0]))
+        if hinges.joint_names:
+            boundary = color_boundary(session.scene.canonical, deformation, index)
+            hinges.wrist_start.fill_(_symmetry_boundary(session, index) if boundary is None else boundary)
+
+
+def color_boundary(canonical: CanonicalGaussians, deformation: Kinematic, index: int) -> float | None:
+    """Position mm along the shaft that best splits the body's colour profile in two; None without a clear split."""
+    hinges, rows = deformation.hinges_of(index), canonical.body(index + 1)
+    hinge = float(hinges.hinge_depth[0])
+    edges = torch.linspace(float(_extent(canonical, index, hinges)[0]), hinge, COLOR_BINS + 1)
+    area = canonical.log_scales[rows].exp().prod(1).pow(2 / 3)
+    weight = torch.sigmoid(canonical.opacity_logits[rows]) * deformation.part_weights(canonical, index)[:, 0] * area
+    bins = torch.bucketize(hinges.along_shaft(canonical.means[rows]), edges) - 1
+    profile, mass = torch.zeros(COLOR_BINS, 3), torch.zeros(COLOR_BINS, 1)
+    for place in range(COLOR_BINS):
+        here = bins == place
+        mass[place] = weight[here].sum()
+        profile[place] = (canonical.sh_dc[rows][here, 0] * weight[here, None]).sum(0) / mass[place].clamp_min(1e-9)
+
+    def scatter(part: slice) -> float:
+        mean = (profile[part] * mass[part]).sum(0) / mass[part].sum().clamp_min(1e-9)
+        return float((mass[part] * (profile[part] - mean).square()).sum())
+
+    splits = {cut: scatter(slice(0, cut)) + scatter(slice(cut, COLOR_BINS)) for cut in range(3, COLOR_BINS - 1)}
+    best = min(splits, key=lambda cut: splits[cut])
+    return float(edges[best]) if splits[best] < COLOR_SCATTER * scatter(slice(0, COLOR_BINS)) else None
+
+
+def _symmetry_boundary(session: Session, index: int) -> float:
+    """Position mm along the shaft up to which spinning what lies behind costs little."""
+    scene = session.scene
+    deformation = scene.deformation
+    assert isinstance(deformation, Kinematic)
+    hinges = deformation.hinges_of(index)
+    before = float(hinges.wrist_start)
+    hinge, rear = float(hinges.hinge_depth[0]), float(_extent(scene.canonical, index, hinges)[0])
+    starts = torch.linspace(rear + 0.3 * (hinge - rear), hinge, WRIST_STEPS)
+    frames = _spread(session, 16)
+    base = sum(_image_error(session, frame, UNPERTURBED) for frame in frames)
+    costs = []
+    for start in starts:
+        hinges.wrist_start.fill_(float(start))
+        spun = [_image_error(session, frame, Perturbation(ROLLS[k % 2])) for k, frame in enumerate(frames)]
+        costs.append(sum(spun) - base)
+    hinges.wrist_start.fill_(before)
+    limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
+    return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
 def _spread(session: Session, count: int) -> list[int]:

@@ -2,7 +2,7 @@
 
 A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the pivot,
 turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above all where the
-reading is large.
+reading is large, and leaves tissue to be seen between them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from neeco.training.evidence import Evidence
 
 ANGLES = 36  # hinge directions tried over half a turn
 DEPTHS = 10  # pivots tried along the front half
-GAINS = ((0.3, -0.3), (0.5, -0.5), (1.0, 0.0))  # part angle per reading: two jaws share it, or one takes it all
+GAINS = ((0.5, -0.5), (1.0, 0.0))  # part angle per reading: two jaws share the opening, or one takes it all
+CAUTIOUS = 0.3  # a smaller turn, which rough evidence bears better
 STICK_POINTS = 16
 
 
@@ -31,7 +32,8 @@ class HingeGuess:
     angle: float
     depth: float
     gains: tuple[float, float]
-    score: float
+    score: float  # mean evidence on the sticks, in [0, 1]
+    opened: float  # what the turned sticks have more than still ones, times the share of the length they cover
 
 
 def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) -> list[HingeGuess]:
@@ -50,14 +52,30 @@ def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) 
     guesses = []
     for depth in np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, DEPTHS):
         stick = _stick(line, float(depth), shape.tip)
+        needed = {gain for pair in GAINS for gain in pair} | {CAUTIOUS, -CAUTIOUS, 0.0}
         scores = {
             gain: _stick_scores(evidence, camera_from_shaft, stick, float(depth), angles, gain * opening, opening)
-            for gain in sorted({gain for pair in GAINS for gain in pair})
+            for gain in sorted(needed)
         }
+        share = (shape.tip - float(depth)) / length
+        caution = (scores[CAUTIOUS] + scores[-CAUTIOUS]) / 2
         for gains in GAINS:
-            both = (scores[gains[0]] + scores[gains[1]]) / 2
-            guesses += [HingeGuess(float(a), float(depth), gains, float(s)) for a, s in zip(angles, both, strict=True)]
+            evident = torch.maximum((scores[gains[0]] + scores[gains[1]]) / 2, caution)
+            opened = ((scores[gains[0]] + scores[gains[1]]) / 2 - scores[0.0]) * share
+            guesses += [
+                HingeGuess(float(a), float(depth), gains, float(s), float(o))
+                for a, s, o in zip(angles, evident, opened, strict=True)
+            ]
     return sorted(guesses, key=lambda guess: -guess.score)
+
+
+def balanced_depth(guesses: list[HingeGuess]) -> float:
+    """Pivot mm along the shaft: half way between the best by evidence on the sticks and the best by what they open.
+
+    The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
+    """
+    opened = max(guesses, key=lambda guess: guess.opened)
+    return (guesses[0].depth + opened.depth) / 2
 
 
 def dominant_angle(guesses: list[HingeGuess]) -> float:
@@ -65,7 +83,7 @@ def dominant_angle(guesses: list[HingeGuess]) -> float:
     alone."""
     best: dict[float, float] = {}
     for guess in guesses:
-        best[guess.angle] = max(best.get(guess.angle, 0.0), guess.score)
+        best[guess.angle] = max(best.get(guess.angle, -1.0), guess.score)
     wave = sum(score * complex(math.cos(2 * angle), math.sin(2 * angle)) for angle, score in best.items())
     return (math.atan2(wave.imag, wave.real) / 2) % math.pi
 

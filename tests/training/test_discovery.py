@@ -1,0 +1,128 @@
+"""An instrument is found from where images disagree with the tissue, however its sensor is mounted."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
+from neeco.training.carving import CarvedShape, carve
+from neeco.training.evidence import Evidence
+from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
+
+PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
+HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame
+
+
+def instrument_points(reading: float) -> Tensor:
+    """[P, 3] mm: a cylinder along z up to the pivot and two blades that share the opening."""
+    generator = torch.Generator().manual_seed(1)
+    turn, along = torch.rand(2, 6000, generator=generator)
+    radius = RADIUS_MM * torch.rand(6000, generator=generator).sqrt()
+    turn = 2 * math.pi * turn
+    shaft = torch.stack([radius * turn.cos(), radius * turn.sin(), -40 + along * (40 + PIVOT_MM)], -1)
+    axis = torch.tensor([math.cos(HINGE_ANGLE), math.sin(HINGE_ANGLE), 0.0])
+    blade = torch.randn(2500, 3, generator=generator) * 0.7
+    blade[:, 2] = PIVOT_MM + (TIP_MM - PIVOT_MM) * torch.rand(2500, generator=generator)
+    pivot = torch.tensor([0.0, 0.0, PIVOT_MM])
+    jaws = [rotate_about(blade, axis, pivot, torch.full((2500,), sign * reading / 2)) for sign in (1, -1)]
+    return torch.cat([shaft, *jaws])
+
+
+def make_evidence(shaft_from_sensor: Tensor, frames: int = 40) -> Evidence:
+    """Silhouettes of the instrument in random poses before a still camera; `shaft_from_sensor`: how the sensor sits."""
+    rng = np.random.default_rng(0)
+    camera = Camera(torch.eye(4), 200.0, 200.0, 80.0, 64.0, 160, 128)
+    hits, taken = [], []
+    for number in range(frames):
+        reading = float(rng.uniform(0.0, 1.0))
+        roll, tilt, pan = rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5)
+        lean = rigid_from_vector(torch.tensor([1.0, 0.6, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+        spin = rigid_from_vector(torch.tensor([tilt, pan, roll, 0.0, 0.0, 0.0], dtype=torch.float64))
+        place = torch.tensor([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(75, 95)], dtype=torch.float64)
+        world_from_shaft = rigid(lean[:3, :3] @ spin[:3, :3], place)
+        world = instrument_points(reading).double() @ world_from_shaft[:3, :3].T + world_from_shaft[:3, 3]
+        u = (world[:, 0] / world[:, 2] * camera.fx + camera.cx).long()
+        v = (world[:, 1] / world[:, 2] * camera.fy + camera.cy).long()
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (world[:, 2] > 1)
+        mask = torch.zeros(camera.height, camera.width)
+        mask[v[inside], u[inside]] = 1
+        hits.append(torch.nn.functional.max_pool2d(mask[None], 3, 1, 1)[0])
+        state = InstrumentState(world_from_shaft @ shaft_from_sensor, {"jaw": reading})
+        taken.append(Frame(Path(f"{number}.png"), camera, State({"tool": state}), "train"))
+    return Evidence(
+        torch.stack(hits),
+        torch.full((frames, camera.height, camera.width), 130.0),
+        torch.eye(4).repeat(frames, 1, 1),
+        torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]]).repeat(frames, 1),
+        tuple(taken),
+    )
+
+
+MOUNTINGS = {
+    "straight": torch.eye(4, dtype=torch.float64),
+    "tilted and off axis": rigid_from_vector(torch.tensor([0.5, -0.7, 0.3, 5.0, -4.0, 6.0], dtype=torch.float64)),
+}
+
+
+def found(mounting: str) -> tuple[Evidence, CarvedShape, Tensor]:
+    """(evidence, carved shape, true-shaft-frame from carved-shaft-frame)."""
+    shaft_from_sensor = MOUNTINGS[mounting]
+    evidence = make_evidence(shaft_from_sensor)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    assert shape is not None
+    return evidence, shape, shaft_from_sensor.float() @ shape.instrument_from_shaft
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_the_shaft_axis_is_carved_however_the_sensor_is_mounted(mounting: str) -> None:
+    _, shape, true_from_carved = found(mounting)
+    direction, origin = true_from_carved[:3, 2], true_from_carved[:3, 3]
+    assert math.degrees(math.acos(float(direction[2]))) < 5  # and it points to the jaws
+    assert float((origin - direction * origin[2] / direction[2])[:2].norm()) < 1.5
+    assert len(shape.seeds) == 500
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_the_hinge_is_found_without_training(mounting: str) -> None:
+    evidence, shape, true_from_carved = found(mounting)
+    guesses = search_hinge(evidence, "tool", "jaw", shape)
+    angle = dominant_angle(guesses)
+    axis = true_from_carved[:3, :3] @ torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    truth = torch.tensor([math.cos(HINGE_ANGLE), math.sin(HINGE_ANGLE), 0.0])
+    assert math.degrees(math.acos(min(1.0, abs(float(axis @ truth))))) < 20
+    pivot = true_from_carved @ torch.tensor([0.0, 0.0, balanced_depth(guesses), 1.0])
+    assert abs(float(pivot[2]) - PIVOT_MM) < 7  # training takes it from here
+
+
+def test_nothing_is_carved_where_poses_have_nothing_to_do_with_the_images() -> None:
+    evidence = make_evidence(MOUNTINGS["straight"])
+    shuffled = Evidence(
+        evidence.hits.roll(17, 0),
+        evidence.depths,
+        evidence.camera_from_world,
+        evidence.intrinsics,
+        evidence.frames,
+    )
+    assert carve(shuffled, "tool", torch.Generator().manual_seed(0), 500) is None
+
+
+def test_a_joint_that_stands_still_gives_no_hinge() -> None:
+    evidence, shape, _ = found("straight")
+    still = tuple(
+        Frame(
+            f.image_path,
+            f.camera,
+            State({"tool": InstrumentState(f.state.instruments["tool"].pose, {"jaw": 0.4})}),
+            "train",
+        )
+        for f in evidence.frames
+    )
+    frozen = Evidence(evidence.hits, evidence.depths, evidence.camera_from_world, evidence.intrinsics, still)
+    assert search_hinge(frozen, "tool", "jaw", shape) == []
