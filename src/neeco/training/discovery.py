@@ -16,7 +16,7 @@ from neeco.scene.deformations._hinges import Hinges
 from neeco.scene.deformations.kinematic import PART_LOGITS, Kinematic
 from neeco.scene.deformations.static import Static
 from neeco.scene.scene import Recording, Scene
-from neeco.training.carving import CarvedShape, carve
+from neeco.training.carving import CarvedShape, camera_from_instrument, carve, score_points
 from neeco.training.config import PLAIN, RefineConfig, TrainConfig
 from neeco.training.evidence import Evidence, gather_evidence
 from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
@@ -25,6 +25,7 @@ from neeco.training.session import Session
 
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
 SEEDS = 3000  # Gaussians per instrument at the start
+MOVES = 1.5  # ratio of evidence under its own poses to that under exchanged ones
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
 
 Report = Callable[[str], None]
@@ -50,12 +51,37 @@ def find_instruments(
                 f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
                 "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
+        _judge_evidence(scene, evidence, instrument.name, shape, report)
         hinges = deformation.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
         body = seed_gaussians(shape.seeds, torch.full((SEEDS, 3), 0.4), torch.full((SEEDS,), 0.4 * shape.radius))
         logits = seed_logits(hinges, shape.seeds, deformation.logit_count, generator)
         bodies.append(body.with_extras(**{PART_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
+
+
+def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> None:
+    """Does the evidence move with the instrument? Exchange the poses among frames: it must get worse.
+
+    Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
+    """
+    transforms = camera_from_instrument(evidence, name)
+    own, _ = score_points(evidence, transforms, shape.seeds)
+    # the camera stays: only the instrument's pose is another frame's
+    world = torch.linalg.inv(evidence.camera_from_world.double()) @ transforms.double()
+    exchanged = (evidence.camera_from_world.double() @ world.roll(len(world) // 2, 0)).float()
+    other, _ = score_points(evidence, exchanged, shape.seeds)
+    moves = float(own.mean()) > MOVES * float(other.mean())
+    scene.diagnostics.setdefault("instruments", {})[name] = {
+        "evidence": round(float(own.mean()), 4),
+        "evidence_of_other_poses": round(float(other.mean()), 4),
+        "moves_with_its_pose": moves,
+    }
+    if not moves:
+        report(
+            f"warning: {name}: what the images show hardly depends on its recorded pose; it was probably not found, "
+            "and its labels will be wrong (record more motion, or check that poses are registered)"
+        )
 
 
 def tissue_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig) -> Evidence:
