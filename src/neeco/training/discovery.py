@@ -26,6 +26,7 @@ from neeco.training.session import Session
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
 SEEDS = 3000  # Gaussians per instrument at the start
 MOVES = 1.5  # ratio of evidence under its own poses to that under exchanged ones
+AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted frame seeds are strewn
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
 
 Report = Callable[[str], None]
@@ -51,7 +52,8 @@ def find_instruments(
                 f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
                 "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
-        _judge_evidence(scene, evidence, instrument.name, shape, report)
+        if not _judge_evidence(scene, evidence, instrument.name, shape, report):
+            shape = shape_around_frame(shape, evidence.distance, generator)
         hinges = deformation.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
         body = seed_gaussians(shape.seeds, torch.full((SEEDS, 3), 0.4), torch.full((SEEDS,), 0.4 * shape.radius))
@@ -60,7 +62,7 @@ def find_instruments(
     scene.canonical = join_bodies(bodies)
 
 
-def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> None:
+def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
     """Does the evidence move with the instrument? Exchange the poses among frames: it must get worse.
 
     Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
@@ -79,9 +81,19 @@ def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedSh
     }
     if not moves:
         report(
-            f"warning: {name}: what the images show hardly depends on its recorded pose; it was probably not found, "
-            "and its labels will be wrong (record more motion, or check that poses are registered)"
+            f"warning: {name}: what the images show hardly depends on its recorded pose; its shape is sought about the "
+            "tracked frame, and its labels may be wrong (record more motion, or check that poses are registered)"
         )
+    return moves
+
+
+def shape_around_frame(shape: CarvedShape, distance: float, generator: torch.Generator) -> CarvedShape:
+    """What to start from when carving cannot be trusted: seeds about the tracked frame, which is on the body."""
+    spread = AROUND_FRAME * distance
+    seeds = torch.randn(SEEDS, 3, generator=generator) * spread
+    return replace(
+        shape, instrument_from_shaft=torch.eye(4), near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds
+    )
 
 
 def tissue_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig) -> Evidence:
