@@ -21,6 +21,7 @@ from neeco.training.config import PLAIN, RefineConfig, TrainConfig
 from neeco.training.evidence import Evidence, gather_evidence
 from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.refinement import Refinement
+from neeco.training.schedule import order_by_pose
 from neeco.training.session import Session
 
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
@@ -33,7 +34,12 @@ Report = Callable[[str], None]
 
 
 def find_instruments(
-    scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig, report: Report
+    scene: Scene,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    config: TrainConfig,
+    report: Report,
 ) -> None:
     """Add every instrument's body to `scene`, whose canonical set holds the tissue alone, and start its hinges.
 
@@ -42,7 +48,7 @@ def find_instruments(
     deformation = scene.deformation
     assert isinstance(deformation, Kinematic)
     report("looking for the instruments: fitting the tissue alone")
-    evidence = tissue_evidence(scene, frames, images, config)
+    evidence = tissue_evidence(scene, frames, images, masks, config)
     generator = torch.Generator().manual_seed(config.seed)
     bodies = [_with_logits(scene.canonical, deformation.logit_count)]
     for index, instrument in enumerate(scene.instruments):
@@ -96,7 +102,13 @@ def shape_around_frame(shape: CarvedShape, distance: float, generator: torch.Gen
     )
 
 
-def tissue_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig) -> Evidence:
+def tissue_evidence(
+    scene: Scene,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    config: TrainConfig,
+) -> Evidence:
     """Fit a copy of the tissue with nothing moving for a few hundred steps; what is left over is the evidence."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
     alone = Scene("3dgs", tissue, Static(()), (), Recording(), scene.center)
@@ -111,11 +123,11 @@ def tissue_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Te
         label_sharpness=0.0,
         shaft_roll=0.0,
     )
-    session = new_session(alone, frames, images, [frame.load_mask() for frame in frames], short)
+    session = new_session(alone, frames, images, masks, short)
     while session.iteration < TISSUE_STEPS:
         session.step()
     alone.requires_grad_(False)
-    return gather_evidence(alone, frames, images)
+    return gather_evidence(alone, frames, images, masks)
 
 
 def new_session(
@@ -149,8 +161,6 @@ def scene_extent(frames: tuple[Frame, ...], center: Tensor) -> float:
 
 def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
     """Frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
-    from neeco.training.schedule import order_by_pose
-
     if not instruments:
         return np.arange(len(frames))
     rows = [

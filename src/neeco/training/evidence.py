@@ -56,8 +56,17 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Tensor], most: int = 120) -> Evidence:
-    """Residuals of a tissue-only `scene` against at most `most` training images ([H, W, 3] uint8), evenly picked."""
+def gather_evidence(
+    scene: Scene,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    most: int = 120,
+) -> Evidence:
+    """Residuals of a tissue-only `scene` against at most `most` training images, evenly picked.
+
+    images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame; where a mask is False there is no evidence.
+    """
     step = max(1, -(-len(frames) // most))
     picked = list(range(0, len(frames), step))
     hits, depths = [], []
@@ -65,7 +74,7 @@ def gather_evidence(scene: Scene, frames: tuple[Frame, ...], images: Sequence[Te
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
         residual = (rendering.color - images[index].float() / 255).abs().mean(-1)
-        mask = frame.load_mask()
+        mask = masks[index]
         if mask is not None:
             residual = residual * mask
         smooth = torch.nn.functional.avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]

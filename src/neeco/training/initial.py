@@ -24,11 +24,17 @@ Report = Callable[[str], None]
 
 
 def initial_scene(
-    capture: Capture, frames: tuple[Frame, ...], images: Sequence[Tensor], config: TrainConfig, report: Report
+    capture: Capture,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    config: TrainConfig,
+    report: Report,
 ) -> Scene:
     """Seed Gaussians and deformation of `config.method` from the sparse points and the training frames alone.
 
-    images: [H, W, 3] uint8, one per frame. Raises NeecoError when a joint asked for is unknown.
+    images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame. Raises NeecoError when a joint asked for is
+    unknown.
     """
     instruments = tuple(
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
@@ -48,7 +54,7 @@ def initial_scene(
     if isinstance(deformation, NPS):
         deformation.fit_ranges(list(recorded.states), tissue.means)
     if isinstance(deformation, Kinematic):
-        find_instruments(scene, frames, images, config, report)
+        find_instruments(scene, frames, images, masks, config, report)
     return scene
 
 

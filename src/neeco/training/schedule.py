@@ -90,11 +90,10 @@ class Schedule:
         """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
         (3DGS)."""
         config = self.config
-        grown_since = 0 if config.sh_order == "off" else self.phase_started
-        grown = min(config.max_sh_degree, (iteration - grown_since) // config.sh_interval)
-        if config.sh_order == "off" or self._acting_phase(config.sh_order) == 2:
-            return grown if config.sh_order != "inverse" else min(config.max_sh_degree, iteration // config.sh_interval)
-        return 0
+        if config.sh_order != "off" and self._acting_phase(config.sh_order) == 1:
+            return 0
+        since = 0 if config.sh_order == "off" else self.phase_started
+        return min(config.max_sh_degree, (iteration - since) // config.sh_interval)
 
     def state_noise(self, progress: float) -> float:
         """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in

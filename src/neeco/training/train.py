@@ -92,7 +92,7 @@ def train(
         log.keep_until(session.iteration)
     else:
         log.keep_until(0)  # interrupted before its first checkpoint, a resumed run begins again
-        scene = initial_scene(capture, frames, images, config, log.note)
+        scene = initial_scene(capture, frames, images, masks, config, log.note)
         session = new_session(scene, frames, images, masks, config)
     session.seconds += time.monotonic() - started
     _run(session, output, log)

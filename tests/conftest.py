@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-WORLDS = Path(__file__).resolve().parent.parent / "evaluation" / "worlds.py"
+WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"
 
 
 @pytest.fixture(scope="session")
