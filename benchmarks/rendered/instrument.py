@@ -1,0 +1,248 @@
+"""Hinged instruments as distance functions, traced exactly.
+
+Mechanical frame of an instrument: mm, z along the shaft towards the jaws, origin where the shaft meets the wrist, the
+hinge at (0, 0, `hinge`) with its axis along x; the first jaw opens towards +y, the second towards -y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+SHAFT, WRIST, FIRST_JAW, SECOND_JAW = 1, 2, 3, 4  # what `trace` calls the parts; the truth's ids may swap the jaws
+SHAFT_LENGTH = 320.0
+ITERATIONS = 60
+TOUCH = 0.004  # mm; a ray this near has met the surface
+
+
+@dataclass(frozen=True)
+class Blade:
+    """A tapered, rounded, curved jaw. Lengths mm; half widths at heel and tip along x and y."""
+
+    length: float  # from the hinge to the tip
+    heel: float  # behind the hinge
+    half_x: tuple[float, float]
+    half_y: tuple[float, float]
+    shift_x: float  # where the middle lies at the hinge
+    shift_y: float
+    bend_x: float  # mm sideways at the tip
+    bend_y: float
+    rounding: float
+
+    def distance(self, points: Tensor) -> Tensor:
+        """A lower bound [M] mm of the distance of points [M, 3] (closed jaw, hinge at the origin) to the surface."""
+        x, y, z = points.unbind(-1)
+        share = ((z + self.heel) / (self.length + self.heel)).clamp(0, 1)
+        curve = (z / self.length).clamp(0, 1.2) ** 2
+        half_x = self.half_x[0] + (self.half_x[1] - self.half_x[0]) * share
+        half_y = self.half_y[0] + (self.half_y[1] - self.half_y[0]) * share
+        # the inner face stays where the jaws meet while the blade thins towards the tip
+        across_x = (x - self.shift_x * half_x / self.half_x[0] - self.bend_x * curve).abs() - half_x
+        across_y = (y - self.shift_y * half_y / self.half_y[0] - self.bend_y * curve).abs() - half_y
+        middle, half = (self.length - self.heel) / 2, (self.length + self.heel) / 2
+        along = (z - middle).abs() - half
+        # bending and taper stretch space a little; the factor keeps this a lower bound
+        return 0.78 * _rounded(torch.stack([across_x, across_y, along], -1), self.rounding)
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a part looks: linear colour, how much of it is diffuse, strength and sharpness of highlights."""
+
+    color: tuple[float, float, float]
+    diffuse: float
+    shine: float
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class Design:
+    """An instrument: geometry and materials (shaft, wrist, jaws). Jaw k turns by `shares[k]` of the opening."""
+
+    name: str
+    radius: float  # of the shaft
+    hinge: float  # mm from the end of the shaft
+    collar: float  # length of the round part of the wrist
+    wrist_radius: float
+    prong_half_x: tuple[float, float]  # inner and outer face of the two prongs that hold the hinge
+    prong_half_y: float
+    pin: float  # radius of the hinge pin
+    jaws: tuple[Blade, Blade]
+    shares: tuple[float, float]
+    materials: tuple[Material, Material, Material]
+
+    @property
+    def reach(self) -> float:
+        """How far the jaws and the wrist reach from the hinge, mm."""
+        jaw = max(blade.length + abs(blade.bend_x) + abs(blade.bend_y) + 1.0 for blade in self.jaws)
+        return max(jaw, self.hinge + self.radius)
+
+    def balls(self, opening: float) -> tuple[Tensor, Tensor]:
+        """Centres [K, 3] and radii [K] of balls that together hold wrist and jaws."""
+        end = self.hinge + self.prong_half_y
+        spacing = end / 4
+        middle = torch.zeros(5, 3)
+        middle[:, 2] = torch.arange(5) * spacing
+        centers, radii = [middle], [torch.full((5,), spacing / 2 + self.wrist_radius + 1.0)]
+        for blade, sign, share in zip(self.jaws, (1, -1), self.shares, strict=True):
+            z = torch.linspace(-blade.heel, blade.length, 9)
+            curve = (z / blade.length) ** 2
+            line = torch.stack([blade.shift_x + blade.bend_x * curve, blade.shift_y + blade.bend_y * curve, z], -1)
+            centers.append(_turn_x(line, -sign * share * opening) + torch.tensor([0.0, 0.0, self.hinge]))
+            gap = (blade.length + blade.heel) / 8
+            slack = 0.8 * (abs(blade.shift_x) + abs(blade.shift_y))  # the middle moves inwards as the blade thins
+            radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
+        return torch.cat(centers), torch.cat(radii)
+
+    def distances(self, points: Tensor, opening: float) -> Tensor:
+        """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
+        arm = points - torch.tensor([0.0, 0.0, self.hinge])
+        # a positive turn about x takes z towards -y, so the first jaw turns by minus its share
+        turned = [_turn_x(arm, sign * share * opening) for sign, share in zip((1, -1), self.shares, strict=True)]
+        return torch.stack(
+            [self._wrist(points), *(blade.distance(t) for blade, t in zip(self.jaws, turned, strict=True))], -1
+        )
+
+    def _wrist(self, points: Tensor) -> Tensor:
+        x, y, z = points.unbind(-1)
+        across = (x.square() + y.square()).sqrt()
+        half = self.collar / 2
+        collar = _rounded(torch.stack([across - self.wrist_radius, (z - half).abs() - half], -1), 0.3)
+        inner, outer = self.prong_half_x
+        start, end = self.collar - 1.0, self.hinge + self.prong_half_y
+        prong = torch.stack(
+            [
+                (x.abs() - (inner + outer) / 2).abs() - (outer - inner) / 2,
+                y.abs() - self.prong_half_y,
+                (z - (start + end) / 2).abs() - (end - start) / 2,
+            ],
+            -1,
+        )
+        prongs = torch.maximum(_rounded(prong, 0.4), across - self.wrist_radius - 0.1)
+        off_hinge = (y.square() + (z - self.hinge).square()).sqrt()
+        pin = _rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
+        return torch.minimum(torch.minimum(collar, prongs), pin)
+
+    def everything(self, points: Tensor, opening: float) -> Tensor:
+        """Lower bound [M] mm of the distance to the whole instrument, shaft included."""
+        x, y, z = points.unbind(-1)
+        shaft = torch.maximum((x.square() + y.square()).sqrt() - self.radius, z)
+        return torch.minimum(shaft, self.distances(points, opening).amin(-1))
+
+
+def trace(design: Design, opening: float, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Meet rays from `origin` [3] along `directions` [M, 3] (any length), mechanical frame, with the instrument.
+
+    Returns distances [M] in lengths of the direction (inf: missed) and parts [M] uint8 (0: missed).
+    """
+    distance = torch.full((len(directions),), torch.inf)
+    part = torch.zeros(len(directions), dtype=torch.uint8)
+    lengths = directions.norm(dim=-1)
+    unit = directions / lengths[:, None]
+    shaft = _meet_shaft(design.radius, origin, unit)
+    struck = shaft.isfinite()
+    distance[struck], part[struck] = shaft[struck], SHAFT
+    # the head is looked for only inside balls along wrist and jaws
+    centers, radii = design.balls(opening)
+    nearest = unit @ (centers - origin).T  # [M, K]
+    half = radii.square() - ((centers - origin).square().sum(-1) - nearest.square())
+    chord = half.clamp_min(0).sqrt()
+    inside = (half > 0) & (nearest > 0)
+    entry = torch.where(inside, nearest - chord, torch.inf).amin(-1)
+    leave = torch.where(inside, nearest + chord, -torch.inf).amax(-1)
+    active = torch.nonzero(inside.any(-1))[:, 0]
+    t, far = entry[active].clamp_min(0.1), torch.minimum(leave[active], distance[active])
+    for _ in range(ITERATIONS):
+        gaps, which = design.distances(origin + t[:, None] * unit[active], opening).min(-1)
+        met = (gaps < TOUCH) & (t < far)
+        distance[active[met]], part[active[met]] = t[met], (which[met] + WRIST).to(torch.uint8)
+        t = t + gaps.clamp_min(TOUCH)
+        going = ~met & (t < far)
+        active, t, far = active[going], t[going], far[going]
+        if not len(active):
+            break
+    return distance / lengths, part
+
+
+def normals(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:
+    """Unit outward normals [M, 3] at surface points [M, 3] of the given parts [M]."""
+    around = F.normalize(points * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
+    corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
+    column = (parts.long() - WRIST).clamp_min(0)[:, None]
+    slope = torch.zeros_like(points)
+    for corner in corners:
+        slope += corner * design.distances(points + 0.02 * corner, opening).gather(1, column)
+    return torch.where((parts == SHAFT)[:, None], around, F.normalize(slope, dim=-1))
+
+
+def grain(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:
+    """Worn metal, in [-1, 1]: a pattern [M] that stays where it is on each part; points [M, 3], parts [M]."""
+    arm = points - torch.tensor([0.0, 0.0, design.hinge])
+    for part, sign, share in zip((FIRST_JAW, SECOND_JAW), (1, -1), design.shares, strict=True):
+        arm = torch.where((parts == part)[:, None], _turn_x(arm, sign * share * opening), arm)
+    wavy = arm + 0.8 * torch.sin(arm[:, [1, 2, 0]] * torch.tensor([1.3, 0.8, 1.9]))
+    coarse = torch.sin(wavy @ torch.tensor([0.9, -0.7, 0.5])) * torch.sin(wavy @ torch.tensor([-0.4, 1.1, 0.8]))
+    fine = torch.sin(wavy @ torch.tensor([2.1, 1.5, -1.1])) * torch.sin(wavy @ torch.tensor([1.2, -1.9, 1.7]))
+    return 0.6 * coarse + 0.4 * fine
+
+
+def shadow(design: Design, opening: float, points: Tensor, light: Tensor, softness: float = 11.0) -> Tensor:
+    """Share [M] of a light at `light` [3] that reaches points [M, 3] past the instrument; mechanical frame."""
+    towards = light - points
+    reach = towards.norm(dim=-1)
+    unit = towards / reach[:, None]
+    lit = torch.ones(len(points))
+    active = torch.nonzero(_near_axis(points, unit, reach, design))[:, 0]
+    t = torch.full((len(active),), 2.0)
+    for _ in range(40):
+        gap = design.everything(points[active] + t[:, None] * unit[active], opening)
+        lit[active] = torch.minimum(lit[active], (0.5 + 0.5 * softness * gap / t).clamp(0, 1))
+        t = t + gap.abs().clamp_min(0.5)
+        going = (t < 0.9 * reach[active]) & (lit[active] > 0)
+        active, t = active[going], t[going]
+        if not len(active):
+            break
+    return lit * lit * (3 - 2 * lit)
+
+
+def _near_axis(points: Tensor, unit: Tensor, reach: Tensor, design: Design) -> Tensor:
+    """Which segments [M] pass near the shaft or the head."""
+    margin = 6.0  # the penumbra's width
+    center = torch.tensor([0.0, 0.0, design.hinge])
+    along = ((center - points) * unit).sum(-1)
+    near_head = (points + along[:, None] * unit - center).norm(dim=-1) < design.reach + margin
+    flat, slope = points[:, :2], unit[:, :2]
+    t = (-(flat * slope).sum(-1) / slope.square().sum(-1).clamp_min(1e-9)).clamp_min(0)
+    t = torch.minimum(t, reach)
+    near_shaft = (flat + t[:, None] * slope).norm(dim=-1) < design.radius + margin
+    return near_head | near_shaft
+
+
+def _meet_shaft(radius: float, origin: Tensor, unit: Tensor) -> Tensor:
+    """Distance [M] to the cylinder -SHAFT_LENGTH < z < 0 with its front face, inf where missed."""
+    a = unit[:, :2].square().sum(-1).clamp_min(1e-12)
+    b = unit[:, :2] @ origin[:2]
+    root = b.square() - a * (origin[:2].square().sum() - radius**2)
+    side = (-b - root.clamp_min(0).sqrt()) / a
+    z = origin[2] + side * unit[:, 2]
+    side = torch.where((root > 0) & (side > 0.1) & (z < 0) & (z > -SHAFT_LENGTH), side, torch.inf)
+    face = -origin[2] / torch.where(unit[:, 2].abs() < 1e-9, 1e-9, unit[:, 2])
+    across = (origin[:2] + face[:, None] * unit[:, :2]).square().sum(-1)
+    face = torch.where((face > 0.1) & (across < radius**2) & (origin[2] > 0), face, torch.inf)
+    return torch.minimum(side, face)
+
+
+def _rounded(outside: Tensor, rounding: float) -> Tensor:
+    """Distance to a box-like solid from how far outside its faces a point is [M, K], edges rounded."""
+    beyond = outside + rounding
+    return beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0) - rounding
+
+
+def _turn_x(points: Tensor, angle: float) -> Tensor:
+    """Points [M, 3] turned about x by `angle` rad."""
+    cosine, sine = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    x, y, z = points.unbind(-1)
+    return torch.stack([x, cosine * y - sine * z, sine * y + cosine * z], -1)

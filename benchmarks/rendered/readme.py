@@ -1,0 +1,36 @@
+"""The page that goes with a rendered capture."""
+
+from __future__ import annotations
+
+import math
+
+from neeco.capture import Capture
+from rendered.scenes import SceneSpec
+
+
+def readme(spec: SceneSpec, capture: Capture, quality: dict[str, float]) -> str:
+    """README.md of a capture: what it shows, conventions, splits, and its measured errors against the truth."""
+    path, joint = spec.path, spec.joint
+    counts = ", ".join(f"{name} {len(capture.split(name))}" for name in capture.splits)
+    size = f"{capture.frames[0].camera.width}x{capture.frames[0].camera.height}"
+    errors = "\n".join(f"- {name}: {value:.3f}" for name, value in quality.items())
+    return f"""# {spec.organ}: rendered laparoscopic capture
+
+Made by `benchmarks/rendered_captures.py {spec.organ}`; nothing here is a real recording. {size}, {counts}.
+Shows {spec.words}.
+
+World: the tracker's frame, mm; `pose` = world_from_sensor, the sensor tilted
+{math.degrees(spec.mount.tilt):.0f} degrees against the shaft and off its axis.
+Reading `jaw_angle` = {joint.zero} + ({joint.sign}) * opening, rad.
+`truth/`: masks (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), depth (16 bit, 0.05 mm, every second pixel, for
+frames with number % 4 == 0 and all unseen ones), transforms.json (exact), hinge.json (hinge and shaft, sensor frame).
+
+Splits: the last frames are `unseen` (opening > {math.degrees(path.opening_train):.0f} deg or |roll| > \
+{math.degrees(path.roll_train):.0f} deg, checked for every frame);
+before them number % 8 == 4 is `test`, the rest `train`.
+
+Errors of transforms.json against the truth (rms; the reconstruction's scale is {spec.errors.scale}):
+
+{errors}
+- sparse points: {len(capture.points.positions)}
+"""

@@ -1,0 +1,168 @@
+"""The scenes: what each organ, instrument, motion, sensor and reading is. Angles in rad, lengths in mm."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rendered.errors import ErrorModel
+from rendered.instrument import Blade, Design, Material
+from rendered.motion import Array, Path, rigid
+from rendered.render import Lamps
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the tracked sensor sits on the shaft."""
+
+    position: tuple[float, float, float]  # mechanical frame
+    spin: float  # about the shaft
+    tilt: float  # of the sensor's z against the shaft
+    tilt_towards: float
+
+    def mechanical_from_sensor(self) -> Array:
+        """[4, 4]."""
+        lean = Rotation.from_rotvec(self.tilt * np.array([math.cos(self.tilt_towards), math.sin(self.tilt_towards), 0]))
+        spin = Rotation.from_rotvec([0, 0, self.spin])
+        return rigid((lean * spin).as_matrix(), np.array(self.position))
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What the jaw's sensor says: `zero + sign * opening`."""
+
+    zero: float
+    sign: int
+    limits: tuple[float, float]  # of the reading
+
+    def reading(self, opening: float) -> float:
+        """The reading at an opening (angle between the jaws)."""
+        return self.zero + self.sign * opening
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Everything about one scene."""
+
+    organ: str
+    design: Design
+    lamps: Lamps
+    path: Path
+    mount: Mount
+    joint: Joint
+    seed: int
+    words: str
+    world_turn: tuple[float, float, float]  # the tracker's world against the scene: rotation vector …
+    world_shift: tuple[float, float, float]  # … and shift
+    errors: ErrorModel = field(default_factory=ErrorModel)
+
+    def world_from_scene(self) -> Array:
+        """[4, 4]."""
+        return rigid(Rotation.from_rotvec(self.world_turn).as_matrix(), np.array(self.world_shift))
+
+
+DEGREE = math.pi / 180
+
+SCISSORS = Design(
+    name="scissors",
+    radius=2.5,
+    hinge=10.5,
+    collar=7.0,
+    wrist_radius=2.35,
+    prong_half_x=(1.35, 2.2),
+    prong_half_y=1.9,
+    pin=1.0,
+    jaws=(
+        Blade(23.0, 2.0, (0.55, 0.30), (1.75, 0.55), 0.58, 0.1, 5.0, 0.0, 0.2),
+        Blade(22.0, 2.0, (0.55, 0.30), (1.55, 0.50), -0.58, -0.1, 5.0, 0.0, 0.2),
+    ),
+    shares=(0.64, 0.36),
+    materials=(
+        Material((0.022, 0.023, 0.026), 1.0, 0.10, 22.0),
+        Material((0.80, 0.50, 0.15), 0.50, 0.50, 35.0),
+        Material((0.52, 0.54, 0.57), 0.42, 0.60, 45.0),
+    ),
+)
+
+GRASPER = Design(
+    name="grasper",
+    radius=4.0,
+    hinge=14.0,
+    collar=10.5,
+    wrist_radius=3.8,
+    prong_half_x=(2.45, 3.5),
+    prong_half_y=2.9,
+    pin=1.5,
+    jaws=(
+        Blade(15.0, 2.4, (2.3, 1.8), (1.95, 1.3), 0.0, 1.95, 0.0, 0.5, 0.6),
+        Blade(15.5, 2.4, (2.3, 1.8), (1.85, 1.3), 0.0, -1.85, 0.0, -0.4, 0.6),
+    ),
+    shares=(1.0, 0.0),
+    materials=(
+        Material((0.17, 0.175, 0.19), 0.9, 0.14, 18.0),
+        Material((0.36, 0.38, 0.44), 0.50, 0.35, 30.0),
+        Material((0.60, 0.58, 0.54), 0.48, 0.40, 28.0),
+    ),
+)
+
+SCENES = {
+    "bowel": SceneSpec(
+        organ="bowel",
+        design=SCISSORS,
+        lamps=Lamps(((-4.0, -3.0, 0.0), (4.0, -3.0, 0.0)), power=1.25, distance=95.0, focus=2.0),
+        path=Path(
+            camera_center=(-8.0, -28.0, 112.0),
+            camera_sway=(12.0, 9.0, 15.0),
+            look_at=(0.0, -2.0, 5.0),
+            look_sway=(6.0, 6.0),
+            camera_roll=0.12,
+            trocar=(-118.0, 42.0, 128.0),
+            hinge_center=(0.0, -9.0, 50.0),
+            hinge_sway=(11.0, 10.0, 8.0),
+            hinge_extra=(9.0, 12.0, -14.0),
+            opening_train=48 * DEGREE,
+            opening_most=74 * DEGREE,
+            roll_middle=70 * DEGREE,
+            roll_train=55 * DEGREE,
+            roll_most=95 * DEGREE,
+        ),
+        mount=Mount((2.9, -2.2, -26.0), spin=2.45, tilt=9 * DEGREE, tilt_towards=0.7),
+        joint=Joint(zero=0.22, sign=1, limits=(0.2, 1.7)),
+        seed=11,
+        words="folded pale small-bowel loops with fine red vessels and fat in the creases; a 5 mm black shaft with a "
+        "gold wrist and long thin scissors, curved along the hinge's axis, 64/36 of the opening per blade",
+        world_turn=(0.9, -1.4, 0.5),
+        world_shift=(-85.0, 140.0, 310.0),
+    ),
+    "stomach": SceneSpec(
+        organ="stomach",
+        design=GRASPER,
+        lamps=Lamps(((0.0, -5.0, 0.0), (-4.0, 3.0, 0.0), (4.0, 3.0, 0.0)), power=1.30, distance=80.0, focus=3.0),
+        path=Path(
+            camera_center=(14.0, -8.0, 98.0),
+            camera_sway=(10.0, 13.0, 10.0),
+            look_at=(6.0, 4.0, 6.0),
+            look_sway=(7.0, 5.0),
+            camera_roll=-0.5,
+            trocar=(96.0, 88.0, 135.0),
+            hinge_center=(8.0, 0.0, 46.0),
+            hinge_sway=(12.0, 9.0, 6.0),
+            hinge_extra=(-10.0, -8.0, -6.0),
+            opening_train=32 * DEGREE,
+            opening_most=50 * DEGREE,
+            roll_middle=-40 * DEGREE,
+            roll_train=45 * DEGREE,
+            roll_most=80 * DEGREE,
+        ),
+        mount=Mount((-4.2, 1.6, -9.0), spin=-0.95, tilt=16 * DEGREE, tilt_towards=2.5),
+        joint=Joint(zero=0.0, sign=-1, limits=(-1.0, 0.05)),
+        seed=23,
+        words="smooth reddish stomach wall with soft thick folds, mucus and dark veins; an 8 mm grey shaft with short "
+        "fat grasper jaws of which only one moves",
+        world_turn=(-2.1, 0.3, 1.1),
+        world_shift=(60.0, -35.0, -190.0),
+    ),
+}
