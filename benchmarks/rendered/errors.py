@@ -66,19 +66,19 @@ def jitter_cameras(cameras: Array, model: ErrorModel, generator: np.random.Gener
     return _disturb(cameras, shift, turn)
 
 
-def disturb_poses(poses: Array, model: ErrorModel, generator: np.random.Generator) -> Array:
-    """Instrument poses [F, 4, 4] with a tracker's slow drift and white noise."""
+def disturb_poses(poses: Array, numbers: Array, model: ErrorModel, generator: np.random.Generator) -> Array:
+    """Instrument poses [F, 4, 4] of the frames `numbers` [F], with a tracker's slow drift and white noise."""
     count = len(poses)
-    shift = model.drift_mm * _slow(count, 3, generator) / math.sqrt(3)
+    shift = model.drift_mm * _slow(numbers, 3, generator) / math.sqrt(3)
     shift += generator.normal(0, model.white_mm / math.sqrt(3), (count, 3))
-    turn = model.drift_rad * _slow(count, 3, generator) / math.sqrt(3)
+    turn = model.drift_rad * _slow(numbers, 3, generator) / math.sqrt(3)
     turn += generator.normal(0, model.white_rad / math.sqrt(3), (count, 3))
     return _disturb(poses, shift, turn)
 
 
-def disturb_readings(readings: Array, model: ErrorModel, generator: np.random.Generator) -> Array:
-    """Jaw readings [F] with a sensor's drift and noise."""
-    drift = model.jaw_drift_rad * _slow(len(readings), 1, generator)[:, 0]
+def disturb_readings(readings: Array, numbers: Array, model: ErrorModel, generator: np.random.Generator) -> Array:
+    """Jaw readings [F] of the frames `numbers` [F], with a sensor's drift and noise."""
+    drift = model.jaw_drift_rad * _slow(numbers, 1, generator)[:, 0]
     return readings + drift + generator.normal(0, model.jaw_white_rad, len(readings))
 
 
@@ -89,12 +89,12 @@ def _disturb(poses: Array, shift: Array, turn: Array) -> Array:
     return found
 
 
-def _slow(count: int, width: int, generator: np.random.Generator) -> Array:
-    """[count, width] noise that changes over about a second; each column has rms 1."""
-    longest = 12 * FRAME_RATE  # drawn for longer than needed, so that few frames drift no less than many
-    raw = generator.normal(size=(max(count, int(longest)), width))
+def _slow(numbers: Array, width: int, generator: np.random.Generator) -> Array:
+    """Noise [F, width] at frames `numbers` [F] that changes over about a second; each column has long-run rms 1."""
+    longest = int(12 * FRAME_RATE)  # drawn for longer than needed, so that few frames drift no less than many
+    raw = generator.normal(size=(max(int(numbers.max()) + 1, longest), width))
     smooth = gaussian_filter1d(raw, 0.8 * FRAME_RATE, axis=0, mode="wrap")
-    return (smooth / np.sqrt((smooth**2).mean(0)))[:count]
+    return (smooth / np.sqrt((smooth**2).mean(0)))[numbers]
 
 
 def _direction(generator: np.random.Generator) -> Array:

@@ -155,8 +155,9 @@ def _recorded(
     late = [trajectory.at(shot.time + model.clock_s) for shot in world.shots]
     found = errors.misregister(true_cameras, model, generator)
     cameras = errors.jitter_cameras(np.stack([found.pose(camera) for camera in true_cameras]), model, generator)
-    poses = errors.disturb_poses(np.stack([world.sensor(moment) for moment in late]), model, generator)
-    readings = errors.disturb_readings(np.array([m.opening for m in late]), model, generator)
+    numbers = np.array([shot.number for shot in world.shots])
+    poses = errors.disturb_poses(np.stack([world.sensor(moment) for moment in late]), numbers, model, generator)
+    readings = errors.disturb_readings(np.array([m.opening for m in late]), numbers, model, generator)
     frames = []
     for shot, camera, pose, opening in zip(world.shots, cameras, poses, readings, strict=True):
         state = State({spec.design.name: _state(pose, spec, float(opening))}, shot.time)
