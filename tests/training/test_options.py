@@ -8,12 +8,12 @@ import pytest
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.training.config import METHOD_DEFAULTS
+from neeco.scene.methods import METHODS
 from neeco.training.options import training_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
 
 
-@pytest.mark.parametrize("method", list(METHOD_DEFAULTS))
+@pytest.mark.parametrize("method", list(METHODS))
 def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
     config = training_config(method, values, ["schedule.density=inverse", "refine.cameras=true"])

@@ -15,8 +15,8 @@ from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import write_text
-from neeco.scene.deformations.nps import NPS, mark_moving
 from neeco.scene.io import save_scene
+from neeco.scene.methods import deformation_class
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import new_session
@@ -82,7 +82,7 @@ def train(
     log = _Log(output / "metrics.jsonl", progress)
     started = time.monotonic()
     torch.manual_seed(config.seed)
-    if config.method != "neeco":
+    if not deformation_class(config.method).large_operations:
         # the kernels have their own threads; torch's small operations only wait for each other
         torch.set_num_threads(1)
     if resuming:
@@ -111,8 +111,10 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
     frames = capture.split("train")
     if not frames:
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
-    if config.method == "neeco" and not capture.instruments:
-        raise NeecoError(f"{path}: no instrument states are recorded; method neeco needs them (3dgs does not)")
+    if deformation_class(config.method).needs_instruments and not capture.instruments:
+        raise NeecoError(
+            f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
+        )
     return capture, frames
 
 
@@ -152,8 +154,7 @@ def _finish(session: Session) -> None:
     scene.diagnostics["iterations"] = session.iteration
     scene.diagnostics["phase_2_began"] = session.schedule.phase_started
     scene.diagnostics["phase_2_forced"] = session.schedule.forced
-    if isinstance(scene.deformation, NPS) and scene.instruments:
-        scene.canonical = mark_moving(scene.deformation, scene.canonical, list(scene.recorded.states[::4]))
+    scene.canonical = scene.deformation.finished(scene.canonical, list(scene.recorded.states))
     finish_instruments(session)
 
 
