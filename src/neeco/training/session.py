@@ -108,7 +108,7 @@ class Session:
         if not math.isfinite(float(total.detach())):
             raise NeecoError(
                 f"training: the loss became {float(total.detach())} at iteration {self.iteration}, frame {frame.name}; "
-                "resume from the last checkpoint with another --seed, or run `neeco check`"
+                "run `neeco check` on the capture, or train anew with another --seed (the last checkpoint is kept)"
             )
         total.backward()
         self._learn(rendering, index, progress)
