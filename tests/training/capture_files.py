@@ -1,15 +1,25 @@
-"""A capture small enough to train on in a second."""
+"""Captures small enough to train on in a second: noise, and a drawn grasper over tissue."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from neeco.capture.images import write_image
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.capture.writer import write_capture as write_folder
+from neeco.raster import Camera, Gaussians, rasterize
+from neeco.scene.rotations import rigid_from_vector, rotate_about
 
 FRAMES = 8
+PIVOT_MM, WRIST_MM = 6.0, -3.0  # along the grasper's shaft, which is z of its frame
 
 
 def write_capture(root: Path, *, instruments: bool = True) -> Path:
@@ -40,3 +50,51 @@ def write_capture(root: Path, *, instruments: bool = True) -> Path:
     document["instruments"] = [{"name": "grasper", "joints": {"jaw_angle": {"limits": [0, 1.5]}}}]
     (root / "transforms.json").write_text(json.dumps(document))
     return root
+
+
+def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),)) -> Path:
+    """A two-jawed grasper that moves and opens before a wall, photographed in images of `sizes` in turn."""
+    rng = np.random.default_rng(5)
+    wall = torch.from_numpy(rng.uniform([-75, -60, 98], [75, 60, 102], (900, 3))).float()
+    wall_colors = torch.from_numpy(rng.uniform(0.3, 0.7, (900, 3)) * [1.2, 0.6, 0.6]).float()
+    (root / "images").mkdir(parents=True)
+    taken = []
+    for k in range(frames):
+        width, height = sizes[k % len(sizes)]
+        camera = Camera(torch.eye(4, dtype=torch.float64), width, width, width / 2, height / 2, width, height)
+        opening = 0.5 + 0.5 * math.sin(1.7 * k)
+        tilt, pan, roll = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-1.2, 1.2)
+        turn = rigid_from_vector(torch.tensor([0.9 + tilt, pan, roll, 0, 0, 0], dtype=torch.float64))
+        pose = turn.clone()
+        pose[:3, 3] = torch.tensor([rng.uniform(-14, 14), rng.uniform(-10, 10), rng.uniform(64, 78)])
+        body, colors = grasper_body(opening)
+        means = torch.cat([wall, body @ pose[:3, :3].float().T + pose[:3, 3].float()])
+        count = len(means)
+        gaussians = Gaussians(
+            means,
+            torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+            torch.cat([torch.full((len(wall), 3), 3.5), torch.full((len(body), 3), 1.3)]),
+            torch.full((count,), 0.95),
+            ((torch.cat([wall_colors, colors]) - 0.5) / 0.2820948)[:, None],
+        )
+        path = root / "images" / f"{k:06d}.png"
+        write_image(path, rasterize(gaussians, camera).color)
+        state = State({"grasper": InstrumentState(pose, {"jaw_angle": opening})}, 0.04 * k)
+        taken.append(Frame(path, camera, state, "train" if k % 6 else "test"))
+    points = PointCloud(wall.numpy(), wall_colors.numpy().clip(0, 1))
+    instruments = (Instrument("grasper", {"jaw_angle": (0.0, 1.5)}),)
+    write_folder(Capture(root, tuple(taken), instruments, points), root)
+    return root
+
+
+def grasper_body(opening: float) -> tuple[Tensor, Tensor]:
+    """Points [M, 3] mm and colours [M, 3]: a shaft along z, its wrist brighter, and two jaws."""
+    around = torch.arange(8) * (math.pi / 4)
+    along = torch.arange(-30.0, PIVOT_MM, 1.5)
+    shaft = torch.stack([around.cos().repeat(24) * 2, around.sin().repeat(24) * 2, along.repeat_interleave(8)], -1)
+    blade = torch.stack([torch.zeros(15), torch.zeros(15), torch.linspace(PIVOT_MM, 20, 15)], -1)
+    pivot, axis = torch.tensor([0.0, 0.0, PIVOT_MM]), torch.tensor([1.0, 0.0, 0.0])
+    jaws = [rotate_about(blade, axis, pivot, torch.full((15,), side * opening / 2)) for side in (1, -1)]
+    bright = (shaft[:, 2:] > WRIST_MM).float().expand(-1, 3)
+    colors = torch.cat([0.15 + 0.7 * bright, torch.full((30, 3), 0.85)])
+    return torch.cat([shaft, *jaws]), colors
