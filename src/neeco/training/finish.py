@@ -114,7 +114,9 @@ def _image_error(session: Session, index: int, perturbation: Perturbation) -> fl
     frame = session.frames[index]
     state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
     rendering = rasterize(session.scene.at(state, perturbation), camera)
-    return float((rendering.color - session.images[index].float() / 255).abs().mean())
+    error = (rendering.color - session.images[index].float() / 255).abs()
+    mask = session.masks[index]
+    return float(error.mean() if mask is None else error[mask].mean())
 
 
 def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor:
@@ -151,6 +153,9 @@ def _verdict(session: Session, hinged: Hinged, index: int, joint: int) -> dict[s
             for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
         ]
         covered = torch.maximum(*(d.channels[..., 0] for d in drawings if d.channels is not None)) > 0.3
+        mask = session.masks[frame_index]
+        if mask is not None:
+            covered &= mask
         errors = [float((d.color - target).abs().mean(-1)[covered].sum()) for d in drawings]
         given, middle = given + errors[0], middle + errors[1]
     pivot, axis = hinges.hinge(joint)
