@@ -32,6 +32,10 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("schedule.speed=2", "unknown field 'schedule.speed'"),
         ("ssim_weight=much", "is not a number"),
         ("refine.cameras=3", "does not fit"),
+        ("refine=3", "is a group of fields; give one of registration"),
+        ("ssim_weight=[1", "is not a value"),
+        ("ssim_weight=.nan", "is not a finite number"),
+        ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
@@ -43,3 +47,9 @@ def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None
 def test_a_run_of_no_length_is_refused(values: dict) -> None:
     with pytest.raises(NeecoError, match="is not a positive number"):
         training_config("3dgs", values)
+
+
+@pytest.mark.parametrize(("name", "value"), [("seed", -1), ("tissue_budget", 0), ("instrument_budget", -5)])
+def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: int) -> None:
+    with pytest.raises(NeecoError, match=f"--{name.replace('_', '-')}: {value} is too small"):
+        training_config("kinematic", {name: value})

@@ -30,4 +30,7 @@ def make_deformation(method: str, instruments: tuple[Instrument, ...], config: d
         raise NeecoError(
             f"deformation.{unknown[0]}: method {method} has no such field; it has {', '.join(known) or 'none'}"
         )
-    return kind(instruments, **config)
+    try:
+        return kind(instruments, **config)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise NeecoError(f"deformation: method {method}: {str(error).splitlines()[0]}; see --set deformation") from None
