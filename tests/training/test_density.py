@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.training.density import Budget, GradientStatistics, control_density
+from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
 from neeco.training.optimizer import Adam
 
 
@@ -92,3 +92,20 @@ def test_adams_rows_follow_and_new_ones_start_at_zero() -> None:
     assert sorted(moments[twins].tolist()) == pytest.approx([0.0, expected[3.0]])
     others = [i for i in range(15) if i not in twins.tolist()]
     assert moments[others].tolist() == pytest.approx([expected[float(after.means[i, 0])] for i in others])
+
+
+def test_an_opacity_reset_lowers_the_high_ones_keeps_the_low_ones_and_forgets_their_momentum() -> None:
+    canonical = two_bodies(0.5)
+    canonical.opacity_logits[:] = torch.linspace(-8, 8, 15)
+    before, adam = canonical.opacity_logits.clone(), Adam()
+    for name in ("opacity_logits", "means"):
+        tensor = canonical.tensors()[name].requires_grad_(True)
+        tensor.grad = torch.ones_like(tensor)
+        adam.step(name, tensor, 0.0)
+    reset_opacity(canonical, adam)
+    ceiling = math.log(0.01 / 0.99)
+    assert torch.equal(canonical.opacity_logits.detach(), before.clamp(max=ceiling))
+    assert bool((before > ceiling).any())
+    assert bool((before < ceiling).any())
+    assert float(adam.first["opacity_logits"].abs().max()) == float(adam.second["opacity_logits"].abs().max()) == 0
+    assert float(adam.first["means"].abs().min()) > 0

@@ -8,12 +8,12 @@ import pytest
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.training.config import METHOD_DEFAULTS
+from neeco.scene.methods import METHODS
 from neeco.training.options import training_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
 
 
-@pytest.mark.parametrize("method", list(METHOD_DEFAULTS))
+@pytest.mark.parametrize("method", list(METHODS))
 def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
     config = training_config(method, values, ["schedule.density=inverse", "refine.cameras=true"])
@@ -32,6 +32,10 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("schedule.speed=2", "unknown field 'schedule.speed'"),
         ("ssim_weight=much", "is not a number"),
         ("refine.cameras=3", "does not fit"),
+        ("refine=3", "is a group of fields; give one of registration"),
+        ("ssim_weight=[1", "is not a value"),
+        ("ssim_weight=.nan", "is not a finite number"),
+        ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
@@ -43,3 +47,9 @@ def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None
 def test_a_run_of_no_length_is_refused(values: dict) -> None:
     with pytest.raises(NeecoError, match="is not a positive number"):
         training_config("3dgs", values)
+
+
+@pytest.mark.parametrize(("name", "value"), [("seed", -1), ("tissue_budget", 0), ("instrument_budget", -5)])
+def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: int) -> None:
+    with pytest.raises(NeecoError, match=f"--{name.replace('_', '-')}: {value} is too small"):
+        training_config("kinematic", {name: value})

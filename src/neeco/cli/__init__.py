@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import make_dataclass
 from typing import Any, get_type_hints
@@ -38,6 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     away. Usage errors (2) and `--help` (0) leave through SystemExit.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    terminate = None
+    if threading.current_thread() is threading.main_thread():
+        # told to end, end as on Ctrl-C: tidily
+        terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = _dispatch(words)
         sys.stdout.flush()
@@ -53,9 +59,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         print(f"neeco: error: {where}{error.strerror or error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("\nneeco: interrupted; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        told = " ".join(map(str, interrupt.args)) or "what was finished is kept"
+        print(f"\nneeco: interrupted: {told}", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        if terminate is not None:
+            signal.signal(signal.SIGTERM, terminate)
 
 
 def _dispatch(words: list[str]) -> int:

@@ -36,7 +36,9 @@ def train_with_progress(capture: Path, output: Path, config: TrainConfig, *, res
         bar.update(task, completed=row.progress, description=text)
 
     try:
-        return train(capture, output, config, resume=resume, progress=show)
+        path = train(capture, output, config, resume=resume, progress=show)
+        bar.update(task, completed=1.0)
+        return path
     finally:
         if bar.live.is_started:
             bar.stop()

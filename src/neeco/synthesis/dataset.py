@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -15,7 +17,7 @@ import torch
 import neeco
 from neeco.errors import NeecoError
 from neeco.evaluation.labels import LABEL_THRESHOLD
-from neeco.files import read_json, write_json
+from neeco.files import new_folder, read_json, write_json
 from neeco.synthesis.acceptance import Acceptance, find_tolerance
 from neeco.synthesis.annotation import KEYPOINTS, annotate
 from neeco.synthesis.drawing import (
@@ -33,8 +35,10 @@ from neeco.synthesis.settings import Format, Settings
 from neeco.synthesis.writers.coco import write_coco
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
+    FOLDERS,
     Record,
     load_record,
+    record_path,
     remove_leftovers,
     write_sample,
     write_skipped,
@@ -71,32 +75,72 @@ def synthesize(
 ) -> Summary:
     """Write a labelled data set of `settings.count` images of the run's scene to `output`.
 
-    Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C), it keeps and indexes what is done.
-    `on_progress` is told how many images are done. Raises NeecoError for bad settings, an output that is not empty
-    (without `resume`) or was made with other settings, and when no acceptable state is found.
+    Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C) or failing, it keeps and indexes what
+    is done, for `resume`; where no image was drawn at all, `output` is left as it was found. `on_progress` is told how
+    many images are done. Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was
+    made with other settings, and when no acceptable state is found.
     """
     settings.check()
     output = Path(output)
     scene = run.scene
-    info = _open_output(output, _description(run, settings), resume)
+    info = _description(run, settings)
+    begun = _check_output(output, info, resume)
+    if begun and record_path(output, settings.count).exists():
+        raise NeecoError(
+            f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
+        )
     labeller = make_labeller(scene, settings)
     sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
     acceptance = make_acceptance(scene, labeller, settings)
     info["tissue_tolerance_mm"] = acceptance.tolerance_mm
     records: list[Record] = []
     made = 0
-    try:
-        for index in range(settings.count):
-            record = load_record(output, index) if resume else None
-            if record is None:
-                record = make_sample(scene, labeller, sampler, acceptance, settings, output, index)
-                made += 1
-            records.append(record)
-            on_progress(index + 1)
-    except KeyboardInterrupt:
-        _write_indexes(output, records, info, scene, labeller, formats, complete=False)
-        raise
-    return _write_indexes(output, records, info, scene, labeller, formats, complete=True, made=made)
+    with new_folder(output):
+        if begun:
+            remove_leftovers(output)
+        try:
+            write_json(output / INFO, info | {"complete": False})
+            for index in range(settings.count):
+                record = load_record(output, index) if begun else None
+                if record is None:
+                    record = make_sample(scene, labeller, sampler, acceptance, settings, output, index)
+                    made += 1
+                records.append(record)
+                on_progress(index + 1)
+            if not _drawn(records):
+                reasons = ", ".join(f"{reason}: {count}" for reason, count in _refusals(records).items())
+                raise NeecoError(
+                    f"{settings.states}: every state was refused ({reasons}); try --no-tissue-check or --min-share"
+                )
+        except (KeyboardInterrupt, NeecoError):
+            if begun or _drawn(records):
+                with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
+                    further = (load_record(output, index) for index in range(len(records), settings.count))
+                    records += [record for record in further if record is not None]
+                    _write_indexes(output, records, info, scene, labeller, formats, complete=False)
+            else:
+                _forget(output)
+            raise
+        return _write_indexes(output, records, info, scene, labeller, formats, complete=True, made=made)
+
+
+def _drawn(records: list[Record]) -> list[Record]:
+    return [record for record in records if not record.get("skipped")]
+
+
+def _refusals(records: list[Record]) -> dict[str, int]:
+    """How many states were refused, by reason."""
+    refused: Counter[str] = Counter()
+    for record in records:
+        refused.update(record["refused"])
+    return dict(sorted(refused.items()))
+
+
+def _forget(output: Path) -> None:
+    """Remove what was written to an empty folder before its first image: description and records of skipped states."""
+    (output / INFO).unlink(missing_ok=True)
+    for folder in FOLDERS:
+        shutil.rmtree(output / folder, ignore_errors=True)
 
 
 def make_labeller(scene: Scene, settings: Settings) -> Labeller:
@@ -171,29 +215,29 @@ def _description(run: Run, settings: Settings) -> dict[str, Any]:
     }
 
 
-def _open_output(output: Path, description: dict[str, Any], resume: bool) -> dict[str, Any]:
-    """Claim an empty folder, or check that a begun data set was begun the same way."""
+def _check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
+    """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
     if output.exists() and not output.is_dir():
         raise NeecoError(f"{output}: is a file; give a folder")
     if not output.exists() or not any(output.iterdir()):
-        write_json(output / INFO, description | {"complete": False})
-        return description
+        return False
     if not resume:
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")
     if not (output / INFO).exists():
         raise NeecoError(f"{output}: not empty and no {INFO} in it; --resume continues only data sets made by neeco")
     begun = read_json(output / INFO)
+    if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
+        raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     for key in ("schema", "version", "scene_sha256"):
         if begun.get(key) != description[key]:
             raise NeecoError(
                 f"{output / INFO}: {key}: begun with {begun.get(key)!r}, now {description[key]!r}; use a new folder"
             )
     for key, value in description["settings"].items():
-        before = begun.get("settings", {}).get(key)
+        before = begun["settings"].get(key)
         if before != value:
             raise NeecoError(f"{output / INFO}: settings.{key}: begun with {before!r}, now {value!r}; use a new folder")
-    remove_leftovers(output)
-    return description
+    return True
 
 
 def _write_indexes(
@@ -207,15 +251,8 @@ def _write_indexes(
     made: int = 0,
 ) -> Summary:
     """(Re)write everything that is about the whole data set, from the records."""
-    drawn = [record for record in records if not record.get("skipped")]
-    refused: Counter[str] = Counter()
-    for record in records:
-        refused.update(record["refused"])
+    drawn = _drawn(records)
     skipped = [record["index"] for record in records if record.get("skipped")]
-    if complete and not drawn:
-        raise NeecoError(
-            f"{output}: every given state was refused ({dict(refused)}); see --no-tissue-check and --min-share"
-        )
     instruments = instruments_of(labeller.names)
     keypoints = keypoint_names(scene)
     write_states(output, drawn)
@@ -239,11 +276,11 @@ def _write_indexes(
             "keypoints": list(keypoints),
             "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
             "delta_thresholds": None if thresholds is None else asdict(thresholds),
-            "refused": dict(sorted(refused.items())),
+            "refused": _refusals(records),
             "skipped": skipped,
         },
     )
-    return Summary(output, len(drawn), made, dict(sorted(refused.items())), skipped)
+    return Summary(output, len(drawn), made, _refusals(records), skipped)
 
 
 @torch.no_grad()

@@ -103,6 +103,10 @@ def states_fingerprint(states: str) -> str | None:
     path = states_file(states)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        raise NeecoError(
+            f"{path}: no such file; --states takes inside, beyond, grid, path:FILE.jsonl or FILE.jsonl"
+        ) from None
     except OSError as error:
         raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
 

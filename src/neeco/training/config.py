@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from neeco.errors import NeecoError
-from neeco.training.schedule import DensityPhase, ScheduleConfig
+from neeco.scene.methods import deformation_class
+from neeco.training.schedule import ScheduleConfig
 
 
 @dataclass(frozen=True)
@@ -45,29 +46,19 @@ class TrainConfig:
     joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
 
 
-PLAIN = ScheduleConfig(density="off", sh_order="off", frame_order="off", compensation="off")
-
-METHOD_DEFAULTS: dict[str, TrainConfig] = {
-    "neeco": TrainConfig(method="neeco"),
-    "3dgs": TrainConfig(method="3dgs", schedule=PLAIN),
-    "kinematic": TrainConfig(
-        method="kinematic",
-        schedule=replace(PLAIN, sh_interval=500, plain_density=DensityPhase(200, 0, 2e-4)),
-        refine=RefineConfig(latency=True, frame_poses=True),
-        density_start=400,
-        density_stop=0.7,
-        opacity_penalty=0.002,
-        label_sharpness=0.02,
-        shaft_roll=0.5,
-    ),
-}
-
-
 def method_defaults(method: str) -> TrainConfig:
-    """The config a method starts from. Raises NeecoError for an unknown method."""
-    if method not in METHOD_DEFAULTS:
-        raise NeecoError(f"--method: {method!r} is unknown; choose one of {', '.join(METHOD_DEFAULTS)}")
-    return METHOD_DEFAULTS[method]
+    """The config a method starts from: the paper's, changed as its deformation says. Raises NeecoError for an unknown
+    method."""
+    return with_fields(TrainConfig(method=method), deformation_class(method).training_defaults)
+
+
+def with_fields(config: Any, values: Mapping[str, Any]) -> Any:
+    """The dataclass `config` with fields changed by name; dots reach into nested ones (`refine.latency`)."""
+    for name, value in values.items():
+        field_name, _, rest = name.partition(".")
+        changed = with_fields(getattr(config, field_name), {rest: value}) if rest else value
+        config = replace(config, **{field_name: changed})
+    return config
 
 
 def decayed(rate: float, progress: float, final: float = 0.03) -> float:

@@ -1,4 +1,4 @@
-"""Find each instrument and its joints from training frames alone, and seed its Gaussians (method `kinematic`)."""
+"""Find each instrument and its joints from training frames alone, and seed its Gaussians (of a method with hinges)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.deformations._hinges import Hinges
-from neeco.scene.deformations.kinematic import PART_LOGITS, Kinematic
+from neeco.scene.deformations._hinges import PART_LOGITS, Hinged, Hinges
 from neeco.scene.deformations.static import Static
 from neeco.scene.scene import Recording, Scene
 from neeco.training.carving import CarvedShape, camera_from_instrument, carve, score_points
-from neeco.training.config import PLAIN, RefineConfig, TrainConfig
+from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.evidence import Evidence, gather_evidence
 from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.refinement import Refinement
@@ -35,6 +34,7 @@ Report = Callable[[str], None]
 
 def find_instruments(
     scene: Scene,
+    hinged: Hinged,
     frames: tuple[Frame, ...],
     images: Sequence[Tensor],
     masks: Sequence[Tensor | None],
@@ -43,14 +43,13 @@ def find_instruments(
 ) -> None:
     """Add every instrument's body to `scene`, whose canonical set holds the tissue alone, and start its hinges.
 
-    Raises NeecoError when an instrument leaves no evidence in its own frame: its poses do not match the images.
+    `hinged` is the scene's deformation, known to have hinges. Raises NeecoError when an instrument leaves no evidence
+    in its own frame: its poses do not match the images.
     """
-    deformation = scene.deformation
-    assert isinstance(deformation, Kinematic)
     report("looking for the instruments: fitting the tissue alone")
     evidence = tissue_evidence(scene, frames, images, masks, config)
     generator = torch.Generator().manual_seed(config.seed)
-    bodies = [_with_logits(scene.canonical, deformation.logit_count)]
+    bodies = [_with_logits(scene.canonical, hinged.logit_count)]
     for index, instrument in enumerate(scene.instruments):
         shape = carve(evidence, instrument.name, generator, SEEDS)
         if shape is None:
@@ -60,10 +59,10 @@ def find_instruments(
             )
         if not _judge_evidence(scene, evidence, instrument.name, shape, report):
             shape = shape_around_frame(shape, evidence.distance, generator)
-        hinges = deformation.hinges_of(index)
+        hinges = hinged.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
         body = seed_gaussians(shape.seeds, torch.full((SEEDS, 3), 0.4), torch.full((SEEDS,), 0.4 * shape.radius))
-        logits = seed_logits(hinges, shape.seeds, deformation.logit_count, generator)
+        logits = seed_logits(hinges, shape.seeds, hinged.logit_count, generator)
         bodies.append(body.with_extras(**{PART_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
@@ -116,7 +115,7 @@ def tissue_evidence(
         config,
         iterations=TISSUE_STEPS,
         minutes=None,
-        schedule=PLAIN,
+        schedule=method_defaults("3dgs").schedule,
         refine=RefineConfig(),
         density_start=10**9,
         opacity_penalty=0.0,

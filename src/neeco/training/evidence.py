@@ -21,10 +21,13 @@ FLOOR, RANGE = 0.04, 0.06  # residual at which evidence begins, and over which i
 
 @dataclass(frozen=True)
 class Evidence:
-    """F frames' residuals as soft masks, and what is needed to look points up in them."""
+    """F frames' residuals as soft masks, and what is needed to look points up in them.
+
+    H and W are the largest of the frames' heights and widths; beyond its own image a frame has no evidence.
+    """
 
     hits: Tensor  # [F, H, W] in [0, 1]
-    depths: Tensor  # [F, H, W] mm, of the tissue
+    depths: Tensor  # [F, H, W] mm, of the tissue; inf where there is none
     camera_from_world: Tensor  # [F, 4, 4]
     intrinsics: Tensor  # [F, 4] fx, fy, cx, cy
     frames: tuple[Frame, ...]
@@ -33,6 +36,11 @@ class Evidence:
     def distance(self) -> float:
         """Median distance from camera to tissue, mm: the scale of the scene."""
         return float(self.depths[self.depths.isfinite() & (self.depths > 0)].median())
+
+    @cached_property
+    def sizes(self) -> Tensor:
+        """[F, 2] width and height px of each frame's image."""
+        return torch.tensor([[frame.camera.width, frame.camera.height] for frame in self.frames])
 
     def subset(self, index: Tensor) -> Evidence:
         """The frames `index` [M] alone."""
@@ -48,7 +56,8 @@ class Evidence:
         fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
         u, v = x / z * fx + cx, y / z * fy + cy
         height, width = self.hits.shape[1:]
-        inside = (z > 0.01 * self.distance) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        own_width, own_height = self.sizes[:, :1], self.sizes[:, 1:]
+        inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)
         column, row = u.nan_to_num().clamp(0, width - 1).long(), v.nan_to_num().clamp(0, height - 1).long()
         place = (torch.arange(len(self.frames))[:, None] * height + row) * width + column
         inside &= z < 1.02 * self.depths.view(-1)[place]
@@ -82,9 +91,18 @@ def gather_evidence(
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras = [frames[i].camera for i in picked]
     return Evidence(
-        torch.stack(hits),
-        torch.stack(depths),
+        _stacked(hits, 0.0),
+        _stacked(depths, torch.inf),
         torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]),
         torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]),
         tuple(frames[i] for i in picked),
     )
+
+
+def _stacked(images: list[Tensor], beyond: float) -> Tensor:
+    """Images [H_i, W_i] of any sizes as one [F, H, W], filled up with `beyond` at the right and below."""
+    height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
+    stacked = torch.full((len(images), height, width), beyond)
+    for place, image in zip(stacked, images, strict=True):
+        place[: image.shape[0], : image.shape[1]] = image
+    return stacked

@@ -11,9 +11,8 @@ from torch import Tensor
 from neeco.capture.model import InstrumentState, State
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._hinges import Hinges
+from neeco.scene.deformations._hinges import Hinged, Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.training.extend import extend_shaft
 from neeco.training.session import Session
 
@@ -28,17 +27,17 @@ FOUND = 0.25  # share of the moving parts' error that the readings must explain
 @torch.no_grad()
 def finish_instruments(session: Session) -> None:
     """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`."""
-    deformation = session.scene.deformation
-    if not isinstance(deformation, Kinematic):
+    hinged = session.scene.deformation.hinged
+    if hinged is None:
         return
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
-        hinges = deformation.hinges_of(index)
-        boundary = color_boundary(session.scene.canonical, deformation, index) if hinges.joint_names else None
+        hinges = hinged.hinges_of(index)
+        boundary = color_boundary(session.scene.canonical, hinged, index) if hinges.joint_names else None
         if boundary is not None:
             hinges.wrist_start.fill_(boundary)
         for joint, name in enumerate(hinges.joint_names):
-            verdicts[f"{instrument.name}.{name}"] = _verdict(session, index, joint)
+            verdicts[f"{instrument.name}.{name}"] = _verdict(session, hinged, index, joint)
         scene = session.scene
         hinges.extent.copy_(_extent(scene.canonical, index, hinges))
         scene.canonical = extend_shaft(
@@ -53,23 +52,23 @@ def finish_instruments(session: Session) -> None:
 def place_wrists(session: Session) -> None:
     """Find where each shaft ends and the wrist begins: where the colour along it changes, or, on an instrument of one
     colour, where it stops being a surface of revolution."""
-    deformation = session.scene.deformation
-    if not isinstance(deformation, Kinematic):
+    hinged = session.scene.deformation.hinged
+    if hinged is None:
         return
     for index in range(len(session.scene.instruments)):
-        hinges = deformation.hinges_of(index)
+        hinges = hinged.hinges_of(index)
         if hinges.joint_names:
-            boundary = color_boundary(session.scene.canonical, deformation, index)
-            hinges.wrist_start.fill_(_symmetry_boundary(session, index) if boundary is None else boundary)
+            boundary = color_boundary(session.scene.canonical, hinged, index)
+            hinges.wrist_start.fill_(_symmetry_boundary(session, hinged, index) if boundary is None else boundary)
 
 
-def color_boundary(canonical: CanonicalGaussians, deformation: Kinematic, index: int) -> float | None:
+def color_boundary(canonical: CanonicalGaussians, hinged: Hinged, index: int) -> float | None:
     """Position mm along the shaft that best splits the body's colour profile in two; None without a clear split."""
-    hinges, rows = deformation.hinges_of(index), canonical.body(index + 1)
+    hinges, rows = hinged.hinges_of(index), canonical.body(index + 1)
     hinge = float(hinges.hinge_depth[0])
     edges = torch.linspace(float(_extent(canonical, index, hinges)[0]), hinge, COLOR_BINS + 1)
     area = canonical.log_scales[rows].exp().prod(1).pow(2 / 3)
-    weight = torch.sigmoid(canonical.opacity_logits[rows]) * deformation.part_weights(canonical, index)[:, 0] * area
+    weight = torch.sigmoid(canonical.opacity_logits[rows]) * hinged.part_weights(canonical, index)[:, 0] * area
     bins = torch.bucketize(hinges.along_shaft(canonical.means[rows]), edges) - 1
     profile, mass = torch.zeros(COLOR_BINS, 3), torch.zeros(COLOR_BINS, 1)
     for place in range(COLOR_BINS):
@@ -86,12 +85,10 @@ def color_boundary(canonical: CanonicalGaussians, deformation: Kinematic, index:
     return float(edges[best]) if splits[best] < COLOR_SCATTER * scatter(slice(0, COLOR_BINS)) else None
 
 
-def _symmetry_boundary(session: Session, index: int) -> float:
+def _symmetry_boundary(session: Session, hinged: Hinged, index: int) -> float:
     """Position mm along the shaft up to which spinning what lies behind costs little."""
     scene = session.scene
-    deformation = scene.deformation
-    assert isinstance(deformation, Kinematic)
-    hinges = deformation.hinges_of(index)
+    hinges = hinged.hinges_of(index)
     before = float(hinges.wrist_start)
     hinge, rear = float(hinges.hinge_depth[0]), float(_extent(scene.canonical, index, hinges)[0])
     starts = torch.linspace(rear + 0.3 * (hinge - rear), hinge, WRIST_STEPS)
@@ -117,7 +114,9 @@ def _image_error(session: Session, index: int, perturbation: Perturbation) -> fl
     frame = session.frames[index]
     state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
     rendering = rasterize(session.scene.at(state, perturbation), camera)
-    return float((rendering.color - session.images[index].float() / 255).abs().mean())
+    error = (rendering.color - session.images[index].float() / 255).abs()
+    mask = session.masks[index]
+    return float(error.mean() if mask is None else error[mask].mean())
 
 
 def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor:
@@ -130,7 +129,7 @@ def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor
     return torch.quantile(along, torch.tensor([0.02, 0.985]))
 
 
-def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
+def _verdict(session: Session, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
     """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving
     parts' image?
 
@@ -138,14 +137,12 @@ def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
     either drawing.
     """
     scene = session.scene
-    deformation = scene.deformation
-    assert isinstance(deformation, Kinematic)
-    hinges, instrument = deformation.hinges_of(index), scene.instruments[index]
+    hinges, instrument = hinged.hinges_of(index), scene.instruments[index]
     name = hinges.joint_names[joint]
     readings = torch.tensor([frame.state.instruments[instrument.name].joints[name] for frame in session.frames])
     ordered = readings.argsort()
     extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
-    moving = _moving_weight(scene.canonical, deformation, index, joint)
+    moving = _moving_weight(scene.canonical, hinged, index, joint)
     given = middle = 0.0
     for frame_index in extremes:
         frame = session.frames[frame_index]
@@ -156,6 +153,9 @@ def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
             for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
         ]
         covered = torch.maximum(*(d.channels[..., 0] for d in drawings if d.channels is not None)) > 0.3
+        mask = session.masks[frame_index]
+        if mask is not None:
+            covered &= mask
         errors = [float((d.color - target).abs().mean(-1)[covered].sum()) for d in drawings]
         given, middle = given + errors[0], middle + errors[1]
     pivot, axis = hinges.hinge(joint)
@@ -177,10 +177,10 @@ def _verdict(session: Session, index: int, joint: int) -> dict[str, Any]:
     }
 
 
-def _moving_weight(canonical: CanonicalGaussians, deformation: Kinematic, index: int, joint: int) -> Tensor:
+def _moving_weight(canonical: CanonicalGaussians, hinged: Hinged, index: int, joint: int) -> Tensor:
     """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
     weight = torch.zeros(len(canonical), 1)
-    weights = deformation.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
+    weights = hinged.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
     weight[canonical.body(index + 1), 0] = weights.sum(1)
     return weight
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
-from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.deformations.nps import NPS
 from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Recording, Scene
 from neeco.training.config import TrainConfig
@@ -51,10 +49,9 @@ def initial_scene(
     deformation = make_deformation(config.method, instruments, config.deformation)
     center = torch.from_numpy(np.median(positions, 0))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
-    if isinstance(deformation, NPS):
-        deformation.fit_ranges(list(recorded.states), tissue.means)
-    if isinstance(deformation, Kinematic):
-        find_instruments(scene, frames, images, masks, config, report)
+    deformation.fit_ranges(list(recorded.states), tissue.means)
+    if deformation.hinged is not None:
+        find_instruments(scene, deformation.hinged, frames, images, masks, config, report)
     return scene
 
 

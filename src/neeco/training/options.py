@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,7 +28,15 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
-    return config_from_dict(plain)
+    try:
+        config = config_from_dict(plain)
+    except NeecoError as error:
+        told = str(error).removeprefix("config.yaml: ").removesuffix("; train again")
+        raise NeecoError(f"--set: {told}") from None
+    for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
+        if getattr(config, name) < least:
+            raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
+    return config
 
 
 def _assign(plain: dict[str, Any], assignment: str) -> None:
@@ -41,8 +50,15 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
     open_ended = path == ["deformation"]
     if not isinstance(target, dict) or (last not in target and not open_ended):
         raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
-    value = yaml.safe_load(text)
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise NeecoError(f"--set {name}: {text!r} is not a value; quote it as in YAML") from None
     old = target.get(last)
+    if isinstance(old, dict) and not isinstance(value, dict):
+        raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise NeecoError(f"--set {name}: {text!r} is not a finite number")
     if isinstance(old, bool) is not isinstance(value, bool) and old is not None:
         raise NeecoError(f"--set {name}: {text!r} does not fit a field that holds {old!r}")
     if isinstance(old, int | float) and not isinstance(value, int | float):

@@ -111,4 +111,6 @@ def _build(kind: Any, value: Any) -> Any:
         return kind(**{name: _build(hints[name], item) for name, item in value.items()})
     if typing.get_origin(kind) in (typing.Union, types.UnionType) and value is not None:
         return _build(next(arm for arm in typing.get_args(kind) if arm is not type(None)), value)
+    if typing.get_origin(kind) is typing.Literal and value not in typing.get_args(kind):
+        raise ValueError(f"{value!r} is none of {', '.join(map(str, typing.get_args(kind)))}")
     return tuple(value) if typing.get_origin(kind) is tuple and value is not None else value

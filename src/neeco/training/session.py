@@ -28,7 +28,6 @@ GAUSSIAN_RATES = {
     "opacity_logits": 5e-2,
     "sh_dc": 2.5e-3,
     "sh_rest": 1.25e-4,
-    "extras.part_logits": 1e-2,
 }
 LIGHT_RATE = 3e-3
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
@@ -77,7 +76,13 @@ class Session:
     def watch_gradients(self) -> None:
         """Make the canonical tensors leaves again after they were replaced."""
         for name, tensor in self.scene.canonical.tensors().items():
-            tensor.requires_grad_(name in GAUSSIAN_RATES or name == "means")
+            tensor.requires_grad_(name == "means" or name in self.gaussian_rates)
+
+    @property
+    def gaussian_rates(self) -> dict[str, float]:
+        """Adam's learning rate of every canonical tensor but the means, by name."""
+        extras = self.scene.deformation.extra_rates
+        return GAUSSIAN_RATES | {f"extras.{name}": rate for name, rate in extras.items()}
 
     @property
     def progress(self) -> float:
@@ -103,7 +108,7 @@ class Session:
         if not math.isfinite(float(total.detach())):
             raise NeecoError(
                 f"training: the loss became {float(total.detach())} at iteration {self.iteration}, frame {frame.name}; "
-                "resume from the last checkpoint with another --seed, or run `neeco check`"
+                "run `neeco check` on the capture, or train anew with another --seed (the last checkpoint is kept)"
             )
         total.backward()
         self._learn(rendering, index, progress)
@@ -157,8 +162,9 @@ class Session:
         assert gradient is not None
         self.statistics.record(gradient, self.frames[index].camera.width, self.frames[index].camera.height)
         scene, fall = self.scene, decayed(1.0, progress)
+        gaussian_rates = self.gaussian_rates
         for name, tensor in scene.canonical.tensors().items():
-            rate = POSITION_RATE * self.extent * fall if name == "means" else GAUSSIAN_RATES.get(name)
+            rate = POSITION_RATE * self.extent * fall if name == "means" else gaussian_rates.get(name)
             if rate is not None:
                 self.adam.step(name, tensor, rate)
         rates = scene.deformation.learning_rates(self.iteration)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,14 +16,15 @@ from neeco.capture import Capture, read_capture
 from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.files import write_text
-from neeco.scene.deformations.nps import NPS, mark_moving
+from neeco.files import new_folder, write_text
 from neeco.scene.io import save_scene
+from neeco.scene.methods import deformation_class
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import new_session
 from neeco.training.finish import finish_instruments, place_wrists
 from neeco.training.initial import initial_scene
+from neeco.training.interrupt import StopRequest, hearing_stops
 from neeco.training.run import config_from_dict, read_config, write_config
 from neeco.training.session import Session
 
@@ -61,45 +64,78 @@ def train(
     interrupted run under the settings it was started with. The same seed gives the same scene, interrupted or not,
     unless `minutes` is set. Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without
     `resume`, or a loss that is no number.
+
+    SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way
+    KeyboardInterrupt says how to go on. What fails before the first step leaves no run folder behind.
     """
     capture_path, output = Path(capture_path), Path(output)
-    resuming = resume and checkpoint_path(output).exists()
     if resume and (output / "config.yaml").exists():
-        stored = read_config(output)
-        config = config_from_dict(stored)
-        if Path(stored["capture"]) != capture_path.absolute():
-            raise NeecoError(
-                f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
-            )
+        config = _stored_config(output, capture_path)
         if (output / "scene.safetensors").exists():
             return output
-    elif output.exists() and any(output.iterdir()):
+    elif output.is_dir() and any(output.iterdir()):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
     capture, frames = _open_capture(capture_path, config)
+    log = _Log(output / "metrics.jsonl", progress)
+    go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
+    with new_folder(output), _torch_threads(config.method):
+        try:
+            session = _begin(capture, frames, output, config, resume, log)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("before the first step; run the same command again") from None
+        write_config(output, capture_path, config)
+        with hearing_stops() as stop:
+            _run(session, output, log, stop, go_on)
+        try:
+            log.note("finishing: labels, shaft, diagnostics")
+            _finish(session)
+            save_scene(session.scene, output / "scene.safetensors")
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"while finishing; {go_on}") from None
+    return output
+
+
+def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
+    """The settings that the run in `output` was started with. Raises NeecoError when it was started on another
+    capture."""
+    stored = read_config(output)
+    if Path(stored["capture"]) != capture_path.absolute():
+        raise NeecoError(
+            f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
+        )
+    return config_from_dict(stored)
+
+
+@contextmanager
+def _torch_threads(method: str) -> Iterator[None]:
+    """One thread for torch's small operations, which only wait for each other: the kernels have their own threads."""
+    before = torch.get_num_threads()
+    if not deformation_class(method).large_operations:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _begin(
+    capture: Capture, frames: tuple[Frame, ...], output: Path, config: TrainConfig, resume: bool, log: _Log
+) -> Session:
+    """The session before its first step, or where the checkpoint in `output` left it."""
     images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
     masks = [frame.load_mask() for frame in frames]
-    write_config(output, capture_path, config)
-    log = _Log(output / "metrics.jsonl", progress)
     started = time.monotonic()
     torch.manual_seed(config.seed)
-    if config.method != "neeco":
-        # the kernels have their own threads; torch's small operations only wait for each other
-        torch.set_num_threads(1)
-    if resuming:
+    if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
         session = new_session(scene, frames, images, masks, config)
         restore_session(session, header, tensors)
-        log.keep_until(session.iteration)
-    else:
-        log.keep_until(0)  # interrupted before its first checkpoint, a resumed run begins again
+    else:  # interrupted before its first checkpoint, a resumed run begins again
         scene = initial_scene(capture, frames, images, masks, config, log.note)
         session = new_session(scene, frames, images, masks, config)
+    log.keep_until(session.iteration)
     session.seconds += time.monotonic() - started
-    _run(session, output, log)
-    log.note("finishing: labels, shaft, diagnostics")
-    _finish(session)
-    save_scene(session.scene, output / "scene.safetensors")
-    return output
+    return session
 
 
 def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame, ...]]:
@@ -111,13 +147,15 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
     frames = capture.split("train")
     if not frames:
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
-    if config.method == "neeco" and not capture.instruments:
-        raise NeecoError(f"{path}: no instrument states are recorded; method neeco needs them (3dgs does not)")
+    if deformation_class(config.method).needs_instruments and not capture.instruments:
+        raise NeecoError(
+            f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
+        )
     return capture, frames
 
 
-def _run(session: Session, output: Path, log: _Log) -> None:
-    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL."""
+def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
+    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
     losses, psnrs, phase = [], [], session.schedule.phase
     clock = time.monotonic()
     try:
@@ -136,11 +174,13 @@ def _run(session: Session, output: Path, log: _Log) -> None:
             if session.iteration % ROW_INTERVAL == 0:
                 log.row(session, sum(losses) / len(losses), sum(psnrs) / len(psnrs))
                 losses, psnrs = [], []
-            if session.iteration % CHECKPOINT_INTERVAL == 0:
+            if stop.heard or session.iteration % CHECKPOINT_INTERVAL == 0:
                 save_checkpoint(session, output)
+            if stop.heard:
+                raise KeyboardInterrupt
+        save_checkpoint(session, output)
     except KeyboardInterrupt:
-        log.note(f"interrupted at iteration {session.iteration}; --resume continues from the last checkpoint")
-        raise
+        raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
 
 
 def _finish(session: Session) -> None:
@@ -152,8 +192,7 @@ def _finish(session: Session) -> None:
     scene.diagnostics["iterations"] = session.iteration
     scene.diagnostics["phase_2_began"] = session.schedule.phase_started
     scene.diagnostics["phase_2_forced"] = session.schedule.forced
-    if isinstance(scene.deformation, NPS) and scene.instruments:
-        scene.canonical = mark_moving(scene.deformation, scene.canonical, list(scene.recorded.states[::4]))
+    scene.canonical = scene.deformation.finished(scene.canonical, list(scene.recorded.states))
     finish_instruments(session)
 
 
@@ -176,8 +215,11 @@ class _Log:
             round(session.progress, 4),
         )
         entry = {key: value for key, value in vars(self.last).items() if key != "note"}
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(entry) + "\n")
+        try:
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(entry) + "\n")
+        except OSError as error:
+            raise NeecoError(f"{self.path}: cannot write: {error.strerror or error}") from error
         if self.progress:
             self.progress(self.last)
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
+from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.rotations import axis_angle_quat, quat_multiply, rotate_about
+
+PART_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that part weights are the softmax of
 
 
 class Hinges(nn.Module):
@@ -108,3 +112,20 @@ class Hinges(nn.Module):
         _, axis = self.hinge(joint)
         sign = torch.sign(axis[axis.abs().argmax()])
         return int((sign * self.gains[joint]).argmin())
+
+
+class Hinged(Protocol):
+    """What training asks of a deformation with hinges. Bodies: 0 tissue, then one per instrument in its own frame."""
+
+    @property
+    def logit_count(self) -> int:
+        """Columns of PART_LOGITS: the largest part count of any instrument."""
+        ...
+
+    def hinges_of(self, index: int) -> Hinges:
+        """The shaft and hinges of instrument `index`."""
+        ...
+
+    def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+        """Part weights [M, part_count] of one instrument's Gaussians."""
+        ...

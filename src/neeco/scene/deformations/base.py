@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,15 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations._hinges import Hinged
+
+# Plain 3DGS: no part of the paper's dynamic training adjustment acts.
+PLAIN_TRAINING: Mapping[str, Any] = {
+    "schedule.density": "off",
+    "schedule.sh_order": "off",
+    "schedule.frame_order": "off",
+    "schedule.compensation": "off",
+}
 
 
 @dataclass(frozen=True)
@@ -49,13 +59,20 @@ class Deltas:
 
 
 class Deformation(nn.Module):
-    """Base class. A method is one subclass in one file, with its own small config.
+    """Base class. A method is one subclass in one file, with its own small config, and one line in `scene/methods.py`.
 
+    It is made as `Method(instruments, **config)`. What training must know of a method, it asks here:
     `label_names` lists (instrument, part) for each label column; a deformation that cannot tell parts returns one part,
-    "instrument", per instrument.
+    "instrument", per instrument. `training_defaults` are fields of the training config that differ from the paper's,
+    dotted names as in `neeco train --set`. `extra_rates` are Adam's learning rates of the per-Gaussian parameters that
+    the method adds (`CanonicalGaussians.extras`) by name; an extra without one is not learned.
     """
 
     label_names: tuple[tuple[str, str], ...] = ()
+    training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
+    extra_rates: ClassVar[Mapping[str, float]] = {}
+    needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
+    large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""
@@ -64,6 +81,18 @@ class Deformation(nn.Module):
     def config(self) -> dict[str, Any]:
         """JSON-able keyword arguments that make an equal deformation."""
         return {}
+
+    @property
+    def hinged(self) -> Hinged | None:
+        """The shafts and hinges whose place training is to look for; None: the scene starts from the tissue alone."""
+        return None
+
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Take scales from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
+
+    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+        """`canonical` with whatever the method finds out once learning has ended, from the recorded states."""
+        return canonical
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         """Soft membership [N, len(label_names)] in [0, 1]; what is left to 1 is tissue."""

@@ -6,21 +6,47 @@ parts about hinges that are learned from the images, with soft part assignment p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._hinges import Hinges
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation, Posed, state_of
+from neeco.scene.deformations._hinges import PART_LOGITS, Hinges
+from neeco.scene.deformations.base import (
+    PLAIN_TRAINING,
+    UNPERTURBED,
+    Deformation,
+    Deltas,
+    Perturbation,
+    Posed,
+    state_of,
+)
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
-PART_LOGITS = "part_logits"
 HINGE_START = 600  # iteration
 
 
 class Kinematic(Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
+
+    training_defaults: ClassVar[Mapping[str, Any]] = {
+        **PLAIN_TRAINING,
+        "schedule.sh_interval": 500,
+        "schedule.plain_density.interval": 200,
+        "schedule.plain_density.opacity_reset": 0,
+        "schedule.plain_density.threshold": 2e-4,
+        "refine.latency": True,
+        "refine.frame_poses": True,
+        "density_start": 400,
+        "density_stop": 0.7,
+        "opacity_penalty": 0.002,
+        "label_sharpness": 0.02,
+        "shaft_roll": 0.5,
+    }
+    extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
 
     def __init__(self, instruments: tuple[Instrument, ...]) -> None:
         super().__init__()
@@ -29,6 +55,10 @@ class Kinematic(Deformation):
         self.label_names = tuple(
             (instrument.name, part) for instrument in instruments for part in part_names(tuple(instrument.joints))
         )
+
+    @property
+    def hinged(self) -> Kinematic:
+        return self
 
     def hinges_of(self, index: int) -> Hinges:
         """The shaft and hinges of instrument `index`."""

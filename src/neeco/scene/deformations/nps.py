@@ -9,7 +9,8 @@ detached (Deformable-3DGS).
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +42,10 @@ class NPS(Deformation):
     `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
     evaluation when no gradient is wanted.
     """
+
+    training_defaults: ClassVar[Mapping[str, Any]] = {}  # the paper's
+    needs_instruments = True
+    large_operations = True
 
     state_center: Tensor
     state_halfwidth: Tensor
@@ -180,6 +185,9 @@ class NPS(Deformation):
         if MEMBERSHIP not in canonical.extras or not self.label_names:
             return torch.zeros(len(canonical), len(self.label_names))
         return canonical.extras[MEMBERSHIP][:, None]
+
+    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         return {name: 8e-4 for name, _ in self.named_parameters()}

@@ -1,0 +1,130 @@
+"""A data set that comes to nothing leaves nothing; what was drawn before a failure is kept and can be gone on from."""
+
+import errno
+import json
+import os
+from dataclasses import replace
+
+import pytest
+
+import neeco.files
+from neeco.errors import NeecoError
+from neeco.synthesis import dataset
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.progress import counting
+from neeco.synthesis.settings import Settings
+from neeco.synthesis.statefile import state_to_json
+
+SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, tries=3)
+
+
+def contents(folder) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def refusing(reasons, monkeypatch) -> None:
+    """Judge drawn states by `reasons` in turn; None accepts."""
+    given = iter(reasons)
+    monkeypatch.setattr(dataset.Acceptance, "why_refused", lambda self, scene, drawing: next(given))
+
+
+def behind_the_camera(state, path) -> str:
+    path.write_text(json.dumps(state_to_json(state(z=-50.0))) + "\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize(
+    ("states", "told"),
+    [
+        ("nowhere.jsonl", "nowhere.jsonl: no such file; --states takes"),
+        ("bad.jsonl", "bad.jsonl: line 1: not valid JSON"),
+        ("behind.jsonl", "behind.jsonl: every state was refused .*leaves the image"),
+        ("inside", "image 0: no acceptable state in 3 tries"),
+    ],
+)
+def test_a_refused_data_set_leaves_the_disk_as_it_was(there, resume, states, told, run, tmp_path, state, monkeypatch):
+    (tmp_path / "bad.jsonl").write_text("{\n")
+    behind_the_camera(state, tmp_path / "behind.jsonl")
+    if states == "inside":
+        refusing(["leaves the image"] * 3, monkeypatch)
+    output = tmp_path / "new" / "dataset"
+    if there:
+        output.mkdir(parents=True)
+    given = states if states == "inside" else str(tmp_path / states)
+    with pytest.raises(NeecoError, match=told):
+        synthesize(run, output, replace(SETTINGS, states=given), resume=resume)
+    if there:
+        assert list(output.iterdir()) == []
+    else:
+        assert not output.parent.exists()
+
+
+def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tmp_path, monkeypatch):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    synthesize(run, whole, SETTINGS)
+    with monkeypatch.context() as patched:
+        refusing([None, None, *["leaves the image"] * 3], patched)
+        with pytest.raises(NeecoError, match=r"image 2: no acceptable state"):
+            synthesize(run, cut, SETTINGS)
+    info = json.loads((cut / "dataset.json").read_text())
+    assert (info["complete"], info["images"]) == (False, 2)
+    assert len((cut / "states.jsonl").read_text().splitlines()) == 2
+    assert synthesize(run, cut, replace(SETTINGS, tries=50), resume=True).made_now == 2
+    assert contents(cut / "images") == contents(whole / "images")
+
+
+def test_a_refused_resume_changes_nothing(run, tmp_path):
+    output = tmp_path / "dataset"
+    synthesize(run, output, SETTINGS)
+    before = contents(output)
+    for settings, told in (
+        (replace(SETTINGS, seed=4), "settings.seed: begun with 3, now 4"),
+        (replace(SETTINGS, states="nowhere.jsonl"), "nowhere.jsonl: no such file; --states takes"),
+        (replace(SETTINGS, count=2), "--count: .* holds more than 2 images already"),
+    ):
+        with pytest.raises(NeecoError, match=told):
+            synthesize(run, output, settings, resume=True)
+        assert contents(output) == before
+
+
+def test_an_interrupted_resume_forgets_no_image(run, tmp_path):
+    def interrupt(done):
+        raise KeyboardInterrupt
+
+    output = tmp_path / "dataset"
+    synthesize(run, output, SETTINGS)
+    with pytest.raises(KeyboardInterrupt):
+        synthesize(run, output, replace(SETTINGS, count=6), resume=True, on_progress=interrupt)
+    assert json.loads((output / "dataset.json").read_text())["images"] == 4
+    assert len((output / "states.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monkeypatch):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    synthesize(run, whole, SETTINGS)
+    with monkeypatch.context() as patched:
+        real = os.fsync
+        left = iter(range(8))  # dataset.json, one image's five files, and two of the next's
+
+        def full(descriptor: int) -> None:
+            if next(left, None) is None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            real(descriptor)
+
+        patched.setattr(neeco.files.os, "fsync", full)
+        with pytest.raises(NeecoError, match=r"000001.*: cannot write: No space left on device"):
+            synthesize(run, cut, SETTINGS)
+    assert not [path for path in cut.rglob(".*") if path.is_file()]  # no half-written file
+    assert synthesize(run, cut, SETTINGS, resume=True).made_now == 3
+    assert contents(cut) == contents(whole)
+
+
+def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
+    with pytest.raises(NeecoError), counting("synthesize", 3):
+        raise NeecoError("bad input")
+    assert capsys.readouterr().err == ""
+    with counting("synthesize", 3) as advance:
+        advance(3)
+    assert "3/3" in capsys.readouterr().err

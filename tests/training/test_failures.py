@@ -1,0 +1,187 @@
+"""What goes wrong while training is told in one line, and what was done is kept."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from capture_files import write_capture
+from PIL import Image
+
+import neeco.files
+import neeco.training.session
+from neeco.cli import main
+from neeco.errors import NeecoError
+from neeco.training import train as module
+from neeco.training.checkpoint import checkpoint_path, read_checkpoint
+from neeco.training.options import training_config
+from neeco.training.run import load_run
+from neeco.training.train import ProgressRow, train
+
+CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write_capture(tmp_path / "capture")
+
+
+@pytest.fixture(autouse=True)
+def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ROW_INTERVAL", 5)
+    monkeypatch.setattr(module, "CHECKPOINT_INTERVAL", 20)
+
+
+def hidden_files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".*") if path.is_file()]
+
+
+@pytest.mark.parametrize(("whole_files", "named"), [(0, "config.yaml"), (2, "session.safetensors")])
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(
+    whole_files: int,
+    named: str,
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole = train(capture, tmp_path / "whole", CONFIG)
+    words = ["train", str(capture), "--output", str(tmp_path / "cut"), "--method", "3dgs", "--iterations", "60"]
+    words += ["--set", "density_start=10", "--set", "density_stop=0.9"]
+    with monkeypatch.context() as patched:
+        real, left = os.fsync, iter(range(whole_files))
+
+        def full(descriptor: int) -> None:
+            if next(left, None) is None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            real(descriptor)
+
+        patched.setattr(neeco.files.os, "fsync", full)
+        assert main(words) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told.startswith("neeco: error: ")
+    assert named in told
+    assert "No space left on device" in told
+    if whole_files == 0:
+        assert not (tmp_path / "cut").exists()
+        return
+    assert hidden_files(tmp_path / "cut") == []
+    assert read_checkpoint(tmp_path / "cut")[1]["iteration"] == 20  # the one before
+    assert main([*words, "--resume"]) == 0
+    assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+
+
+def test_metrics_that_cannot_be_written_are_told_with_their_file(capture: Path, tmp_path: Path) -> None:
+    def block(row: ProgressRow) -> None:
+        if row.iteration == 5:
+            (tmp_path / "run" / "metrics.jsonl").unlink()
+            (tmp_path / "run" / "metrics.jsonl").mkdir()
+
+    with pytest.raises(NeecoError, match=r"metrics.jsonl: cannot write: Is a directory"):
+        train(capture, tmp_path / "run", CONFIG, progress=block)
+
+
+def test_a_loss_that_becomes_no_number_keeps_the_last_checkpoint(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = neeco.training.session.photometric_loss, iter(range(100))
+
+    def breaking(*args: object, **options: object) -> torch.Tensor:
+        return real(*args, **options) * (float("nan") if next(calls) == 49 else 1.0)
+
+    monkeypatch.setattr(neeco.training.session, "photometric_loss", breaking)
+    with pytest.raises(NeecoError, match=r"loss became nan at iteration 50, frame 0000.*another --seed"):
+        train(capture, tmp_path / "run", CONFIG)
+    assert read_checkpoint(tmp_path / "run")[1]["iteration"] == 40
+    assert not (tmp_path / "run" / "scene.safetensors").exists()
+    assert hidden_files(tmp_path / "run") == []
+
+
+def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tmp_path: Path) -> None:
+    run = train(capture, tmp_path / "run", CONFIG)
+    config = (run / "config.yaml").read_text()
+
+    (run / "config.yaml").write_text(config.replace("neeco-run/1", "neeco-run/9"))
+    for opened in (lambda: load_run(run), lambda: train(capture, run, CONFIG, resume=True)):
+        with pytest.raises(NeecoError, match=r"config.yaml: schema is 'neeco-run/9', this version reads 'neeco-run/1'"):
+            opened()
+
+    (run / "config.yaml").write_text(config + "warp_drive: true\n")
+    with pytest.raises(NeecoError, match=r"config.yaml: .*warp_drive"):
+        train(capture, run, CONFIG, resume=True)
+
+    (run / "config.yaml").write_text(config)
+    scene = (run / "scene.safetensors").read_bytes()
+    (run / "scene.safetensors").write_bytes(scene.replace(b"neeco-scene/1", b"neeco-scene/9"))
+    with pytest.raises(NeecoError, match=r"scene.safetensors: schema 'neeco-scene/9', this version reads"):
+        load_run(run)
+
+    (run / "scene.safetensors").unlink()
+    stored = checkpoint_path(run).read_bytes()
+    checkpoint_path(run).write_bytes(stored.replace(b"neeco-checkpoint/1", b"neeco-checkpoint/9"))
+    with pytest.raises(
+        NeecoError, match=r"session.safetensors: cannot resume from this checkpoint .*neeco-checkpoint/9"
+    ):
+        train(capture, run, CONFIG, resume=True)
+    checkpoint_path(run).write_bytes(stored[: len(stored) // 2])
+    with pytest.raises(NeecoError, match=r"session.safetensors: cannot resume from this checkpoint"):
+        train(capture, run, CONFIG, resume=True)
+
+
+def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = module.check_capture
+
+    def check_then_break(*args: object):
+        problems = real(*args)
+        (capture / "images/000003.png").write_bytes(b"a disk gone bad")
+        return problems
+
+    monkeypatch.setattr(module, "check_capture", check_then_break)
+    assert main(["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs"]) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len(told) == 1
+    assert "000003.png" in told[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_frame_that_becomes_unreadable_mid_run_does_no_harm(capture: Path, tmp_path: Path) -> None:
+    whole = train(capture, tmp_path / "whole", CONFIG)
+
+    def remove(row: ProgressRow) -> None:
+        (capture / "images/000003.png").unlink(missing_ok=True)
+
+    run = train(capture, tmp_path / "run", CONFIG, progress=remove)
+    assert (run / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_what_a_loss_mask_hides_teaches_nothing(seen: bool, tmp_path: Path) -> None:
+    """Pixels under the mask are repainted: the scene stays the same. Repainted beside the mask: it changes."""
+    scenes = []
+    for name in ("a", "b"):
+        capture = write_capture(tmp_path / name)
+        document = json.loads((capture / "transforms.json").read_text())
+        mask = np.full((24, 32), 255, np.uint8)
+        mask[:8, :8] = 0
+        for frame in document["frames"]:
+            path = capture / frame["file_path"]
+            frame["mask_path"] = f"masks/{path.name}"
+            (capture / "masks").mkdir(exist_ok=True)
+            Image.fromarray(mask).save(capture / frame["mask_path"])
+            if name == "b":
+                pixels = np.array(Image.open(path))
+                pixels[:8, :8] = 255 - pixels[:8, :8]
+                if seen:
+                    pixels[10:14, 10:14] = 255 - pixels[10:14, 10:14]
+                Image.fromarray(pixels).save(path)
+        (capture / "transforms.json").write_text(json.dumps(document))
+        run = train(capture, tmp_path / f"run-{name}", CONFIG)
+        scenes.append((run / "scene.safetensors").read_bytes())
+    assert (scenes[0] != scenes[1]) is seen

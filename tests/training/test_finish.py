@@ -1,0 +1,177 @@
+"""After learning: joints are judged by what their readings explain, wrists found by colour, shafts prolonged."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
+
+from neeco.capture import read_capture
+from neeco.raster import rasterize
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.deformations._hinges import PART_LOGITS, Hinges
+from neeco.scene.methods import make_deformation
+from neeco.scene.scene import Recording, Scene
+from neeco.training.config import TrainConfig
+from neeco.training.discovery import new_session
+from neeco.training.extend import extend_shaft, shaft_coverage
+from neeco.training.finish import finish_instruments, place_wrists
+from neeco.training.session import Session
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    """The grasper's capture with the scene that it was drawn from: nothing is left to learn."""
+    capture = read_capture(write_grasper(tmp_path / "capture", frames=18))
+    frames = capture.split("train")
+    points = capture.points
+    wall = seed_gaussians(
+        torch.from_numpy(points.positions), torch.from_numpy(points.colors), torch.full((900,), 3.5), opacity=0.95
+    )
+    body, colors = grasper_body(0.0)
+    grasper = seed_gaussians(body, colors, torch.full((len(body),), 1.3), opacity=0.95)
+    logits = torch.zeros(len(body), 3)
+    logits[:-30, 0] = logits[-30:-15, 1] = logits[-15:, 2] = 30.0
+    canonical = join_bodies(
+        [wall.with_extras(**{PART_LOGITS: torch.zeros(900, 3)}), grasper.with_extras(**{PART_LOGITS: logits})]
+    )
+    states, cameras = tuple(f.state for f in frames), tuple(f.camera for f in frames)
+    recorded = Recording(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
+    deformation = make_deformation("kinematic", capture.instruments, {})
+    scene = Scene("kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
+    hinges = deformation.hinged.hinges_of(0)
+    with torch.no_grad():
+        hinges.hinge_depth.fill_(PIVOT_MM)
+        hinges.wrist_start.fill_(-20.0)
+    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
+    session = new_session(scene, frames, images, [None] * len(frames), TrainConfig(method="kinematic"))
+    scene.requires_grad_(False)
+    return session
+
+
+def hinges_of(session: Session) -> Hinges:
+    return session.scene.deformation.hinged.hinges_of(0)
+
+
+def verdict(session: Session) -> dict:
+    finish_instruments(session)
+    return session.scene.diagnostics["joints"]["grasper.jaw_angle"]
+
+
+def test_a_true_hinge_is_found(session: Session) -> None:
+    told = verdict(session)
+    assert told["found"] is True
+    assert told["explained"] > 0.8
+    assert told["pivot_mm"] == pytest.approx([0, 0, PIVOT_MM], abs=1e-3)
+    assert told["axis"] == pytest.approx([1, 0, 0], abs=1e-4)
+    assert told["verdict"].startswith("found: the reading explains")
+
+
+@pytest.mark.parametrize("wrong", ["across", "still"])
+def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: Session) -> None:
+    with torch.no_grad():
+        if wrong == "across":
+            hinges_of(session).hinge_angle.fill_(math.pi / 2)
+        else:
+            hinges_of(session).scale.fill_(0.0)
+    told = verdict(session)
+    assert told["found"] is False
+    assert "NOT found" in told["verdict"]
+
+
+def test_masked_pixels_do_not_judge_a_hinge(session: Session) -> None:
+    before = verdict(session)["explained"]
+    for image in session.images:
+        image[:, :40] = 255  # a text overlay, say
+    spoilt = verdict(session)["explained"]
+    session.masks = [torch.arange(80).expand(64, 80) >= 40 for _ in session.images]
+    assert verdict(session)["explained"] > 0.7 > spoilt
+    assert before > 0.7
+
+
+def test_the_wrist_begins_where_the_colour_changes(session: Session) -> None:
+    place_wrists(session)
+    assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
+    finish_instruments(session)
+    assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
+
+
+def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_round(session: Session) -> None:
+    """From -10 mm on the shaft becomes a flat blade, which shows when it is spun."""
+    canonical = session.scene.canonical.map(lambda tensor: tensor.detach().clone())
+    rows = canonical.body(1)
+    canonical.sh_dc[rows] = 1.0
+    flat = torch.zeros(len(canonical), dtype=torch.bool)
+    flat[rows] = canonical.means[rows][:, 2] > -10
+    canonical.means[flat] *= torch.tensor([3.0, 0.05, 1.0])
+    session.scene.canonical = canonical
+    session.images = [
+        (rasterize(session.scene.at(frame.state), frame.camera).color * 255).round().to(torch.uint8)
+        for frame in session.frames
+    ]
+    place_wrists(session)
+    assert float(hinges_of(session).wrist_start) == pytest.approx(-10, abs=4)
+
+
+def test_the_extent_is_where_the_solid_is(session: Session) -> None:
+    finish_instruments(session)
+    rear, tip = hinges_of(session).extent.tolist()
+    assert rear == pytest.approx(-30, abs=3)
+    assert tip == pytest.approx(20, abs=3)
+
+
+def shaft_of(length: float) -> tuple[CanonicalGaussians, Hinges]:
+    """Ten tissue Gaussians, a tube of radius 2 mm along z from -length to 0, and ten Gaussians of another body."""
+    along = torch.arange(-length, 0, 0.5).repeat_interleave(4)
+    around = torch.tensor([0.0, 1.0, 2.0, 3.0]).repeat(len(along) // 4) * (math.pi / 2)
+    tube = torch.stack([2 * around.cos(), 2 * around.sin(), along], -1)
+    bodies = [torch.zeros(10, 3), tube, torch.ones(10, 3)]
+    canonical = join_bodies(
+        [seed_gaussians(p, torch.full((len(p), 3), 0.4), torch.ones(len(p)), opacity=0.9) for p in bodies]
+    )
+    hinges = Hinges(("jaw",))
+    with torch.no_grad():
+        hinges.hinge_depth.fill_(2.0)
+        hinges.wrist_start.fill_(0.0)
+    return canonical, hinges
+
+
+def recorded_at(session: Session, shift_mm: float) -> Recording:
+    """The session's recording with each camera looking across the shaft, whose rear leaves the image at `shift_mm`."""
+    from neeco.capture.model import Camera, InstrumentState, State
+
+    camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 50.0, 50.0, 100, 100)
+    pose = torch.eye(4, dtype=torch.float64)
+    # the shaft's z along the image's x; its origin so that z = shift_mm falls on the left border at 100 mm depth
+    pose[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    pose[:3, 3] = torch.tensor([-50.0 - shift_mm, 0.0, 100.0])
+    state = State({"tool": InstrumentState(pose, {"jaw": 0.1})})
+    return Recording(("a",) * 4, ("train",) * 4, (state,) * 4, (camera,) * 4)
+
+
+def test_coverage_counts_the_frames_that_hold_a_place(session: Session) -> None:
+    _, hinges = shaft_of(40)
+    seen = shaft_coverage(torch.tensor([-30.0, -21.0, -19.0, 0.0]), "tool", hinges, recorded_at(session, -20.0))
+    assert seen.tolist() == [0, 0, 1, 1]
+
+
+def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(session: Session) -> None:
+    canonical, hinges = shaft_of(40)
+    longer = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -20.0), 60.0)
+    assert longer.counts[0] == longer.counts[2] == 10
+    assert torch.equal(longer.means[longer.body(0)], canonical.means[:10])
+    assert torch.equal(longer.means[longer.body(2)], canonical.means[-10:])
+    tube = longer.means[longer.body(1)]
+    assert float(tube[:, 2].min()) < -70  # 20 mm seen and about 60 more
+    assert float(tube[:, :2].norm(dim=1).sub(2).abs().max()) < 1e-4  # straight on
+    gaps = tube[:, 2].unique().diff()
+    assert float(gaps.max()) < 1.01  # and without a gap
+
+
+def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: Session) -> None:
+    canonical, hinges = shaft_of(40)
+    same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -60.0), 60.0)
+    assert same is canonical

@@ -1,0 +1,149 @@
+"""Ctrl-C in training: the first keeps every iteration, the second stops at once, and going on changes no bit."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from capture_files import write_capture
+
+from neeco.cli import main
+from neeco.training import train as module
+from neeco.training.interrupt import hearing_stops
+from neeco.training.options import training_config
+from neeco.training.train import ProgressRow, train
+
+PROGRAM = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())"]
+CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write_capture(tmp_path / "capture")
+
+
+@pytest.fixture(autouse=True)
+def rows_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ROW_INTERVAL", 1)
+
+
+def signalling(stop: int, *signals: int):
+    """A progress callback that sends this process `signals` at iteration `stop`."""
+
+    def call(row: ProgressRow) -> None:
+        if row.iteration == stop and not row.note:
+            for number in signals:
+                os.kill(os.getpid(), number)
+
+    return call
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [1, 37])
+def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
+    number: int, stop: int, capture: Path, tmp_path: Path
+) -> None:
+    whole = train(capture, tmp_path / "whole", CONFIG)
+    handlers = signal.getsignal(signal.SIGINT), signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt, match=f"at iteration {stop}; go on with: neeco train .* --resume"):
+            train(capture, tmp_path / "cut", CONFIG, progress=signalling(stop, number))
+        assert signal.getsignal(signal.SIGINT) is handlers[0]
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, handlers[1])
+    steps: list[int] = []
+    train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
+    assert min(step for step in steps if step) == stop + 1  # nothing is done twice
+    assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+
+
+def test_a_second_ctrl_c_stops_at_once(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[int] = []
+    monkeypatch.setattr(module, "save_checkpoint", lambda session, run: saved.append(session.iteration))
+    with pytest.raises(KeyboardInterrupt, match="at iteration 12; go on with"):
+        train(capture, tmp_path / "run", CONFIG, progress=signalling(12, signal.SIGINT, signal.SIGINT))
+    assert saved == []
+
+
+def test_ctrl_c_while_finishing_loses_no_step(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    whole = train(capture, tmp_path / "whole", CONFIG)
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "finish_instruments", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
+            train(capture, tmp_path / "cut", CONFIG)
+    steps: list[int] = []
+    train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
+    assert set(steps) == {0}  # the note of finishing alone
+    assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+
+
+def test_ctrl_c_before_the_first_step_leaves_nothing(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "initial_scene", interrupted)
+    assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
+    assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_command_line_tells_how_to_go_on_and_going_on_works(capture: Path, tmp_path: Path) -> None:
+    words = ["train", str(capture), "--output", str(tmp_path / "my run"), "--method", "3dgs", "--iterations", "3000"]
+    started = subprocess.Popen([*PROGRAM, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    rows = tmp_path / "my run" / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (rows.exists() and rows.read_text()) and started.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    started.send_signal(signal.SIGINT)
+    _, told = started.communicate(timeout=60)
+    assert started.returncode == 130, told
+    assert "Traceback" not in told
+    last = told.strip().splitlines()[-1]
+    found = re.fullmatch(r"neeco: interrupted: at iteration (\d+); go on with: neeco (.*)", last)
+    assert found, told
+    assert int(found[1]) % module.CHECKPOINT_INTERVAL != 0  # so the checkpoint was written for this stop
+    assert shlex.split(found[2]) == ["train", str(capture), "--output", str(tmp_path / "my run"), "--resume"]
+    from neeco.training.checkpoint import read_checkpoint
+
+    assert read_checkpoint(tmp_path / "my run")[1]["iteration"] == int(found[1])
+
+
+def test_outside_the_main_thread_training_works_and_hears_nothing(capture: Path, tmp_path: Path) -> None:
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            train(capture, tmp_path / "run", CONFIG)
+        except BaseException as error:
+            failures.append(error)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    worker.join()
+    assert not failures
+    assert (tmp_path / "run" / "scene.safetensors").is_file()
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with hearing_stops() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+        assert not stop.heard
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,85 @@
+"""Method `kinematic` from photographs to a run folder: any image sizes, the same bytes, interrupted or not."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from capture_files import PIVOT_MM, write_grasper
+
+from neeco.capture import read_capture
+from neeco.evaluation.evaluate import evaluate_run
+from neeco.scene.deformations import kinematic
+from neeco.scene.io import load_scene
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.settings import Settings
+from neeco.training import discovery
+from neeco.training import train as module
+from neeco.training.evidence import gather_evidence
+from neeco.training.initial import initial_scene
+from neeco.training.options import training_config
+from neeco.training.run import load_run
+from neeco.training.train import ProgressRow, train
+
+SIZES = ((80, 64), (64, 72))
+# everything that a long run does happens within 40 iterations
+EARLY = ["density_start=10", "refine.start=8", "refine.cameras=true", "refine.registration=true", "shaft_roll_start=5"]
+CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
+    monkeypatch.setattr(kinematic, "HINGE_START", 12)
+    monkeypatch.setattr(module, "ROW_INTERVAL", 1)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_grasper(tmp_path_factory.mktemp("grasper") / "capture", sizes=SIZES)
+
+
+def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == 23 and not row.note:  # after the hinges began to move and density control acted
+            os.kill(os.getpid(), signal.SIGINT)
+
+    first, second = (train(capture, tmp_path / name, CONFIG) for name in ("first", "second"))
+    with pytest.raises(KeyboardInterrupt, match="at iteration 23"):
+        train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
+    cut = train(capture, tmp_path / "cut", CONFIG, resume=True)
+    assert (first / "scene.safetensors").read_bytes() == (second / "scene.safetensors").read_bytes()
+    assert (first / "scene.safetensors").read_bytes() == (cut / "scene.safetensors").read_bytes()
+
+    scene = load_scene(first / "scene.safetensors")
+    assert scene.diagnostics["instruments"]["grasper"]["moves_with_its_pose"]
+    pivot = scene.deformation.hinges_of(0).hinge(0)[0]
+    assert abs(float(pivot[2]) - PIVOT_MM) < 6
+
+    run = load_run(first)  # images of two sizes all the way
+    evaluation = evaluate_run(run, ("test",), align=True)
+    assert evaluation["given"]["test"]["frames"] == 4
+    synthesize(run, tmp_path / "dataset", Settings(count=4, tissue_check=False, min_share=1e-4))
+
+
+def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) -> None:
+    frames = read_capture(capture).split("train")
+    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
+    plain = training_config("3dgs", {"iterations": 1})
+    scene = initial_scene(read_capture(capture), frames, images, [None] * len(frames), plain, print)
+    together = gather_evidence(scene, frames, images, [None] * len(frames))
+    assert together.hits.shape == (len(frames), 72, 80)
+    points = torch.tensor([[0.0, 0.0, 60.0], [38.0, 0.0, 80.0], [0.0, 42.0, 80.0], [10.0, -20.0, 70.0]])
+    for index in range(4):
+        alone = gather_evidence(scene, frames[index : index + 1], images[index : index + 1], [None])
+        expected = alone.look_up_camera(points[None])
+        found = together.subset(torch.tensor([index])).look_up_camera(points[None])
+        assert torch.equal(found[1], expected[1])
+        assert torch.equal(found[0][found[1]], expected[0][expected[1]])
+    tall = next(k for k, frame in enumerate(frames) if frame.camera.width == 64)
+    x = 66 / 64 * 64 - 32  # 66 px from the left: within the common size, beyond this image's own
+    beyond = torch.tensor([[[x / 64 * 60.0, 0.0, 60.0]]])
+    assert not bool(together.subset(torch.tensor([tall])).look_up_camera(beyond)[1])
