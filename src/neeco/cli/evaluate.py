@@ -9,16 +9,16 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),
     ("SSIM", "ssim", "{:.3f}"),
     ("LPIPS", "lpips", "{:.3f}"),
-    ("in instrument", "psnr_instrument", "{:.2f}"),
+    ("PSNR in instrument", "psnr_instrument", "{:.2f}"),
     ("mask IoU", "mask_iou", "{:.3f}"),
-    ("covered PSNR", "psnr_covered", "{:.2f}"),
-    ("covered", "covered_fraction", "{:.1%}"),
+    ("PSNR of tissue seen", "psnr_covered", "{:.2f}"),
+    ("tissue seen", "covered_fraction", "{:.1%}"),
     ("FPS", "fps", "{:.1f}"),
     ("Gaussians", "num_gaussians", "{:,}"),
     ("frames", "frames", "{}"),
@@ -82,9 +82,16 @@ def _progress() -> Progress:
 
 
 def _table(evaluation: dict[str, Any]) -> Table:
-    table = Table("split", "poses", *(title for title, _, _ in COLUMNS))
-    for kind in ("given", "aligned"):
-        for split, numbers in evaluation.get(kind, {}).items():
-            cells = ["-" if numbers[key] is None else form.format(numbers[key]) for _, key, form in COLUMNS]
-            table.add_row(split, kind, *cells)
+    """One column per split and kind of pose, so that it fits a narrow terminal."""
+    from neeco.evaluation.mask_metrics import PART_SCORES
+
+    scored = [(kind, split) for kind in ("given", "aligned") for split in evaluation.get(kind, {})]
+    table = Table("poses", *(Column(f"{kind}\n{split}", justify="right") for kind, split in scored))
+    for title, key, form in COLUMNS:
+        values = [evaluation[kind][split][key] for kind, split in scored]
+        table.add_row(title, *("-" if value is None else form.format(value) for value in values))
+    for part in PART_SCORES:
+        values = [evaluation[kind][split]["part_iou"][part] for kind, split in scored]
+        if any(value is not None for value in values):
+            table.add_row(f"{part} IoU", *("-" if value is None else f"{value:.3f}" for value in values))
     return table

@@ -1,0 +1,21 @@
+"""The table of an evaluation is readable in a narrow terminal."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from neeco.cli.evaluate import COLUMNS, _table
+from neeco.evaluation.mask_metrics import PART_SCORES
+
+
+def test_no_number_is_cut_at_eighty_columns() -> None:
+    numbers = {key: 0.125 for _, key, _ in COLUMNS} | {"num_gaussians": 123456, "frames": 45, "psnr": 31.42}
+    numbers["part_iou"] = dict.fromkeys(PART_SCORES)
+    evaluation = {kind: {"test": numbers, "unseen": numbers} for kind in ("given", "aligned")}
+    out = io.StringIO()
+    Console(file=out, width=80).print(_table(evaluation))
+    assert out.getvalue().count("31.42") == 4
+    assert "…" not in out.getvalue()
+    assert "jaws" not in out.getvalue(), "parts without a number take no row"
