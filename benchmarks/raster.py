@@ -32,7 +32,7 @@ WORKLOADS = {
     "100k, 640x480": (100_000, 640, 480),
     "300k, 960x540": (300_000, 960, 540),
 }
-STAGES = ("project", "sort", "bin", "composite", "composite_backward", "project_backward")
+STAGES = ("project", "bin", "composite", "composite_backward", "project_backward")
 FLOPS_FORWARD, FLOPS_BACKWARD = 35, 60  # per Gaussian and pixel, 4 composited values
 Timings = dict[str, list[float]]
 clock: Callable[[], float] = time.perf_counter

@@ -84,7 +84,7 @@ Statistics& latest() {
 }
 
 nb::dict last_statistics() {
-    static const char* names[kStages] = {"project", "sort", "bin", "composite", "composite_backward", "project_backward"};
+    static const char* names[kStages] = {"project", "bin", "composite", "composite_backward", "project_backward"};
     nb::dict d;
     for (int i = 0; i < kStages; i++) d[names[i]] = latest().milliseconds[i];
     d["visible"] = latest().visible;
