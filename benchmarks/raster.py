@@ -25,7 +25,7 @@ from neeco.raster.cpu import last_statistics
 from neeco.raster.losses import PhotometricTarget, photometric_loss
 from neeco.raster.optimizer import adam_step
 from neeco.raster.reference import Projection, blend_weights, camera_from_world, project
-from neeco.raster.threads import set_threads, simd
+from neeco.raster.threads import keep_freed_memory, set_threads, simd
 
 WORKLOADS = {
     "20k, 256x192": (20_000, 256, 192),
@@ -265,6 +265,7 @@ def main() -> None:
         global clock
         clock = time.thread_time
     set_threads(arguments.threads)
+    keep_freed_memory()  # as training does
     flops = peak_flops(arguments.threads)
     print(f"{simd()}, {arguments.threads} threads")
     for name in arguments.workload or WORKLOADS:

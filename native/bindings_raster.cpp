@@ -177,6 +177,7 @@ void bind_raster(nb::module_& m) {
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());
     m.def("last_statistics", &last_statistics);
+    m.def("keep_freed_memory", &keep_freed_memory);
     m.def("thread_count", &thread_count);
     m.def("set_thread_count", &set_thread_count);
     m.def("simd", [] { return std::string(kernels().name); });

@@ -12,6 +12,9 @@ namespace neeco {
 // Aligned for the widest vectors; large blocks ask for huge pages. Freed by std::free. Throws std::bad_alloc.
 void* allocate(size_t bytes);
 
+// Lets this process keep what it frees (up to 1 GiB) for its next allocations; false where the system has no such setting.
+bool keep_freed_memory();
+
 // Memory that is reused from frame to frame, not initialised.
 template <class T>
 class Buffer {

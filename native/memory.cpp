@@ -4,6 +4,9 @@
 #ifdef __linux__
 #include <sys/mman.h>
 #endif
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
 
 #include "frame.hpp"
 
@@ -21,6 +24,15 @@ void* allocate(size_t bytes) {
     if (large) madvise(memory, (bytes + alignment - 1) / alignment * alignment, MADV_HUGEPAGE);
 #endif
     return memory;
+}
+
+bool keep_freed_memory() {
+#ifdef __GLIBC__
+    constexpr int largest = 32 << 20;  // bytes; glibc takes no more as the size from which blocks are mapped one by one
+    return mallopt(M_MMAP_THRESHOLD, largest) != 0 && mallopt(M_TRIM_THRESHOLD, 1 << 30) != 0;
+#else
+    return false;
+#endif
 }
 
 template class Buffer<uint32_t>;

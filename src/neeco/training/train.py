@@ -15,6 +15,7 @@ from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import write_text
+from neeco.raster.threads import keep_freed_memory
 from neeco.scene.deformations.nps import NPS, mark_moving
 from neeco.scene.io import save_scene
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
@@ -82,6 +83,7 @@ def train(
     log = _Log(output / "metrics.jsonl", progress)
     started = time.monotonic()
     torch.manual_seed(config.seed)
+    keep_freed_memory()
     if config.method != "neeco":
         # the kernels have their own threads; torch's small operations only wait for each other
         torch.set_num_threads(1)
