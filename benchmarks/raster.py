@@ -25,14 +25,14 @@ from neeco.raster.cpu import last_statistics
 from neeco.raster.losses import PhotometricTarget, photometric_loss
 from neeco.raster.optimizer import adam_step
 from neeco.raster.reference import Projection, blend_weights, camera_from_world, project
-from neeco.raster.threads import set_threads, simd
+from neeco.raster.threads import keep_freed_memory, set_threads, simd
 
 WORKLOADS = {
     "20k, 256x192": (20_000, 256, 192),
     "100k, 640x480": (100_000, 640, 480),
     "300k, 960x540": (300_000, 960, 540),
 }
-STAGES = ("project", "sort", "bin", "composite", "composite_backward", "project_backward")
+STAGES = ("project", "bin", "composite", "composite_backward", "project_backward")
 FLOPS_FORWARD, FLOPS_BACKWARD = 35, 60  # per Gaussian and pixel, 4 composited values
 Timings = dict[str, list[float]]
 clock: Callable[[], float] = time.perf_counter
@@ -265,6 +265,7 @@ def main() -> None:
         global clock
         clock = time.thread_time
     set_threads(arguments.threads)
+    keep_freed_memory()  # as training does
     flops = peak_flops(arguments.threads)
     print(f"{simd()}, {arguments.threads} threads")
     for name in arguments.workload or WORKLOADS:

@@ -84,7 +84,7 @@ Statistics& latest() {
 }
 
 nb::dict last_statistics() {
-    static const char* names[kStages] = {"project", "sort", "bin", "composite", "composite_backward", "project_backward"};
+    static const char* names[kStages] = {"project", "bin", "composite", "composite_backward", "project_backward"};
     nb::dict d;
     for (int i = 0; i < kStages; i++) d[names[i]] = latest().milliseconds[i];
     d["visible"] = latest().visible;
@@ -177,6 +177,7 @@ void bind_raster(nb::module_& m) {
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());
     m.def("last_statistics", &last_statistics);
+    m.def("keep_freed_memory", &keep_freed_memory);
     m.def("thread_count", &thread_count);
     m.def("set_thread_count", &set_thread_count);
     m.def("simd", [] { return std::string(kernels().name); });

@@ -4,13 +4,18 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
-#include <new>
 #include <utility>
 #include <vector>
 
 namespace neeco {
 
-// Memory that is reused from frame to frame, not initialised, aligned for the widest vectors.
+// Aligned for the widest vectors; large blocks ask for huge pages. Freed by std::free. Throws std::bad_alloc.
+void* allocate(size_t bytes);
+
+// Lets this process keep what it frees (up to 1 GiB) for its next allocations; false where the system has no such setting.
+bool keep_freed_memory();
+
+// Memory that is reused from frame to frame, not initialised.
 template <class T>
 class Buffer {
 public:
@@ -32,7 +37,9 @@ public:
     T* reserve(size_t n) {
         if (n > capacity_) {
             std::free(data_);
-            data_ = allocate(n + n / 4 + 64);
+            data_ = nullptr;
+            capacity_ = 0;
+            replace(n + n / 4 + 64);
         }
         return data_;
     }
@@ -40,9 +47,9 @@ public:
     // The same, contents kept.
     T* grow(size_t n) {
         if (n > capacity_) {
-            const size_t kept = capacity_;
             T* old = data_;
-            data_ = allocate(2 * n + 64);
+            const size_t kept = capacity_;
+            replace(2 * n + 64);
             for (size_t i = 0; i < kept; i++) data_[i] = old[i];
             std::free(old);
         }
@@ -53,27 +60,21 @@ public:
     size_t capacity() const { return capacity_; }
 
 private:
-    T* allocate(size_t n) {
-        const size_t bytes = (n * sizeof(T) + 63) / 64 * 64;
-        void* memory = nullptr;
-        if (posix_memalign(&memory, 64, bytes) != 0) {
-            data_ = nullptr;
-            capacity_ = 0;
-            throw std::bad_alloc();
-        }
+    void replace(size_t n) {
+        data_ = static_cast<T*>(allocate(n * sizeof(T)));
         capacity_ = n;
-        return static_cast<T*>(memory);
     }
 
     T* data_ = nullptr;
     size_t capacity_ = 0;
 };
 
-// Compiled once, in binning.cpp: never into the kernels' objects, whose instructions not every machine has.
+// Compiled once, in memory.cpp: never into the kernels' objects, whose instructions not every machine has.
 extern template class Buffer<uint32_t>;
 extern template class Buffer<int32_t>;
 extern template class Buffer<float>;
 extern template class Buffer<double>;
+extern template class Buffer<uint64_t>;
 
 struct Camera {
     float rotation[9];        // camera_from_world, row major
@@ -151,33 +152,59 @@ struct Span {
     uint32_t first, count;
 };
 
-extern template class Buffer<Pair>;
-extern template class Buffer<Span>;
-
 constexpr int kChunkBits = 11;  // Gaussians are projected in chunks of 2048, whatever the number of threads
 constexpr int kChunk = 1 << kChunkBits;
 
 // A strip piece as projection emits it: tile | first row << 20 | last row << 26.
 constexpr int kTileBits = 20, kRowBits = 6;
 
-struct Chunk {
-    Buffer<uint32_t> pieces;
-    uint32_t piece_count = 0, visible = 0, base = 0;
-    uint32_t lowest_key = 0, highest_key = 0;
+constexpr int kMostBands = 16;
+
+// A visible Gaussian; the key is its depth's bits, which sort like the depth.
+struct Visible {
+    uint32_t key, gaussian;
 };
 
-enum Stage { kProject, kSort, kBin, kComposite, kCompositeBackward, kProjectBackward, kStages };
+// The pieces of one Gaussian in one band: `count` of them from `first` on in its chunk's (later, its band's) list.
+struct Run {
+    uint32_t key, gaussian, first, count;
+};
+
+// 2048 Gaussians as projection leaves them.
+struct Chunk {
+    Buffer<uint32_t> pieces;
+    Buffer<Run> loose, runs;                 // in Gaussian order; the same, band by band
+    uint32_t run_start[kMostBands + 1] = {}, band_pieces[kMostBands] = {};
+    uint32_t piece_count = 0, visible = 0;
+    uint32_t base = 0;                       // slot of the first piece
+};
+
+// A band of neighbouring columns of tiles, which is sorted and listed on its own: small enough to stay in cache.
+struct Band {
+    Buffer<Run> runs;
+    Buffer<uint32_t> pieces, slots, next;    // slots: of each run's first piece; next: free place in each tile's list
+    Buffer<uint64_t> order, spare;
+};
+
+enum Stage { kProject, kBin, kComposite, kCompositeBackward, kProjectBackward, kStages };
+
+extern template class Buffer<Pair>;
+extern template class Buffer<Span>;
+extern template class Buffer<Visible>;
+extern template class Buffer<Run>;
 
 struct Frame {
     Camera camera;
     int count = 0, values = 0;               // Gaussians; composited values per pixel, padded to a compiled size
     int record_stride = 0;                   // floats
-    int tile_width = 0, tile_height = 0, tiles_x = 0, tiles_y = 0;
+    int tile_width = 0, tile_height = 0;
+    int tiles_x = 0, tiles_y = 0;            // tiles are numbered down the columns: x * tiles_y + y
+    int bands = 0, band_columns = 0;         // the last band may be narrower
     Buffer<float> records;
     Buffer<Span> spans;
     std::vector<Chunk> chunks;
-    Buffer<uint32_t> keys, order;            // visible Gaussians, near to far
-    Buffer<uint32_t> spare_keys, spare_order, histogram;
+    Band band[kMostBands];
+    Buffer<Visible> visible_list;            // chunk c's from c * kChunk on
     size_t visible = 0, pairs = 0;
     Buffer<uint32_t> tile_start, tile_order;
     Buffer<Pair> list;

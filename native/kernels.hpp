@@ -53,8 +53,10 @@ void select_kernels(const char* name);
 #define NEECO_VALUES(X) X(4) X(5) X(6) X(8) X(12) X(20) X(36)
 constexpr int kMostChannels = 32;
 
-// Sorts the visible Gaussians by depth (equal depths by index) and lists them per tile.
-void sort_by_depth(Frame& frame);
+// Groups the pieces of a chunk that was just projected by band.
+void group_by_band(Frame& frame, int chunk);
+
+// Lists the visible Gaussians per tile, near to far (equal depths by index).
 void list_per_tile(Frame& frame);
 
 void draw(Frame& frame, const Kernels& k, const GaussianInputs& in, const Images& out, bool keep);

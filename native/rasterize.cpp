@@ -1,4 +1,5 @@
 // The stages in order, timed.
+#include <algorithm>
 #include <chrono>
 #include <stdexcept>
 
@@ -36,12 +37,15 @@ void lay_out(Frame& f, const Kernels& k, const GaussianInputs& in) {
     f.tile_height = k.tile_height;
     f.tiles_x = (f.camera.width + k.tile_width - 1) / k.tile_width;
     f.tiles_y = (f.camera.height + k.tile_height - 1) / k.tile_height;
+    // Even numbers of bands, so that two threads share them well; about 16 columns, so that few Gaussians lie in two.
+    f.bands = std::min({2 * ((f.tiles_x + 31) / 32), kMostBands, f.tiles_x});
+    f.band_columns = (f.tiles_x + f.bands - 1) / f.bands;
+    f.bands = (f.tiles_x + f.band_columns - 1) / f.band_columns;
     if (static_cast<int64_t>(f.tiles_x) * f.tiles_y >= int64_t{1} << kTileBits) throw std::invalid_argument("image too large");
     const size_t pixels = static_cast<size_t>(f.camera.width) * f.camera.height, n = in.count;
     f.records.reserve(n * f.record_stride);
     f.spans.reserve(n);
-    f.spare_keys.reserve(n + kChunk);
-    f.spare_order.reserve(n + kChunk);
+    f.visible_list.reserve(n);
     f.transmittance.reserve(pixels);
     f.last.reserve(pixels);
     f.chunks.resize((n + kChunk - 1) / kChunk);
@@ -54,8 +58,6 @@ void draw(Frame& f, const Kernels& k, const GaussianInputs& in, const Images& ou
     Stopwatch watch;
     k.project(f, in, out.radii);
     f.milliseconds[kProject] = watch.lap();
-    sort_by_depth(f);
-    f.milliseconds[kSort] = watch.lap();
     list_per_tile(f);
     f.milliseconds[kBin] = watch.lap();
     k.composite(f, out, in.channel_count, keep);

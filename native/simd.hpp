@@ -20,6 +20,8 @@ constexpr int W = NEECO_WIDTH;
 typedef float vf __attribute__((vector_size(W * 4)));
 typedef int32_t vi __attribute__((vector_size(W * 4)));
 typedef float vf_loose __attribute__((vector_size(W * 4), aligned(4), may_alias));
+typedef float v4 __attribute__((vector_size(16)));
+typedef float v4_loose __attribute__((vector_size(16), aligned(4), may_alias));
 typedef float v8 __attribute__((vector_size(32)));
 typedef float v8_loose __attribute__((vector_size(32), aligned(4), may_alias));
 
@@ -29,8 +31,6 @@ NEECO_INLINE vf all(float x) { return x - (vf){}; }
 NEECO_INLINE vi all(int32_t x) { return x - (vi){}; }
 NEECO_INLINE vf select(vi mask, vf a, vf b) { return mask ? a : b; }
 NEECO_INLINE vi select(vi mask, vi a, vi b) { return mask ? a : b; }
-NEECO_INLINE vf lower(vf a, vf b) { return a < b ? a : b; }
-NEECO_INLINE vf higher(vf a, vf b) { return a > b ? a : b; }
 NEECO_INLINE int lower(int a, int b) { return a < b ? a : b; }
 NEECO_INLINE int higher(int a, int b) { return a > b ? a : b; }
 NEECO_INLINE float lower(float a, float b) { return a < b ? a : b; }
@@ -50,18 +50,27 @@ NEECO_INLINE bool finite(float x) {
 NEECO_INLINE vi to_int(vf x) { return __builtin_convertvector(x, vi); }
 NEECO_INLINE vf to_float(vi x) { return __builtin_convertvector(x, vf); }
 
+// lower and higher give b where the comparison is undecided, as minps does: GCC makes no minps of a < b ? a : b.
 #if defined(__AVX512F__) && NEECO_WIDTH == 16
 NEECO_INLINE bool any(vi m) { return _mm512_test_epi32_mask((__m512i)m, (__m512i)m) != 0; }
 NEECO_INLINE vf root(vf x) { return (vf)_mm512_sqrt_ps((__m512)x); }
+NEECO_INLINE vf lower(vf a, vf b) { return (vf)_mm512_min_ps((__m512)a, (__m512)b); }
+NEECO_INLINE vf higher(vf a, vf b) { return (vf)_mm512_max_ps((__m512)a, (__m512)b); }
 #elif defined(__AVX__) && NEECO_WIDTH == 8
 NEECO_INLINE bool any(vi m) { return !_mm256_testz_si256((__m256i)m, (__m256i)m); }
 NEECO_INLINE vf root(vf x) { return (vf)_mm256_sqrt_ps((__m256)x); }
+NEECO_INLINE vf lower(vf a, vf b) { return (vf)_mm256_min_ps((__m256)a, (__m256)b); }
+NEECO_INLINE vf higher(vf a, vf b) { return (vf)_mm256_max_ps((__m256)a, (__m256)b); }
 #elif defined(__SSE2__)
 NEECO_INLINE bool any(vi m) { return _mm_movemask_epi8((__m128i)m) != 0; }
 NEECO_INLINE vf root(vf x) { return (vf)_mm_sqrt_ps((__m128)x); }
+NEECO_INLINE vf lower(vf a, vf b) { return (vf)_mm_min_ps((__m128)a, (__m128)b); }
+NEECO_INLINE vf higher(vf a, vf b) { return (vf)_mm_max_ps((__m128)a, (__m128)b); }
 #else
 NEECO_INLINE bool any(vi m) { return (m[0] | m[1] | m[2] | m[3]) != 0; }
 NEECO_INLINE vf root(vf x) { return (vf)vsqrtq_f32((float32x4_t)x); }
+NEECO_INLINE vf lower(vf a, vf b) { return a < b ? a : b; }
+NEECO_INLINE vf higher(vf a, vf b) { return a > b ? a : b; }
 #endif
 
 // 2^x for |x| < 126, relative error 1e-7 (degree 5, fitted on [-1/2, 1/2]); outside it is garbage, never a trap.
@@ -94,6 +103,48 @@ NEECO_INLINE vf gather(const float* base, const int* index, int stride) {
     vf r;
     for (int i = 0; i < W; i++) r[i] = base[(size_t)stride * index[i]];
     return r;
+}
+
+// Four neighbouring floats of each of W rows, as four vectors: out[k][lane] = base[stride * index[lane] + k]. Built from
+// whole loads and a 4 x 4 transposition in every quarter of a vector, where `gather` would insert lane by lane.
+NEECO_INLINE v4 quad(const float* p) { return (v4) * (const v4_loose*)p; }
+#if NEECO_WIDTH == 4
+#define NEECO_ZIP(a, b, w, x, y, z) __builtin_shufflevector(a, b, w, x, y, z)
+NEECO_INLINE vf rows_at(const float* base, size_t stride, const int* index, int i) { return quad(base + stride * index[i]); }
+#elif NEECO_WIDTH == 8
+#define NEECO_ZIP(a, b, w, x, y, z) \
+    __builtin_shufflevector(a, b, NEECO_AT(8, w, 0), NEECO_AT(8, x, 0), NEECO_AT(8, y, 0), NEECO_AT(8, z, 0), NEECO_AT(8, w, 4), \
+                            NEECO_AT(8, x, 4), NEECO_AT(8, y, 4), NEECO_AT(8, z, 4))
+NEECO_INLINE vf rows_at(const float* base, size_t stride, const int* index, int i) {
+    const v4 a = quad(base + stride * index[i]), b = quad(base + stride * index[i + 4]);
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
+}
+#else
+#define NEECO_ZIP(a, b, w, x, y, z) \
+    __builtin_shufflevector(a, b, NEECO_AT(16, w, 0), NEECO_AT(16, x, 0), NEECO_AT(16, y, 0), NEECO_AT(16, z, 0), NEECO_AT(16, w, 4), \
+                            NEECO_AT(16, x, 4), NEECO_AT(16, y, 4), NEECO_AT(16, z, 4), NEECO_AT(16, w, 8), NEECO_AT(16, x, 8), \
+                            NEECO_AT(16, y, 8), NEECO_AT(16, z, 8), NEECO_AT(16, w, 12), NEECO_AT(16, x, 12), \
+                            NEECO_AT(16, y, 12), NEECO_AT(16, z, 12))
+NEECO_INLINE vf rows_at(const float* base, size_t stride, const int* index, int i) {
+    const v4 a = quad(base + stride * index[i]), b = quad(base + stride * index[i + 4]);
+    const v4 c = quad(base + stride * index[i + 8]), d = quad(base + stride * index[i + 12]);
+    const v8 low = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7), high = __builtin_shufflevector(c, d, 0, 1, 2, 3, 4, 5, 6, 7);
+    return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+#endif
+// Entry i of a quarter of a (i < 4) or b (i - 4), in the quarter that starts at `offset` of vectors of `width`.
+#define NEECO_AT(width, i, offset) ((i) < 4 ? (i) + (offset) : (width) + (i) - 4 + (offset))
+NEECO_INLINE void transpose_quads(vf* v) {
+    const vf a = NEECO_ZIP(v[0], v[1], 0, 4, 1, 5), b = NEECO_ZIP(v[2], v[3], 0, 4, 1, 5);
+    const vf c = NEECO_ZIP(v[0], v[1], 2, 6, 3, 7), d = NEECO_ZIP(v[2], v[3], 2, 6, 3, 7);
+    v[0] = NEECO_ZIP(a, b, 0, 1, 4, 5);
+    v[1] = NEECO_ZIP(a, b, 2, 3, 6, 7);
+    v[2] = NEECO_ZIP(c, d, 0, 1, 4, 5);
+    v[3] = NEECO_ZIP(c, d, 2, 3, 6, 7);
+}
+NEECO_INLINE void load_quads(const float* base, size_t stride, const int* index, vf* out) {
+    for (int i = 0; i < 4; i++) out[i] = rows_at(base, stride, index, i);
+    transpose_quads(out);
 }
 NEECO_INLINE float sum(vf v) {
     float s = 0;
@@ -148,7 +199,7 @@ constexpr float kLowPass = 0.3f;                      // px^2
 // A tile is one vector-friendly strip wide: a vector covers kRows rows of kStrip columns.
 constexpr int kStrip = W < 8 ? W : 8;
 constexpr int kRows = W / kStrip;
-constexpr int kTileHeight = W == 16 ? 64 : (W == 8 ? 16 : 32);
+constexpr int kTileHeight = W == 16 ? 64 : 32;
 
 }  // namespace NEECO_VARIANT
 }  // namespace neeco

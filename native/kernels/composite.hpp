@@ -29,8 +29,8 @@ struct Tile {
 };
 NEECO_INLINE Tile tile_at(const Frame& frame, int tile) {
     Tile t;
-    t.x = tile % frame.tiles_x * kStrip;
-    t.y = tile / frame.tiles_x * kTileHeight;
+    t.x = tile / frame.tiles_y * kStrip;
+    t.y = tile % frame.tiles_y * kTileHeight;
     t.width = lower(kStrip, frame.camera.width - t.x);
     t.height = lower(kTileHeight, frame.camera.height - t.y);
     return t;
@@ -50,7 +50,8 @@ struct TileState {
     alignas(64) int32_t last[kTilePixels];
 };
 
-template <int V>
+// Keep: remember where in the list each pixel became full, for the backward pass.
+template <int V, bool Keep>
 static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, int count, TileState<V>& s) {
     for (int i = 0; i < kTilePixels; i++) {
         s.transmittance[i] = i % kStrip < tile.width && i / kStrip < tile.height ? 1.f : -1.f;
@@ -59,7 +60,7 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
     std::memset(s.sums, 0, sizeof s.sums);
     const vf lane_columns = lane_x(), lane_rows = lane_y();
     int live_from = 0, live_to = tile.height;
-    bool filled = false;
+    vi filled = all(0);
     for (int k = 0; k < count; k++) {
         if (k + 8 < count) prefetch_record(frame, list[k + 8].gaussian, V);
         const float* record = frame.records.data() + (size_t)list[k].gaussian * frame.record_stride;
@@ -73,17 +74,16 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
         vf dy = lane_rows + ((float)(from * kRows + tile.y) + 0.5f - g.y);
         for (int row = from; row < to; row++, dy += (float)kRows) {
             const vf exponent = (g.c * dy + linear) * dy + constant;
-            const vf raw = exp2_fast(exponent);
-            const vf alpha = raw < kOpaque ? raw : all(kOpaque);
+            const vf alpha = lower(exp2_fast(exponent), all(kOpaque));
             vf* transmittance = (vf*)(s.transmittance + row * W);
-            vf before = *transmittance;
-            vi drawn = (exponent >= kLog2Faintest) & (before > 0.f);
+            const vf before = *transmittance;
+            const vi offered = (exponent >= kLog2Faintest) & (before > 0.f);
             vf weight = before * alpha;
-            const vi full = drawn & (before - weight <= kFull);
-            if (__builtin_expect(any(full), 0)) {
-                filled = true;
-                drawn &= ~full;
-                before = select(full, -before, before);
+            const vi drawn = offered & (before - weight > kFull), full = offered ^ drawn;
+            // No branch on `full`: it would be decided only at the end of the longest chain of dependent operations, and
+            // every wrong guess would throw away the rows begun meanwhile.
+            filled |= full;
+            if (Keep) {
                 vi* last = (vi*)(s.last + row * W);
                 *last = select(full, all(k), *last);
             }
@@ -91,10 +91,10 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
             vf* sums = (vf*)s.sums[row];
             for (int c = 0; c < V; c++) sums[c] += weight * value[c];
             sums[V] += weight;
-            *transmittance = before - weight;
+            *transmittance = select(full, -before, before - weight);
         }
-        if ((k & 7) == 7 && filled) {  // rows that are full at both ends need no more visits
-            filled = false;
+        if ((k & 7) == 7 && any(filled)) {  // rows that are full at both ends need no more visits
+            filled = all(0);
             auto full_row = [&](int y) { return !any(*(vf*)(s.transmittance + y / kRows * W) > 0.f); };
             while (live_from < live_to && full_row(live_from)) live_from += kRows;
             while (live_to > live_from && full_row(live_to - 1)) live_to = (live_to - 1) / kRows * kRows;
@@ -103,8 +103,8 @@ static void blend_tile(const Frame& frame, const Tile& tile, const Pair* list, i
     }
 }
 
-template <int V>
-static void write_tile(Frame& frame, const Tile& tile, const TileState<V>& s, const Images& out, int channels, bool keep) {
+template <int V, bool Keep>
+static void write_tile(Frame& frame, const Tile& tile, const TileState<V>& s, const Images& out, int channels) {
     const float* background = out.background;
     for (int y = 0; y < tile.height; y++)
         for (int x = 0; x < tile.width; x++) {
@@ -116,15 +116,15 @@ static void write_tile(Frame& frame, const Tile& tile, const TileState<V>& s, co
             out.alpha[pixel] = alpha;
             out.depth[pixel] = alpha > 0 ? sums[3][lane] / alpha : 0.f;
             for (int c = 0; c < channels; c++) out.channels[pixel * channels + c] = sums[4 + c][lane];
-            if (keep) {
+            if (Keep) {
                 frame.transmittance.data()[pixel] = left;
                 frame.last.data()[pixel] = s.last[i];
             }
         }
 }
 
-template <int V>
-static void composite_values(Frame& frame, const Images& out, int channels, bool keep) {
+template <int V, bool Keep>
+static void composite_values(Frame& frame, const Images& out, int channels) {
     const int tiles = frame.tiles();
     auto body = [&](int group) {
         TileState<V> state;
@@ -132,8 +132,8 @@ static void composite_values(Frame& frame, const Images& out, int channels, bool
             const int number = (int)frame.tile_order.data()[i];
             const uint32_t* start = frame.tile_start.data() + number;
             const Tile tile = tile_at(frame, number);
-            blend_tile<V>(frame, tile, frame.list.data() + start[0], (int)(start[1] - start[0]), state);
-            write_tile<V>(frame, tile, state, out, channels, keep);
+            blend_tile<V, Keep>(frame, tile, frame.list.data() + start[0], (int)(start[1] - start[0]), state);
+            write_tile<V, Keep>(frame, tile, state, out, channels);
         }
     };
     parallel_for((tiles + kTileGrain - 1) / kTileGrain, body);

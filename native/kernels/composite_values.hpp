@@ -8,7 +8,7 @@ namespace NEECO_VARIANT {
 
 static void composite(Frame& frame, const Images& out, int channels, bool keep) {
     switch (frame.values) {
-#define NEECO_CASE(V) case V: return composite_values<V>(frame, out, channels, keep);
+#define NEECO_CASE(V) case V: return keep ? composite_values<V, true>(frame, out, channels) : composite_values<V, false>(frame, out, channels);
         NEECO_VALUES(NEECO_CASE)
 #undef NEECO_CASE
     }

@@ -35,16 +35,42 @@ NEECO_INLINE void rotation_matrix(const vf* q, vf* r) {
 }
 
 // Depth: in double, rounded once, so that every backend and instruction set sorts the same numbers.
-NEECO_INLINE float depth_of(const Camera& c, const float* mean) {
-    return (float)(((c.depth_row[0] * mean[0] + c.depth_row[1] * mean[1]) + c.depth_row[2] * mean[2]) + c.depth_row[3]);
+NEECO_INLINE vf depth_lanes(const Camera& c, const Projected& p) {
+    typedef double d4 __attribute__((vector_size(32)));
+    float x[W], y[W], z[W], depth[W];
+    store(x, p.wx);
+    store(y, p.wy);
+    store(z, p.wz);
+    for (int i = 0; i < W; i += 4) {
+        const d4 dx = __builtin_convertvector(quad(x + i), d4), dy = __builtin_convertvector(quad(y + i), d4),
+                 dz = __builtin_convertvector(quad(z + i), d4);
+        const d4 sum = ((c.depth_row[0] * dx + c.depth_row[1] * dy) + c.depth_row[2] * dz) + c.depth_row[3];
+        *(v4_loose*)(depth + i) = (v4_loose)__builtin_convertvector(sum, v4);
+    }
+    return load(depth);
+}
+
+// Rows of three floats. Loads take four: at the array's very end, one by one.
+NEECO_INLINE void load_triples(const float* base, int count, const int* index, vf* out) {
+    bool at_end = false;
+    for (int i = 0; i < W; i++) at_end |= index[i] == count - 1;
+    if (at_end) {
+        for (int k = 0; k < 3; k++) out[k] = gather(base + k, index, 3);
+        return;
+    }
+    vf quads[4];
+    load_quads(base, 3, index, quads);
+    for (int k = 0; k < 3; k++) out[k] = quads[k];
 }
 
 NEECO_INLINE Projected project_lanes(const Camera& c, const GaussianInputs& in, const int* index) {
     Projected p;
-    p.wx = gather(in.means, index, 3);
-    p.wy = gather(in.means + 1, index, 3);
-    p.wz = gather(in.means + 2, index, 3);
-    for (int i = 0; i < W; i++) p.z[i] = depth_of(c, in.means + 3 * (size_t)index[i]);
+    vf mean[3];
+    load_triples(in.means, in.count, index, mean);
+    p.wx = mean[0];
+    p.wy = mean[1];
+    p.wz = mean[2];
+    p.z = depth_lanes(c, p);
     p.x = c.rotation[0] * p.wx + c.rotation[1] * p.wy + c.rotation[2] * p.wz + c.translation[0];
     p.y = c.rotation[3] * p.wx + c.rotation[4] * p.wy + c.rotation[5] * p.wz + c.translation[1];
     p.inverse_z = 1.f / p.z;
@@ -60,15 +86,13 @@ NEECO_INLINE Projected project_lanes(const Camera& c, const GaussianInputs& in, 
         p.t[3 + k] = jy * (c.rotation[3 + k] - p.slope_y * c.rotation[6 + k]);
     }
     vf norm2 = all(0.f);
-    for (int k = 0; k < 4; k++) {
-        p.q[k] = gather(in.quats + k, index, 4);
-        norm2 += p.q[k] * p.q[k];
-    }
+    load_quads(in.quats, 4, index, p.q);
+    for (int k = 0; k < 4; k++) norm2 += p.q[k] * p.q[k];
     p.inverse_norm = 1.f / root(norm2);
     for (int k = 0; k < 4; k++) p.q[k] *= p.inverse_norm;
     rotation_matrix(p.q, p.r);
+    load_triples(in.scales, in.count, index, p.s);
     for (int k = 0; k < 3; k++) {
-        p.s[k] = gather(in.scales + k, index, 3);
         p.u[k] = (p.t[0] * p.r[k] + p.t[1] * p.r[3 + k] + p.t[2] * p.r[6 + k]) * p.s[k];
         p.u[3 + k] = (p.t[3] * p.r[k] + p.t[4] * p.r[3 + k] + p.t[5] * p.r[6 + k]) * p.s[k];
     }
@@ -117,7 +141,7 @@ NEECO_INLINE Direction direction_lanes(const Camera& c, const GaussianInputs& in
     d.world[2] = dz * d.inverse_length;
     if (in.sh_frames) {
         vf q[4];
-        for (int k = 0; k < 4; k++) q[k] = gather(in.sh_frames + k, index, 4);
+        load_quads(in.sh_frames, 4, index, q);
         rotation_matrix(q, d.frame);
         for (int k = 0; k < 3; k++)
             d.local[k] = d.frame[k] * d.world[0] + d.frame[3 + k] * d.world[1] + d.frame[6 + k] * d.world[2];

@@ -46,12 +46,45 @@ NEECO_INLINE uint32_t emit_pieces(const Frame& frame, const Ellipse& g, uint32_t
             if (a > b) continue;
             for (int row = a / kTileHeight; row <= b / kTileHeight; row++) {
                 const int y0 = higher(a - row * kTileHeight, 0), y1 = lower(b - row * kTileHeight, kTileHeight - 1);
-                out[n++] = (uint32_t)(row * frame.tiles_x + base + i) | (uint32_t)y0 << kTileBits |
+                out[n++] = (uint32_t)((base + i) * frame.tiles_y + row) | (uint32_t)y0 << kTileBits |
                            (uint32_t)y1 << (kTileBits + kRowBits);
             }
         }
     }
     return n;
+}
+
+// What emission reads lane by lane.
+struct Lanes {
+    vf ellipse[8];  // in the order of Ellipse
+    vf radius, depth;
+    vi seen;
+};
+
+// Pieces, record and depth key of Gaussian g, which is lane i. head: the records' first twelve floats, as
+// transpose_quads leaves them: row r of a quarter q is in vector r, lanes 4 q to 4 q + 3.
+NEECO_INLINE void emit_gaussian(Frame& frame, const GaussianInputs& in, Chunk& chunk, int g, const Lanes& lanes, int i,
+                                const vf (*head)[4], float* radii) {
+    const float* channels = in.channels ? in.channels + (size_t)g * in.channel_count : nullptr;
+    for (int ch = 0; ch < in.channel_count; ch++)
+        if (!finite(channels[ch])) return;
+    uint32_t* out = chunk.pieces.grow((size_t)chunk.piece_count + frame.tiles()) + chunk.piece_count;
+    Ellipse ellipse;
+    float* values = &ellipse.x;
+    for (int k = 0; k < 8; k++) values[k] = lanes.ellipse[k][i];
+    const uint32_t n = emit_pieces(frame, ellipse, out);
+    if (n == 0) return;
+    chunk.piece_count += n;
+    frame.spans.data()[g].count = n;
+    radii[g] = lanes.radius[i];
+    float* record = frame.records.data() + (size_t)g * frame.record_stride;
+    for (int k = 0; k < 3; k++) std::memcpy(record + 4 * k, (const float*)&head[k][i % 4] + i / 4 * 4, 16);
+    for (int ch = 0; ch < in.channel_count; ch++) record[kRecordHead + 4 + ch] = channels[ch];
+    for (int ch = 4 + in.channel_count; ch < frame.values; ch++) record[kRecordHead + ch] = 0;
+    uint32_t key;
+    const float depth = lanes.depth[i];
+    std::memcpy(&key, &depth, 4);
+    frame.visible_list.data()[(size_t)(g >> kChunkBits << kChunkBits) + chunk.visible++] = {key, (uint32_t)g};
 }
 
 // Projects W Gaussians of which the first `live` are real.
@@ -79,52 +112,29 @@ NEECO_INLINE void project_batch(Frame& frame, const GaussianInputs& in, Chunk& c
     const vf half_trace = 0.5f * (p.cov_xx + p.cov_yy), half_gap = 0.5f * (p.cov_xx - p.cov_yy);
     const vf radius = 3.f * root(half_trace + root(half_gap * half_gap + p.cov_xy * p.cov_xy));
     const vf peak = p.cov_xy * root(reach / p.cov_yy);
-    vf basis[16];
+    vf basis[16], color[3] = {all(0.5f), all(0.5f), all(0.5f)};
     if (in.sh_count > 1) sh_basis(in.sh_count, direction_lanes(c, in, p, index).local, basis);
     else basis[0] = all(kSh0);
+    add_sh(in.sh_count, in.sh, index, basis, color);
     const vf light = in.falloff ? light_lanes(in, p, index).factor : all(1.f);
+    seen &= finite(color[0]) & finite(color[1]) & finite(color[2]) & finite(light);
     const vf a = -0.5f * kLog2E * p.cov_yy * inverse_det, b = kLog2E * p.cov_xy * inverse_det,
-             cc = -0.5f * kLog2E * p.cov_xx * inverse_det, slope = p.cov_xy * inverse_xx;
+             cc = -0.5f * kLog2E * p.cov_xx * inverse_det;
     const vf k0 = reach * p.det * inverse_xx, k1 = p.det * inverse_xx * inverse_xx;
-
+    const Lanes lanes = {{x, y, half_width, half_height, p.cov_xy * inverse_xx, k0, k1, peak}, radius, p.z, seen};
+    // Records by quads of their first twelve floats (a record has sixteen or more; channels overwrite the last two).
+    vf head[3][4] = {{x, y, a, b}, {cc, log2_opacity}};
+    for (int ch = 0; ch < 3; ch++) color[ch] = higher(color[ch], all(0.f)) * light;
+    head[1][2] = color[0];
+    head[1][3] = color[1];
+    head[2][0] = color[2];
+    head[2][1] = p.z;
+    head[2][2] = head[2][3] = all(0.f);
+    for (auto& quads : head) transpose_quads(quads);
     for (int i = 0; i < live; i++) {
-        const int g = index[i];
-        spans[g] = {chunk.piece_count, 0};
-        radii[g] = 0;
-        if (!seen[i]) continue;
-        float color[3] = {0.5f, 0.5f, 0.5f};
-        const float* sh = in.sh + (size_t)g * in.sh_count * 3;
-        for (int k = 0; k < in.sh_count; k++)
-            for (int ch = 0; ch < 3; ch++) color[ch] += basis[k][i] * sh[3 * k + ch];
-        if (!finite(color[0]) || !finite(color[1]) || !finite(color[2]) || !finite(light[i])) continue;
-        float* record = frame.records.data() + (size_t)g * frame.record_stride;
-        bool drawable = true;
-        for (int ch = 0; ch < in.channel_count; ch++) {
-            const float v = in.channels[(size_t)g * in.channel_count + ch];
-            drawable &= finite(v);
-            record[kRecordHead + 4 + ch] = v;
-        }
-        if (!drawable) continue;
-        uint32_t* out = chunk.pieces.grow((size_t)chunk.piece_count + frame.tiles()) + chunk.piece_count;
-        const Ellipse ellipse{x[i], y[i], half_width[i], half_height[i], slope[i], k0[i], k1[i], peak[i]};
-        const uint32_t n = emit_pieces(frame, ellipse, out);
-        if (n == 0) continue;
-        chunk.piece_count += n;
-        spans[g].count = n;
-        radii[g] = radius[i];
-        *(Record*)record = {x[i], y[i], a[i], b[i], cc[i], log2_opacity[i]};
-        for (int ch = 0; ch < 3; ch++) record[kRecordHead + ch] = higher(color[ch], 0.f) * light[i];
-        record[kRecordHead + 3] = p.z[i];
-        for (int ch = 4 + in.channel_count; ch < frame.values; ch++) record[kRecordHead + ch] = 0;
-        uint32_t key;
-        const float z = p.z[i];
-        std::memcpy(&key, &z, 4);
-        const size_t at = (size_t)(g >> kChunkBits << kChunkBits) + chunk.visible;
-        frame.spare_keys.data()[at] = key;
-        frame.spare_order.data()[at] = (uint32_t)g;
-        if (chunk.visible++ == 0) chunk.lowest_key = chunk.highest_key = key;
-        if (key < chunk.lowest_key) chunk.lowest_key = key;
-        if (key > chunk.highest_key) chunk.highest_key = key;
+        spans[index[i]] = {chunk.piece_count, 0};
+        radii[index[i]] = 0;
+        if (lanes.seen[i]) emit_gaussian(frame, in, chunk, index[i], lanes, i, head, radii);
     }
 }
 
@@ -139,6 +149,7 @@ static void project(Frame& frame, const GaussianInputs& in, float* radii) {
             for (int k = 0; k < W; k++) index[k] = lower(i + k, count - 1);
             project_batch(frame, in, chunk, index, lower(W, end - i), radii);
         }
+        group_by_band(frame, number);
     };
     parallel_for((count + kChunk - 1) / kChunk, body);
 }

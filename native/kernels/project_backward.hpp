@@ -105,10 +105,7 @@ NEECO_INLINE void color_gradient(const Frame& frame, const GaussianInputs& in, c
                 for (int ch = 0; ch < 3; ch++) out[3 * k + ch] = basis[k][i] * to_base[ch][i];
         }
     if (count == 1) return;
-    for (int i = 0; i < W; i++) {
-        const float* sh = in.sh + (size_t)index[i] * count * 3;
-        for (int k = 0; k < count; k++) w[k][i] = to_base[0][i] * sh[3 * k] + to_base[1][i] * sh[3 * k + 1] + to_base[2][i] * sh[3 * k + 2];
-    }
+    sh_products(count, in.sh, index, to_base, w);
     vf local[3], world[3];
     sh_direction_gradient(count, d.local, w, local);
     for (int k = 0; k < 3; k++)

@@ -35,6 +35,54 @@ NEECO_INLINE void sh_basis(int count, const vf* d, vf* b) {
     b[15] = -kSh33 * x * (xx - 3.f * yy);
 }
 
+// visit(j, coefficients): every coefficient j (of 3 * Count: r, g, b of the first, r, g, b of the second, ...) of W rows.
+template <int Count, class F>
+NEECO_INLINE void sh_coefficients(const float* sh, const int* index, F&& visit) {
+    constexpr int length = 3 * Count;
+    if (length < 4) {
+        for (int j = 0; j < length; j++) visit(j, gather(sh + j, index, length));
+        return;
+    }
+#pragma GCC unroll 12
+    for (int done = 0; done < length; done += 4) {
+        const int at = done + 4 <= length ? done : length - 4;  // never past a row's end
+        vf quads[4];
+        load_quads(sh + at, length, index, quads);
+#pragma GCC unroll 4
+        for (int k = done - at; k < 4; k++) visit(at + k, quads[k]);
+    }
+}
+
+// color[c] += sum over k of basis[k] * sh[row][k][c].
+template <int Count>
+NEECO_INLINE void add_sh(const float* sh, const int* index, const vf* basis, vf* color) {
+    sh_coefficients<Count>(sh, index, [&](int j, vf coefficient) __attribute__((always_inline)) { color[j % 3] += basis[j / 3] * coefficient; });
+}
+
+// w[k] = sum over c of to_color[c] * sh[row][k][c].
+template <int Count>
+NEECO_INLINE void sh_products(const float* sh, const int* index, const vf* to_color, vf* w) {
+    for (int k = 0; k < Count; k++) w[k] = all(0.f);
+    sh_coefficients<Count>(sh, index, [&](int j, vf coefficient) __attribute__((always_inline)) { w[j / 3] += to_color[j % 3] * coefficient; });
+}
+
+// The same for a number of coefficients known only at run time.
+NEECO_INLINE void add_sh(int count, const float* sh, const int* index, const vf* basis, vf* color) {
+    switch (count) {
+        case 1: return add_sh<1>(sh, index, basis, color);
+        case 4: return add_sh<4>(sh, index, basis, color);
+        case 9: return add_sh<9>(sh, index, basis, color);
+        default: return add_sh<16>(sh, index, basis, color);
+    }
+}
+NEECO_INLINE void sh_products(int count, const float* sh, const int* index, const vf* to_color, vf* w) {
+    switch (count) {
+        case 4: return sh_products<4>(sh, index, to_color, w);
+        case 9: return sh_products<9>(sh, index, to_color, w);
+        default: return sh_products<16>(sh, index, to_color, w);
+    }
+}
+
 // g = sum over k of w[k] * gradient of basis k at d.
 NEECO_INLINE void sh_direction_gradient(int count, const vf* d, const vf* w, vf* g) {
     const vf x = d[0], y = d[1], z = d[2];

@@ -66,6 +66,42 @@ def test_any_scene_matches_the_reference(simd: str, **shape: object) -> None:
     assert_same_as_reference(make_scene(**shape))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
+@pytest.mark.parametrize("count", [3, 5, 8, 17])
+def test_counts_that_do_not_fill_the_vectors(simd: str, count: int, sh_count: int) -> None:
+    assert_same_as_reference(make_scene(count, sh_count, count % 2, seed=count + sh_count))
+
+
+@pytest.mark.parametrize("width", [257, 700])
+def test_gaussians_that_cross_many_columns_of_tiles(simd: str, width: int) -> None:
+    scene = make_scene(60, 4, 1, seed=11, width=width, height=9, size=12.0)
+    scene.tensors["means"][:, 0] *= width / 45
+    assert_same_as_reference(scene)
+
+
+@pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
+def test_gaussians_out_of_sight_change_nothing_for_those_between_them(simd: str, sh_count: int) -> None:
+    scene = make_scene(90, sh_count, 1, seed=12)
+    hidden = torch.arange(90) % 7 != 3  # six of seven: every vector holds both kinds, or none that is seen
+    scene.tensors["means"][hidden, 2] = -100.0
+    scene.tensors["sh"][hidden] = 1e30
+    without = Scene(
+        {k: v[~hidden] if v.dim() and v.shape[0] == 90 else v for k, v in scene.tensors.items()},
+        scene.width,
+        scene.height,
+    )
+    weights = torch.ones(scene.height, scene.width)
+    out, gradients = draw(scene, torch.float32, "cpu", weights)
+    expected, expected_gradients = draw(without, torch.float32, "cpu", weights)
+    assert expected.visible.any()
+    assert torch.equal(out.color, expected.color)
+    assert torch.equal(out.depth, expected.depth)
+    for name, gradient in gradients.items():
+        if gradient.dim() and gradient.shape[0] == 90:
+            assert torch.equal(gradient[~hidden], expected_gradients[name]), name
+            assert not gradient[hidden].any(), name
+
+
 def test_many_opaque_layers_fill_pixels(simd: str) -> None:
     scene = make_scene(300, 1, 1, seed=3, size=25.0, opacity=0.6)
     assert_same_as_reference(scene)

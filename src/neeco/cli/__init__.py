@@ -83,6 +83,9 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
+    from neeco.raster.threads import keep_freed_memory
+
+    keep_freed_memory()
     return run(parsed)
 
 

@@ -1,4 +1,4 @@
-"""How many threads the CPU kernels use, and which instruction set."""
+"""How many threads the CPU kernels use, which instruction set, and what becomes of freed memory."""
 
 from __future__ import annotations
 
@@ -24,3 +24,12 @@ def simd() -> str:
         return native().simd()
     except RuntimeError as error:
         raise NeecoError(str(error)) from error
+
+
+def keep_freed_memory() -> bool:
+    """Let this process keep what it frees, up to 1 GiB; whether the system can (glibc).
+
+    A training step frees megabytes of tensors that the next one wants again; by default the system takes them back
+    and clears every page anew. A setting of the whole process: for programs to call, not for libraries.
+    """
+    return native().keep_freed_memory()
