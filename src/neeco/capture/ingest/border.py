@@ -11,7 +11,7 @@ DARK = 40.0  # of 255; a border brighter than this in most frames is no border
 MARGIN = 0.015  # of the radius taken off: the rim is blurred
 MISFIT = 0.015  # of the radius: how far the rim may be off a circle
 CLEAN = 0.9  # share of the pixels beyond the rim that must be dark, of those within that must not be
-SHARP = 0.4  # share of the scene's brightness that must be there right inside the rim
+SHARP = 0.6  # share of the brightness inside the rim that must be gone right outside
 SAMPLES = 48
 
 
@@ -123,7 +123,7 @@ def _holds(circle: tuple[float, float, float], outside: np.ndarray, brightness: 
     if np.mean(outside[beyond]) <= CLEAN or np.mean(outside[within]) >= 1 - CLEAN or bright <= CLEAN:
         return False
     # a vignette darkens slowly; a rim does it within a few pixels
-    black = float(np.median(brightness[beyond]))
-    near = brightness[within & (distance > 0.94 * radius)]
-    scene = brightness[within & (distance > 0.6 * radius)]
-    return float(np.median(near)) - black > SHARP * (float(np.median(scene)) - black)
+    black = float(np.percentile(brightness[beyond], 10))
+    inner = float(np.median(brightness[(distance > 0.94 * radius) & (distance < 0.98 * radius)]))
+    outer = float(np.median(brightness[(distance > 1.02 * radius) & (distance < 1.06 * radius)]))
+    return inner - outer > SHARP * (inner - black)
