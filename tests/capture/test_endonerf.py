@@ -113,7 +113,7 @@ def test_damaged_poses_are_named(endonerf, damage, message):
 def test_a_truncated_file_is_refused_in_one_line(endonerf, keep):
     file = endonerf / "poses_bounds.npy"
     file.write_bytes(file.read_bytes()[:keep])
-    with pytest.raises(NeecoError, match="poses_bounds.npy") as refused:
+    with pytest.raises(NeecoError, match=r"poses_bounds\.npy") as refused:
         read_capture(endonerf)
     assert "\n" not in str(refused.value)
 

@@ -1,7 +1,7 @@
 """Read EndoNeRF folders (Wang et al., MICCAI 2022): `poses_bounds.npy`, images/, masks/ and depth/.
 
-The poses are LLFF's (Mildenhall et al. 2019): a row of 17 numbers per image, 3x5 [R | t | height width focal] row by row,
-then the nearest and farthest depth; the columns of R are the camera's down, right and backwards axes.
+The poses are LLFF's (Mildenhall et al. 2019): a row of 17 numbers per image, 3x5 [R | t | height width focal] row by
+row, then the nearest and farthest depth; the columns of R are the camera's down, right and backwards axes.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def test_nothing_is_overwritten_and_failures_leave_nothing(nerfstudio, tmp_path)
     (tmp_path / "empty").mkdir()
     convert_folder(nerfstudio, tmp_path / "empty")
     (nerfstudio / "images/002.png").write_bytes(b"no image")
-    with pytest.raises(NeecoError, match="002.png: not an image file"):
+    with pytest.raises(NeecoError, match=r"002\.png: not an image file"):
         convert_folder(nerfstudio, tmp_path / "broken")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "full", "nerfstudio"]
 

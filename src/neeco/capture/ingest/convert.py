@@ -26,8 +26,8 @@ from neeco.errors import NeecoError
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
 
-    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool. The capture appears whole
-    or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output` exists
+    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool. The capture appears
+    whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output` exists
     already, and when the disk refuses.
     """
     folder, output = Path(folder), Path(output)
@@ -97,8 +97,8 @@ def _lacking(parsed: Parsed, folder: Path, *, masked: bool) -> list[str]:
     sentences = []
     if not parsed.instruments:
         sentences.append(
-            "No instrument states: the methods that pose an instrument (kinematic, neeco) cannot be trained, only those "
-            "that need no state, such as 3dgs; nothing can be synthesised in new states."
+            "No instrument states: the methods that pose an instrument (kinematic, neeco) cannot be trained, only "
+            "those that need no state, such as 3dgs; nothing can be synthesised in new states."
         )
     for instrument in parsed.instruments:
         if not instrument.joints:
