@@ -27,8 +27,8 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
 
     Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool. The capture appears
-    whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output` exists
-    already, and when the disk refuses.
+    whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output`
+    exists already, and when the disk refuses.
     """
     folder, output = Path(folder), Path(output)
     if os.path.lexists(output) and not _is_empty_folder(output):
