@@ -215,7 +215,7 @@ def _cells(table: Table, names: tuple[str, ...], keep: np.ndarray, dropped: Drop
     if len(bad) > max(3, 0.5 * keep.sum()):
         alike = f"{len(bad)} of {count_rows(len(table.rows))} like it"
         raise NeecoError(
-            f"{table.path}: line {table.lines[rows[0]]}: {bad[0][1]} ({alike}); name the right columns or repair the file"
+            f"{table.path}: line {table.lines[rows[0]]}: {bad[0][1]} ({alike}); name other columns or repair the file"
         )
     if bad:
         dropped.add(f"not readable, first: {bad[0][1]}", table.lines[rows])

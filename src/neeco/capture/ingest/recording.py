@@ -18,7 +18,6 @@ from neeco.files import read_json
 
 TRACKER_CLOCK = "em"
 _SUFFIX = "_minus_video_s"
-_RULES = ("test_every", "unseen_fraction", "unseen_by")
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,8 @@ class InstrumentLogs:
 
 @dataclass(frozen=True)
 class Splits:
-    """How frames are split. test_every: every n-th frame before the unseen ones; unseen_fraction: of the frames, the
-    extreme of `unseen_by` (a joint; None: of the whole state); or given: ranges (first, last) of video frames."""
+    """How frames are split. test_every: every n-th (0: none); unseen_fraction: of the frames (0: none), the extreme of
+    `unseen_by` (a joint; None: of the whole state); or given: ranges (first, last) of video frames. None: as usual."""
 
     test_every: int | None = None
     unseen_fraction: float | None = None
@@ -251,9 +250,7 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
     else:
         entries = {("", key): number for key, number in value.items() if str(key).endswith(_SUFFIX)}
         if not entries:
-            raise source.error(
-                "clocks", 'missing; give offsets as {"clocks": {"em": 0.038}} or {"em_minus_video_s": 0.038}'
-            )
+            raise source.error("clocks", 'missing; give offsets, as in {"clocks": {"em": 0.038}}')
     offsets: dict[str, float] = {}
     notes = []
     for (group, key), number in entries.items():
@@ -262,7 +259,7 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
         if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) < 1e12:
             raise source.error(place, f"{shown(number)} is not an offset in seconds; t_log = t_video + offset")
         if clock is None:
-            notes.append(f"{source.file.name}: {place} belongs to no log of this recording; ignored")
+            notes.append(f"{source.file.name}: {shown(place)} belongs to no log of this recording; ignored")
         else:
             offsets[clock] = float(number)
     return offsets, tuple(notes)
@@ -284,12 +281,13 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
 def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | None:
     if top.value.get("splits") is None:
         return None
-    section = Section(top.file, "splits", top.value["splits"], (*_RULES, "test", "unseen"))
+    keys = ("test_every", "unseen_fraction", "unseen_by", "test", "unseen")
+    section = Section(top.file, "splits", top.value["splits"], keys)
     by = section.text("unseen_by")
     joints = [joint for instrument in instruments for joint in instrument.joints]
     if by is not None and by not in joints:
         raise section.error(
             "unseen_by", f"no joint is called {shown(by)}; the joints are {', '.join(joints) or 'none'}"
         )
-    fraction = section.number("unseen_fraction", above=0.0, below=0.9)
-    return Splits(section.integer("test_every", 2), fraction, by, section.ranges("test"), section.ranges("unseen"))
+    fraction = section.number("unseen_fraction", least=0.0, below=0.9)
+    return Splits(section.integer("test_every", 0), fraction, by, section.ranges("test"), section.ranges("unseen"))

@@ -21,7 +21,7 @@ from neeco.capture.ingest.units import KINDS, canonical_unit
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 
-_EULER = re.compile(r"^(?:[xyz]{3}|[XYZ]{3})$")
+_EULER = re.compile(r"^(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})$")  # no axis twice in a row
 
 
 def close_match(name: str, names: Iterable[str]) -> str | None:
@@ -31,9 +31,9 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
 
 
 class Section:
-    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys`."""
+    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys` (None: any)."""
 
-    def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...]) -> None:
+    def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...] | None) -> None:
         self.file, self.place = file, place
         if not isinstance(value, dict):
             where = f"{file}: {place}" if place else str(file)
@@ -42,7 +42,7 @@ class Section:
             )
         self.value: dict[str, Any] = value
         for key in value:
-            if key not in keys:
+            if keys is not None and key not in keys:
                 likely = close_match(str(key), keys)
                 hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
                 raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
@@ -75,16 +75,20 @@ class Section:
             raise self.error(key, f"no such file: {shown(text, 120)}; correct the path (relative to {self.file.name})")
         return path
 
-    def number(self, key: str, above: float | None = None, below: float | None = None) -> float | None:
+    def number(
+        self, key: str, above: float | None = None, least: float | None = None, below: float | None = None
+    ) -> float | None:
         value = self.value.get(key)
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
             raise self.error(key, f"{shown(value)} is not a usable number; correct it")
-        if (above is not None and value <= above) or (below is not None and value >= below):
-            limits = [f"above {above:g}"] if above is not None else []
-            limits += [f"below {below:g}"] if below is not None else []
-            raise self.error(key, f"{value:g} is out of range; give a number {' and '.join(limits)}")
+        wrong = []
+        wrong += [f"above {above:g}"] if above is not None and value <= above else []
+        wrong += [f"{least:g} or more"] if least is not None and value < least else []
+        wrong += [f"below {below:g}"] if below is not None and value >= below else []
+        if wrong:
+            raise self.error(key, f"{value:g} is out of range; give a number {wrong[0]}")
         return float(value)
 
     def integer(self, key: str, least: int) -> int | None:
@@ -119,6 +123,13 @@ class Section:
             raise self.error(key, "names a column twice; list different columns")
         return tuple(str(item) for item in items)
 
+    def range(self, key: str, unit: str) -> tuple[float, float]:
+        """Least and greatest of something."""
+        low, high = self.numbers(key, 2, f"least and greatest, {unit}")
+        if low >= high:
+            raise self.error(key, f"{low:g} is not below {high:g}; give the least first, in {unit}")
+        return low, high
+
     def ranges(self, key: str) -> tuple[tuple[int, int], ...]:
         """Frame numbers and ranges such as "30-40", as (first, last)."""
         value = self.value.get(key)
@@ -126,9 +137,7 @@ class Section:
             return ()
         found = []
         for item in value if isinstance(value, list) else [value]:
-            match = (
-                re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item)) if not isinstance(item, bool) else None
-            )
+            match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
             if match is None or int(match[2] or match[1]) < int(match[1]):
                 raise self.error(key, f"{shown(item)} is no range of frames; write 12 or 30-40")
             found.append((int(match[1]), int(match[2] or match[1])))
@@ -187,10 +196,7 @@ def joint_columns(parent: Section, key: str, value: Any, clock: str, poses: Pose
     columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), ("time", "value"))
     limits = None
     if section.value.get("limits") is not None:
-        low, high = section.numbers("limits", 2, "least and greatest angle, rad")
-        if low >= high:
-            raise section.error("limits", f"{low:g} is not below {high:g}; give the least angle first, rad")
-        limits = (low, high)
+        limits = section.range("limits", "rad")
     names = columns.names("value", (1,))
     return JointColumns(
         file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
