@@ -28,7 +28,7 @@ class ClockOffset:
 
 
 def offset_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog) -> float:
-    """Coarse offset s (to about 10 ms): how fast the cameras [N, 4, 4] turned, against how fast the log's sensor turned.
+    """Coarse offset s (to about 10 ms): how fast the cameras [N, 4, 4] turned, against how fast the sensor turned.
 
     Speed of turning needs no calibration: it is the same for every point of a rigid scope. Raises NeecoError when the
     two never fit, or fit at several offsets.
@@ -47,8 +47,8 @@ def offset_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: P
     if scores[best] < CLEAR or scores[best] - rival < DISTINCT:
         raise NeecoError(
             f"{log.path}: its clock cannot be told from the images: the best offset ({offset:.2f} s) fits with "
-            f"correlation {scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake the scope at the start "
-            "of the recording"
+            f"correlation {scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake the scope at the "
+            "start of the recording"
         )
     return float(offset)
 

@@ -1,7 +1,7 @@
 """Put SfM's cameras into the tracker's frame, from a laparoscope that is tracked too.
 
-SfM knows the cameras up to a similarity; the tracker knows a sensor on the scope, up to a constant hand-eye transform and
-the offset of its clock. All of it is solved at once, robustly:
+SfM knows the cameras up to a similarity; the tracker knows a sensor on the scope, up to a constant hand-eye transform
+and the offset of its clock. All of it is solved at once, robustly:
 
     world_from_sensor(t_i + offset)  =  similarity(world_from_camera_sfm_i) @ camera_from_sensor
 """
@@ -60,7 +60,7 @@ def register_with_laparoscope(
 ) -> Registration:
     """Similarity, hand-eye and clock offset from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
 
-    The offset is estimated unless known; a known one is kept. Raises NeecoError when the scope moved too little to tell.
+    The offset is estimated unless known; a known one is kept. Raises NeecoError when the scope moved too little.
     """
     offset = known_offset
     if offset is None:
@@ -95,14 +95,18 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
     camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
     middle = len(cameras) // 2
     steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
-    a = np.concatenate([(camera_turns[i].inv() * camera_turns[j]).as_rotvec() for i, j in steps])  # [3N, 3] camera frame
-    b = np.concatenate([(sensor_turns[i].inv() * sensor_turns[j]).as_rotvec() for i, j in steps])  # [3N, 3] sensor frame
+    a = np.concatenate(
+        [(camera_turns[i].inv() * camera_turns[j]).as_rotvec() for i, j in steps]
+    )  # [3N, 3] camera frame
+    b = np.concatenate(
+        [(sensor_turns[i].inv() * sensor_turns[j]).as_rotvec() for i, j in steps]
+    )  # [3N, 3] sensor frame
     spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
     if spread[1] < MIN_TURN:
         raise NeecoError(
-            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg across "
-            "the others), so its hand-eye calibration cannot be found; record the scope turning about two axes by 10 deg "
-            "or more"
+            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
+            "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
+            "by 10 deg or more"
         )
     camera_from_sensor, _ = Rotation.align_vectors(a, b)
     world_from_sfm = (sensor_turns * camera_from_sensor.inv() * camera_turns.inv()).mean()

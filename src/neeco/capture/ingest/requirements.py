@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from types import ModuleType
 
 from neeco.errors import NeecoError
@@ -14,3 +15,9 @@ def optional_module(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise NeecoError("ingest: needs PyAV, OpenCV and pycolmap; pip install 'neeco[ingest]'") from error
+
+
+def require_installed(name: str) -> None:
+    """Raise the same NeecoError when `name` is absent, without importing it (pycolmap runs in its own process)."""
+    if importlib.util.find_spec(name) is None:
+        raise NeecoError("ingest: needs PyAV, OpenCV and pycolmap; pip install 'neeco[ingest]'")
