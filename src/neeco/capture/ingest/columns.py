@@ -175,7 +175,7 @@ def quaternion_form(names: Sequence[str]) -> str | None:
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("_" if name[:2] != "__" else "")
+    return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("%_" if name[:2] != "__" else "")
 
 
 def _position_names() -> list[tuple[bool, list[str]]]:

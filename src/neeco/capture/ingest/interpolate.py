@@ -208,7 +208,8 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     ridge[:, 1] = 1e-9
     ridge[:, 2] = np.where(used.sum(axis=1) < FEW, 1e6, 1e-9)
     # start from what the middle of the window says, so that one wild sample does not bend the first fit
-    middle = np.nanmedian(np.where(used[..., None], values, np.nan), axis=1, keepdims=True)
+    axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
+    middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
     residuals = np.linalg.norm(values - middle, axis=-1)
     scale = np.maximum(_median(residuals, used), noise)
     weights = near / (1 + (residuals / (3 * scale[:, None])) ** 2)
@@ -262,8 +263,9 @@ def _turns(quats: np.ndarray) -> np.ndarray:
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Median [N] of the used among values [N, K]."""
-    return np.nanmedian(np.where(used, values, np.nan), axis=1)
+    """Lower median [..., N] of the used among values [..., N, K]."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
+    return np.take_along_axis(ordered, (used.sum(axis=-1, keepdims=True) - 1) // 2, axis=-1)[..., 0]
 
 
 def _tricube(offsets: np.ndarray) -> np.ndarray:

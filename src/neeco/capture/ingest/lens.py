@@ -61,11 +61,11 @@ class Lens:
             return replace(self, distortion=(), size=size)
         matrix, _ = optional_module("cv2").getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
         fl_x, fl_y, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        sane = all(math.isfinite(value) for value in (fl_x, fl_y, cx, cy))
-        if not sane or not (0.3 < fl_x / self.fl_x < 5 and 0.3 < fl_y / self.fl_y < 5):
+        found = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
+        if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(found, size):
             listed = ", ".join(f"{value:g}" for value in self.distortion)
             raise NeecoError(f"lens: distortion {listed} folds the image over; calibrate again")
-        return Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
+        return found
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """An image uint8 [H, W, 3] (or [H, W]) as `pinhole` sees it, bilinear."""
@@ -81,6 +81,16 @@ class Lens:
         cv2 = optional_module("cv2")
         maps = _maps(self, (image.shape[1], image.shape[0]))
         return cv2.remap(image, *maps, getattr(cv2, interpolation), borderMode=cv2.BORDER_CONSTANT)
+
+    def _folds(self, pinhole: Lens, size: tuple[int, int]) -> bool:
+        """Whether somewhere in the undistorted image a ray farther out is not seen farther out."""
+        x = np.array([-pinhole.cx, size[0] - pinhole.cx]) / pinhole.fl_x
+        y = np.array([-pinhole.cy, size[1] - pinhole.cy]) / pinhole.fl_y
+        r2 = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), 200) ** 2
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * 8)[:8]
+        with np.errstate(all="ignore"):
+            seen = np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return not bool((np.diff(seen) > 0).all())
 
     def _matrix(self) -> np.ndarray:
         """K [3, 3] as OpenCV means it: the first pixel's centre at 0."""

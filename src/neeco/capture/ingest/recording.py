@@ -171,7 +171,9 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     """Video, images, fps and times of images."""
     video, images = top.value.get("video"), top.value.get("images")
     if (video is None) == (images is None):
-        raise top.error("video", "give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`")
+        raise top.error(
+            "video", "missing or given twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`"
+        )
     key, keys = ("video", ("file", "fps")) if images is None else ("images", ("folder", "fps", "times"))
     value = top.value[key]
     section = Section(top.file, key, value if isinstance(value, dict) else {keys[0]: value}, keys)

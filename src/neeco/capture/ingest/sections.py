@@ -31,9 +31,9 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
 
 
 class Section:
-    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys` (None: any)."""
+    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys`."""
 
-    def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...] | None) -> None:
+    def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...]) -> None:
         self.file, self.place = file, place
         if not isinstance(value, dict):
             where = f"{file}: {place}" if place else str(file)
@@ -42,7 +42,7 @@ class Section:
             )
         self.value: dict[str, Any] = value
         for key in value:
-            if keys is not None and key not in keys:
+            if key not in keys:
                 likely = close_match(str(key), keys)
                 hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
                 raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
@@ -115,10 +115,8 @@ class Section:
         items = value if isinstance(value, list) else [value]
         good = all(isinstance(item, str | int) and not isinstance(item, bool) for item in items)
         if not good or len(items) not in counts:
-            wanted = " or ".join(map(str, counts))
-            raise self.error(
-                key, f"expected {wanted} column name{'s' if counts != (1,) else ''}, found {shown(value)}; list them"
-            )
+            wanted = "the name of a column" if counts == (1,) else f"{' or '.join(map(str, counts))} names of columns"
+            raise self.error(key, f"expected {wanted}, found {shown(value)}; list them")
         if len({str(item) for item in items}) < len(items):
             raise self.error(key, "names a column twice; list different columns")
         return tuple(str(item) for item in items)
