@@ -103,7 +103,7 @@ def _residuals(result: IngestResult) -> str:
     registration = result.registration
     rows = result.registered_frames.astype(int)
     shown = rows >= 0  # frames that helped to register but were left out of the capture afterwards have no row
-    times = result.kept_times[rows[shown]]
+    times = result.kept_times[rows[shown]] - result.kept_times.min()
     positions, turns = registration.position_residual, np.degrees(registration.rotation_residual)
     charts = scatter(times, positions[shown], "position residual, mm", rms(positions))
     charts += scatter(times, turns[shown], "rotation residual, deg", rms(turns))
@@ -111,7 +111,7 @@ def _residuals(result: IngestResult) -> str:
         "<h2>Registration</h2><p>Where the laparoscope's tracker puts each camera, against where the images put it, "
         "after one similarity, hand-eye transform and clock offset for the whole recording. Even scatter is the "
         "tracker's noise; a slow wave is its drift or a bent scale; single spikes are frames to distrust.</p>"
-        f"<div class='curves'>{charts}</div><p class='soft'>Over video time, s; the line is the root mean square.</p>"
+        f"<div class='curves'>{charts}</div><p class='soft'>Over seconds since the first frame; the line is the root mean square.</p>"
     )
 
 
@@ -139,13 +139,13 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -
     length = axis_length(capture)
     figures = sample_figures(capture, result.shapes, axes, length)
     numbers = dict(zip(np.round(result.kept_times, 6).tolist(), result.kept.tolist(), strict=True))
-    cells = []
+    cells, start = [], min(frame.state.time for frame in capture.frames)
     for figure in figures:
         number = numbers.get(round(figure.frame.state.time, 6))
         place = figure.frame.name if number is None else f"video frame {number}"
         cells.append(
             f"<figure><img src='{figure.picture}' alt='{escape(place)}'><figcaption>{escape(place)}, "
-            f"{figure.frame.state.time:.2f} s <span class='tag'>{escape(figure.frame.split)}</span></figcaption>"
+            f"{figure.frame.state.time - start:.2f} s <span class='tag'>{escape(figure.frame.split)}</span></figcaption>"
             "</figure>"
         )
     return f"<h2>Frames</h2>{_frames_key(result, capture, axes, length)}<div class='samples'>{''.join(cells)}</div>"
