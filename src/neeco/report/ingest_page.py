@@ -111,7 +111,8 @@ def _residuals(result: IngestResult) -> str:
         "<h2>Registration</h2><p>Where the laparoscope's tracker puts each camera, against where the images put it, "
         "after one similarity, hand-eye transform and clock offset for the whole recording. Even scatter is the "
         "tracker's noise; a slow wave is its drift or a bent scale; single spikes are frames to distrust.</p>"
-        f"<div class='curves'>{charts}</div><p class='soft'>Over seconds since the first frame; the line is the root mean square.</p>"
+        f"<div class='curves'>{charts}</div><p class='soft'>Over seconds since the first frame; the line is the root "
+        "mean square.</p>"
     )
 
 
@@ -145,8 +146,8 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -
         place = figure.frame.name if number is None else f"video frame {number}"
         cells.append(
             f"<figure><img src='{figure.picture}' alt='{escape(place)}'><figcaption>{escape(place)}, "
-            f"{figure.frame.state.time - start:.2f} s <span class='tag'>{escape(figure.frame.split)}</span></figcaption>"
-            "</figure>"
+            f"{figure.frame.state.time - start:.2f} s <span class='tag'>{escape(figure.frame.split)}</span>"
+            "</figcaption></figure>"
         )
     return f"<h2>Frames</h2>{_frames_key(result, capture, axes, length)}<div class='samples'>{''.join(cells)}</div>"
 
