@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,9 +90,11 @@ def _recording(args: Ingest) -> Recording:
     from neeco.errors import NeecoError
 
     if args.source is not None:
-        if args.video or args.instrument or args.laparoscope or args.joint or args.calibration or args.intrinsics:
+        said = (args.video, args.instrument, args.laparoscope, args.joint, args.calibration, args.intrinsics, args.sync)
+        if any(said):
             raise NeecoError(f"{args.source}: says what was recorded; give that file or the options, not both")
-        return read_recording(args.source, frames=args.frames, sync=args.sync)
+        recording = read_recording(args.source)
+        return recording if args.frames is None else replace(recording, frames=args.frames)
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
     if args.intrinsics and args.calibration:
