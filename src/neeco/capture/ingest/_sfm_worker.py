@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+SWEEPS = 4  # over frames that have no camera yet
+MISFIT_PX = 3.0
+
 
 def say(stage: str, **facts: Any) -> None:
     print(json.dumps({"stage": stage, **facts}), flush=True)
@@ -58,18 +61,27 @@ def match(job: dict[str, Any], database: Path, work: Path) -> None:
     )
 
 
-def reconstruct(job: dict[str, Any], database: Path, work: Path) -> pycolmap.Reconstruction | None:
-    """Incremental mapping; the largest model, or None."""
+def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    refine = not job["camera_params"]
-    options.ba_refine_focal_length = refine
-    options.ba_refine_extra_params = refine
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not job["camera_params"]
     options.multiple_models = False
     options.num_threads = job["threads"]
     options.random_seed = 0
+    # the last adjustment is ours, after the instrument's features are gone; until then rough is enough
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    options.ba_global_max_num_iterations, options.ba_global_max_refinements = 20, 2
+    options.ba_local_max_num_iterations, options.ba_local_max_refinements = 10, 1
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
     options.mapper.init_min_tri_angle = 6.0  # a laparoscope moves little
     options.mapper.init_min_num_inliers = 50
     options.mapper.abs_pose_min_num_inliers = 15
+    return options
+
+
+def map_keyframes(job: dict[str, Any], database: Path, work: Path) -> pycolmap.Reconstruction | None:
+    """Incremental mapping of the keyframes; the largest model, or None."""
+    options = pipeline_options(job)
+    options.image_names = job["keyframes"]
     count = 2
 
     def on_image() -> None:
@@ -83,15 +95,46 @@ def reconstruct(job: dict[str, Any], database: Path, work: Path) -> pycolmap.Rec
     return max(models.values(), key=lambda model: model.num_reg_images()) if models else None
 
 
-def polish(model: pycolmap.Reconstruction, fixed_camera: bool, threads: int) -> None:
-    """A last bundle adjustment under a robust loss: highlights and the instrument's edges make outliers."""
+def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconstruction) -> None:
+    """Cameras of all other frames from the points the keyframes gave: mapping them too would take ten times as long.
+
+    Frames the keyframes do not reach are tried again after their neighbours have brought points of their own.
+    """
+    options = pipeline_options(job)
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    choice = pycolmap.DatabaseCacheOptions()
+    choice.min_num_matches = 15
+    cache = pycolmap.DatabaseCache.create(pycolmap.Database.open(str(database)), choice)
+    model.load(cache)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    for sweep in range(SWEEPS):
+        missing = [image for image in model.images.values() if not image.has_pose]
+        found = 0
+        for image in sorted(missing, key=lambda image: image.name):
+            if mapper.register_next_image(options.mapper, image.image_id):
+                found += 1
+                if sweep > 0:
+                    mapper.triangulate_image(options.triangulation, image.image_id)
+            say("mapping", done=model.num_reg_images(), total=len(job["names"]))
+        if found == 0:
+            break
+    mapper.end_reconstruction(False)
+
+
+def adjust(model: pycolmap.Reconstruction, job: dict[str, Any]) -> None:
+    """Bundle adjustment under a robust loss, misfits dropped, and again: highlights and edges make outliers."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = not fixed_camera
-    options.refine_extra_params = not fixed_camera
+    options.refine_focal_length = options.refine_extra_params = not job["camera_params"]
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = threads
-    pycolmap.bundle_adjustment(model, options)
+    options.ceres.solver_options.num_threads = job["threads"]
+    options.ceres.solver_options.function_tolerance = 1e-5
+    for iterations in (15, 30):
+        options.ceres.solver_options.max_num_iterations = iterations
+        pycolmap.bundle_adjustment(model, options)
+        observations = pycolmap.ObservationManager(model)
+        observations.filter_all_points3D(MISFIT_PX, 1.0)
 
 
 def save(model: pycolmap.Reconstruction, path: Path) -> None:
@@ -149,7 +192,8 @@ def main(job_file: str) -> int:
         model = found
         model_folder.mkdir()
         model.write(str(model_folder))
-    polish(model, bool(job["camera_params"]), job["threads"])
+    if "drop" in job:
+        adjust(model, job)
     save(model, work / "result.npz")
     say("done", images=model.num_reg_images(), points=model.num_points3D())
     return 0
@@ -163,7 +207,10 @@ def build(job: dict[str, Any], work: Path) -> pycolmap.Reconstruction | None:
     say("matching")
     match(job, database, work)
     say("mapping", done=0, total=len(job["names"]))
-    return reconstruct(job, database, work)
+    model = map_keyframes(job, database, work)
+    if model is not None:
+        register_others(job, database, model)
+    return model
 
 
 if __name__ == "__main__":

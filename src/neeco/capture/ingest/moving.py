@@ -23,7 +23,7 @@ MOVED = 1.5  # px of flow the still scene does not explain
 FRAMES = 60  # that shape is carved from
 CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid
-COVERED = 0.5  # of the best point's evidence, for a point to belong to the instrument
+COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
 MARGIN = 6  # px about its projection
 
 

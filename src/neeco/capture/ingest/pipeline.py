@@ -99,8 +99,9 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
             _write_images(work, kept, lens)
         assert pinhole is not None
         registration = _register(work, kept, sfm)
-        sfm, shapes = _without_instruments(work, kept, motion, sfm, pinhole, registration)
-        registration = _register(work, kept, sfm) if shapes else registration
+        doubtful, shapes = _on_instruments(work, kept, motion, sfm, pinhole, registration)
+        sfm = motion.adjust(sfm, doubtful, progress)
+        registration = _register(work, kept, sfm)
         return _finish(work, output, kept, sfm, pinhole, registration, shapes, visible)
 
 
@@ -283,17 +284,18 @@ def _instrument_poses(work: _Work, log: PoseLog, times: np.ndarray) -> tuple[np.
     return poses_at(log, times + clock.seconds)
 
 
-def _without_instruments(
+def _on_instruments(
     work: _Work,
     kept: np.ndarray,
     motion: StructureFromMotion,
     sfm: SfmResult,
     pinhole: Pinhole,
     registration: Registration | None,
-) -> tuple[SfmResult, dict[str, Shape]]:
-    """Carve each instrument's rough shape from what moves, and adjust the cameras again without features on it."""
+) -> tuple[np.ndarray, dict[str, Shape]]:
+    """bool [Q]: observations on an instrument, whose rough shape is carved from what moves with its pose."""
+    doubtful = np.zeros(len(sfm.observations), dtype=bool)
     if registration is None:
-        return sfm, {}
+        return doubtful, {}
     work.progress("finding the instrument", 0, 0)
     rows = np.unique(np.linspace(0, len(sfm.indices) - 1, FRAMES).astype(int))
     raw = {index: name for index, name in enumerate(motion.names)}
@@ -304,7 +306,6 @@ def _without_instruments(
 
     evidence = moving_pixels(load, sfm, pinhole, rows)
     cameras = registration.cameras(sfm.world_from_camera)
-    doubtful = np.zeros(len(sfm.observations), dtype=bool)
     shapes = {}
     for name, log in work.logs.poses.items():
         poses, valid = _instrument_poses(work, log, work.times[kept[sfm.indices]])
@@ -318,9 +319,7 @@ def _without_instruments(
             continue
         shapes[name] = shape
         doubtful |= _observations_on(shape, sfm, cameras, camera_from_instrument, valid, registration, pinhole, work)
-    if not shapes:
-        return sfm, {}
-    return motion.without(sfm, doubtful, work.progress), shapes
+    return doubtful, shapes
 
 
 def _observations_on(

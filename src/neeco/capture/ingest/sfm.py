@@ -16,10 +16,11 @@ import numpy as np
 from neeco.capture.ingest.requirements import require_installed
 from neeco.errors import NeecoError
 
-NEIGHBOURS = 8  # every frame is matched to this many after it, then to ones twice as far each time
-FARTHEST = 128
-LOOP_STRIDE = 12  # every so many frames, one that is matched to all others of its kind: closes loops
-FEATURES = 2000  # per image of 320 x 256 pixels; grows with the area
+KEYFRAMES = 80  # about so many frames are mapped; the others are placed among their points
+KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes a keyframe is matched with
+NEAR_KEYFRAMES = 3  # on each side of another frame, that it is matched with
+LOOP_STRIDE = 4  # every so many keyframes, one that is matched to all others of its kind: closes loops
+FEATURES = 1200  # per image
 MIN_IMAGES = 10
 
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
@@ -54,14 +55,26 @@ class SfmResult:
         return (self.lengths >= length) & (self.errors < error)
 
 
+def keyframes(count: int) -> list[int]:
+    """Indices of about KEYFRAMES images, evenly spread."""
+    return list(range(0, count, max(1, count // KEYFRAMES)))
+
+
 def image_pairs(count: int) -> list[tuple[int, int]]:
-    """Which images to match: neighbours in time, ever sparser farther off, and all pairs of every LOOP_STRIDE-th."""
-    steps = [*range(1, NEIGHBOURS + 1)]
-    while steps[-1] * 2 <= FARTHEST:
-        steps.append(steps[-1] * 2)
-    pairs = {(i, i + step) for step in steps for i in range(count - step)}
-    anchors = range(0, count, LOOP_STRIDE)
-    pairs |= {(i, j) for i in anchors for j in anchors if i < j}
+    """Which images to match: keyframes with keyframes near in time, sparser farther off and in loops; every other
+    frame with the keyframes around it and the frame before."""
+    keys = keyframes(count)
+    pairs = {(keys[i], keys[i + step]) for step in KEY_NEIGHBOURS for i in range(len(keys) - step)}
+    anchors = keys[::LOOP_STRIDE]
+    pairs |= {(a, b) for a in anchors for b in anchors if a < b}
+    stride = keys[1] - keys[0] if len(keys) > 1 else 1
+    for frame in range(count):
+        place = frame // stride
+        for near in range(place - NEAR_KEYFRAMES + 1, place + NEAR_KEYFRAMES + 1):
+            if 0 <= near < len(keys) and keys[near] != frame:
+                pairs.add((min(frame, keys[near]), max(frame, keys[near])))
+        if frame:
+            pairs.add((frame - 1, frame))
     return sorted(pairs)
 
 
@@ -89,12 +102,13 @@ class StructureFromMotion:
         }
 
     def reconstruct(self, progress: Progress) -> SfmResult:
-        """Cameras and points. Raises NeecoError when fewer than MIN_IMAGES images get a camera."""
+        """Cameras and points, not yet adjusted together. Raises NeecoError when fewer than MIN_IMAGES get a camera."""
         pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(len(self.names))]
-        return self._run(self.job | {"pairs": pairs}, progress)
+        keys = [self.names[index] for index in keyframes(len(self.names))]
+        return self._run(self.job | {"pairs": pairs, "keyframes": keys}, progress)
 
-    def without(self, found: SfmResult, doubtful: np.ndarray, progress: Progress) -> SfmResult:
-        """The same, adjusted again without the observations marked in `doubtful` [Q]."""
+    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: Progress) -> SfmResult:
+        """The same after bundle adjustment without the observations marked in `doubtful` [Q]."""
         rows = found.observations[doubtful]
         names = [self.names[index] for index in found.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
