@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,55 +15,32 @@ from PIL import Image
 
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.ingest.border import SAMPLES, visible_mask
-from neeco.capture.ingest.clocks import ClockOffset
-from neeco.capture.ingest.interpolate import poses_at, readings_at
 from neeco.capture.ingest.lens import Lens, read_lens
-from neeco.capture.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.capture.ingest.moving import FRAMES, Shape, carve_shape, moving_pixels, project_mask, project_points
-from neeco.capture.ingest.recording import TRACKER_CLOCK, Recording, Splits
+from neeco.capture.ingest.recording import Recording, Splits
 from neeco.capture.ingest.registration import Registration, register_with_laparoscope
 from neeco.capture.ingest.result import IngestResult
 from neeco.capture.ingest.select import choose_frames, look_over
 from neeco.capture.ingest.sfm import Pinhole, Progress, SfmResult, StructureFromMotion
 from neeco.capture.ingest.splits import LEFT_OUT, Assigned, assign_splits
-from neeco.capture.ingest.video import VideoSource
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.capture.ingest.work import (
+    States,
+    Work,
+    begin,
+    instrument_poses,
+    instruments_of,
+    note_once,
+    state_of,
+    states_at,
+    states_for_choice,
+)
+from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
 
 MOST_FRAMES = 400  # kept unless the recording asks for another number
 SCENE_MM = 100.0  # from the cameras to the tissue, taken when nothing measures it
-
-
-@dataclass
-class _Logs:
-    """What was logged, by instrument."""
-
-    poses: dict[str, PoseLog]
-    joints: dict[str, dict[str, ReadingLog]]
-    scope: PoseLog | None
-
-    @property
-    def notes(self) -> list[str]:
-        logs: list[PoseLog | ReadingLog] = [*self.poses.values(), *([self.scope] if self.scope else [])]
-        logs += [log for joints in self.joints.values() for log in joints.values()]
-        return [note for log in logs for note in log.notes]
-
-
-@dataclass
-class _Work:
-    """Where an ingest stands; filled step by step."""
-
-    recording: Recording
-    folder: Path  # for everything temporary
-    progress: Progress
-    video: VideoSource
-    times: np.ndarray  # [V] s, every video frame
-    logs: _Logs
-    notes: list[str]
-    clocks: dict[str, ClockOffset] = field(default_factory=dict)
-    dropped: dict[int, str] = field(default_factory=dict)  # video frame -> why
 
 
 def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResult:
@@ -76,7 +52,7 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise NeecoError(f"{output}: already exists; choose another --output")
     with _staging(output) as folder:
-        work = _begin(recording, folder, progress)
+        work = begin(recording, folder, progress)
         lens = read_lens(recording.intrinsics)
         if lens is not None:
             lens.check_size(work.video.size, recording.intrinsics)
@@ -119,50 +95,7 @@ def _staging(output: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _begin(recording: Recording, folder: Path, progress: Progress) -> _Work:
-    """Read the logs (quick, and wrong ones are found before the video is touched), then the video's times."""
-    progress("reading logs", 0, 0)
-    tracked = {item.name: read_pose_log(item.poses) for item in recording.instruments if item.poses is not None}
-    joints = {
-        item.name: {name: read_reading_log(source) for name, source in item.joints.items()}
-        for item in recording.instruments
-    }
-    scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
-    logs = _Logs(tracked, joints, scope)
-    progress("reading video", 0, 0)
-    video = recording.open()
-    notes = [*recording.notes, *logs.notes, *video.notes]
-    for item in recording.instruments:
-        if item.poses is None:
-            notes.append(f"instrument {item.name!r} was not tracked: it is left out of the capture's states")
-    if not tracked:
-        notes.append("no instrument was tracked: the capture has cameras and images only (methods 3dgs and 4dgs train)")
-    work = _Work(recording, folder, progress, video, video.frame_times(), logs, notes)
-    for name, seconds in recording.sync.items():
-        work.clocks[name] = ClockOffset(float(seconds), 0.0, "given")
-    _joint_clocks(work)
-    return work
-
-
-def _joint_clocks(work: _Work) -> None:
-    """A joint's own clock is given or taken to be the video's: images do not tell it to better than some 20 ms."""
-    for logs in work.logs.joints.values():
-        for name, log in logs.items():
-            if log.clock in work.clocks or log.clock == TRACKER_CLOCK:
-                continue
-            if log.times[-1] < work.times[0] or log.times[0] > work.times[-1]:
-                raise NeecoError(
-                    f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's (0 to "
-                    f"{work.times[-1]:g} s); give the offset of its clock: sync: {{{log.clock}: seconds}}"
-                )
-            work.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
-            work.notes.append(
-                f"the clock of joint {name!r} was not given and is taken to be the video's: at 1 rad/s, 20 ms off are "
-                "1.1 deg"
-            )
-
-
-def _choose(work: _Work) -> np.ndarray:
+def _choose(work: Work) -> np.ndarray:
     """Video frames to keep."""
     count = len(work.times)
 
@@ -172,7 +105,7 @@ def _choose(work: _Work) -> np.ndarray:
             yield image
 
     look = look_over(images())
-    states, usable = _states_for_choice(work)
+    states, usable = states_for_choice(work)
     limit = work.recording.frames or MOST_FRAMES
     selection = choose_frames(look, usable, states, limit)
     if work.recording.frames is None and count > MOST_FRAMES:
@@ -191,22 +124,7 @@ def _commonest(dropped: dict[int, str]) -> str:
     return max(set(reasons), key=reasons.count) if reasons else "the video is short"
 
 
-def _states_for_choice(work: _Work) -> tuple[np.ndarray, np.ndarray]:
-    """[V, 6 * instruments + joints] states for coverage, and where they are known; nothing while a clock is unknown."""
-    columns, usable = [np.zeros((len(work.times), 6))], np.ones(len(work.times), dtype=bool)
-    for log in work.logs.poses.values():
-        clock = work.clocks.get(log.clock)
-        if clock is None:
-            continue
-        poses, valid = poses_at(log, work.times + clock.seconds)
-        usable &= valid
-        arms = np.where(valid[:, None], poses[:, :3, 3], 0.0)
-        turns = np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0)
-        columns.append(np.concatenate([arms, turns], 1))
-    return np.concatenate(columns[1:] or columns, 1), usable
-
-
-def _write_images(work: _Work, kept: np.ndarray, lens: Lens | None) -> list[str]:
+def _write_images(work: Work, kept: np.ndarray, lens: Lens | None) -> list[str]:
     """Frames as PNG: as recorded while the lens is unknown, else undistorted."""
     folder = work.folder / "raw"
     folder.mkdir(exist_ok=True)
@@ -218,7 +136,7 @@ def _write_images(work: _Work, kept: np.ndarray, lens: Lens | None) -> list[str]
     return names
 
 
-def _visible(work: _Work, kept: np.ndarray, lens: Lens | None, names: list[str]) -> Path | None:
+def _visible(work: Work, kept: np.ndarray, lens: Lens | None, names: list[str]) -> Path | None:
     """Masks of the endoscope's dark border, one file per frame as SfM wants them; None without a border."""
     sample = kept[np.linspace(0, len(kept) - 1, min(SAMPLES, len(kept))).astype(int)]
     seen = visible_mask(image for _, image in work.video.read(np.unique(sample).tolist()))
@@ -243,11 +161,11 @@ def _pinhole(lens: Lens | None, size: tuple[int, int]) -> Pinhole | None:
     return Pinhole(straight.fl_x, straight.fl_y, straight.cx, straight.cy)
 
 
-def _register(work: _Work, kept: np.ndarray, sfm: SfmResult) -> Registration | None:
+def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | None:
     """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
     scope = work.logs.scope
     if scope is None:
-        _note_once(
+        note_once(
             work,
             "the laparoscope was not tracked: instrument poses stay in the tracker's frame (unregistered), and lengths "
             f"are scaled as if the tissue were {SCENE_MM:g} mm away",
@@ -259,33 +177,14 @@ def _register(work: _Work, kept: np.ndarray, sfm: SfmResult) -> Registration | N
     try:
         registration = register_with_laparoscope(sfm.world_from_camera, times, scope, known)
     except NeecoError as error:
-        _note_once(work, f"not registered, instrument poses stay in the tracker's frame: {error}")
+        note_once(work, f"not registered, instrument poses stay in the tracker's frame: {error}")
         return None
     work.clocks[scope.clock] = registration.clock
     return registration
 
 
-def _note_once(work: _Work, note: str) -> None:
-    if note not in work.notes:
-        work.notes.append(note)
-
-
-def _instrument_poses(work: _Work, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [N, 4, 4] in the tracker's frame at video times, and where known."""
-    clock = work.clocks.get(log.clock)
-    if clock is None:
-        if log.times[-1] < work.times[0] or log.times[0] > work.times[-1]:
-            raise NeecoError(
-                f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's, and nothing "
-                f"ties the clocks; give the offset: sync: {{{log.clock}: seconds}}"
-            )
-        clock = work.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
-        _note_once(work, f"the clock {log.clock!r} was not given and could not be found; it is taken to be the video's")
-    return poses_at(log, times + clock.seconds)
-
-
 def _on_instruments(
-    work: _Work,
+    work: Work,
     kept: np.ndarray,
     motion: StructureFromMotion,
     sfm: SfmResult,
@@ -308,7 +207,7 @@ def _on_instruments(
     cameras = registration.cameras(sfm.world_from_camera)
     shapes = {}
     for name, log in work.logs.poses.items():
-        poses, valid = _instrument_poses(work, log, work.times[kept[sfm.indices]])
+        poses, valid = instrument_poses(work, log, work.times[kept[sfm.indices]])
         camera_from_instrument = np.linalg.inv(cameras) @ np.where(valid[:, None, None], poses, np.eye(4))
         usable = valid[rows]
         shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], pinhole)
@@ -330,7 +229,7 @@ def _observations_on(
     valid: np.ndarray,
     registration: Registration,
     pinhole: Pinhole,
-    work: _Work,
+    work: Work,
 ) -> np.ndarray:
     """bool [Q]: observations that lie on the projected shape."""
     width, height = work.video.size
@@ -347,7 +246,7 @@ def _observations_on(
 
 
 def _finish(
-    work: _Work,
+    work: Work,
     output: Path,
     kept: np.ndarray,
     sfm: SfmResult,
@@ -362,7 +261,7 @@ def _finish(
     frames = kept[sfm.indices]
     times = work.times[frames]
     cameras, points = _placed(sfm, registration)
-    states, usable = _states(work, times)
+    states, usable = states_at(work, times)
     for frame in frames[~usable]:
         work.dropped[int(frame)] = "no instrument state at its time (gap in a log)"
     rule = _split(work, frames, states, usable)
@@ -374,7 +273,7 @@ def _finish(
         Frame(
             work.folder / "raw" / f"{frames[i]:06d}.png",
             Camera(torch.from_numpy(cameras[i].copy()), *optics, *work.video.size),
-            _state(states, int(i), float(times[i])),
+            state_of(states, int(i), float(times[i])),
             rule.names[i],
             visible / f"{frames[i]:06d}.png.png" if visible else None,
         )
@@ -383,7 +282,7 @@ def _finish(
     reliable = sfm.reliable_points()
     cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
     registered = registration is not None or not work.logs.poses
-    capture = Capture(work.folder, capture_frames, _instruments(work), cloud, registered)
+    capture = Capture(work.folder, capture_frames, instruments_of(work), cloud, registered)
     whole = work.folder / "capture"
     write_capture(capture, whole)
     if output.exists():
@@ -425,30 +324,7 @@ def _placed(sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarr
     return cameras, sfm.points * scale
 
 
-_States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
-
-
-def _states(work: _Work, times: np.ndarray) -> tuple[_States, np.ndarray]:
-    """Every tracked instrument's states at video times [N], and where all of them are known."""
-    states: _States = {}
-    usable = np.ones(len(times), dtype=bool)
-    for name, log in work.logs.poses.items():
-        poses, valid = _instrument_poses(work, log, times)
-        usable &= valid
-        readings = {}
-        for joint, reading in work.logs.joints[name].items():
-            values, known = readings_at(reading, times + work.clocks[reading.clock].seconds)
-            readings[joint] = values
-            usable &= known
-        states[name] = (poses, readings)
-    if not usable.any():
-        raise NeecoError(
-            f"{work.recording.path}: no frame has a state of every instrument; check the logs' clocks in `sync`"
-        )
-    return states, usable
-
-
-def _split(work: _Work, frames: np.ndarray, states: _States, usable: np.ndarray) -> Assigned:
+def _split(work: Work, frames: np.ndarray, states: States, usable: np.ndarray) -> Assigned:
     """By the first tracked instrument; frames without a state are LEFT_OUT."""
     names = np.full(len(frames), LEFT_OUT, dtype=object)
     poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
@@ -460,21 +336,3 @@ def _split(work: _Work, frames: np.ndarray, states: _States, usable: np.ndarray)
     )
     names[usable] = assigned.names
     return Assigned(tuple(names), assigned.rule)
-
-
-def _state(states: _States, row: int, time: float) -> State:
-    instruments = {
-        name: InstrumentState(
-            torch.from_numpy(poses[row].copy()), {joint: float(values[row]) for joint, values in joints.items()}
-        )
-        for name, (poses, joints) in states.items()
-    }
-    return State(instruments, time)
-
-
-def _instruments(work: _Work) -> tuple[Instrument, ...]:
-    return tuple(
-        Instrument(item.name, {name: source.limits for name, source in item.joints.items()})
-        for item in work.recording.instruments
-        if item.poses is not None
-    )
