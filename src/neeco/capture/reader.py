@@ -10,6 +10,7 @@ import numpy as np
 
 from neeco.capture.blender import is_blender_file, parse_blender
 from neeco.capture.colmap import find_model, parse_colmap
+from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.parsed import Parsed
 from neeco.capture.paths import inside
@@ -22,7 +23,7 @@ UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
-    """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, or a COLMAP model.
+    """Read a capture: neeco-capture/1, nerfstudio, Blender / D-NeRF transforms, a COLMAP model or an EndoNeRF folder.
 
     path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
     background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
@@ -63,7 +64,10 @@ def parse_capture(
         return parse_blender(blender_files, path, report, background)
     if (model := find_model(path)) is not None:
         return parse_colmap(model, path, report)
-    report.error("transforms.json", "", "no such file, nor transforms_train.json or a COLMAP model", "is it a capture?")
+    if is_endonerf_folder(path):
+        return parse_endonerf(path, report)
+    message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"
+    report.error("transforms.json", "", message, "is it a capture?")
     return Parsed(path)
 
 

@@ -21,6 +21,7 @@ from neeco.errors import NeecoError
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
     "check": "Tell everything that is wrong with a capture.",
+    "ingest": "Make a capture from a recording: video and tracker logs.",
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",

@@ -1,0 +1,165 @@
+"""Read EndoNeRF folders (Wang et al., MICCAI 2022): `poses_bounds.npy`, images/, masks/ and depth/.
+
+The poses are LLFF's (Mildenhall et al. 2019): a row of 17 numbers per image, 3x5 [R | t | height width focal] row by
+row, then the nearest and farthest depth; the columns of R are the camera's down, right and backwards axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neeco.capture.images import EXTENSIONS
+from neeco.capture.model import Frame, PointCloud, State
+from neeco.capture.parsed import Parsed, Place
+from neeco.capture.paths import inside
+from neeco.capture.points import random_points
+from neeco.capture.problems import Node, Report, shown
+from neeco.capture.transforms import TEST_EVERY
+from neeco.errors import NeecoError
+from neeco.raster.types import Camera
+
+POSES_FILE = "poses_bounds.npy"
+MASKS = "masks"
+COLUMNS = 17
+FIRST_TEST = 1  # frames 1, 9, 17, ... test, as in EndoGaussian, SurgicalGaussian and Deform3DGS: numbers compare
+STILL = 1e-6  # of a pose's entries: less is one still camera
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One image's row: camera pose (OpenCV axes), size, focal length and depth bounds, in the folder's own unit."""
+
+    world_from_camera: np.ndarray  # [4, 4]
+    width: int
+    height: int
+    focal: float
+    near: float
+    far: float
+
+
+def is_endonerf_folder(root: Path) -> bool:
+    """Whether a folder has EndoNeRF's poses."""
+    return (root / POSES_FILE).is_file()
+
+
+def parse_endonerf(root: Path, report: Report) -> Parsed:
+    """Read an EndoNeRF folder; problems and what such a folder lacks go to `report`. Lengths are in its own unit.
+
+    Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used;
+    where the depth bounds are usable, random points fill the space between them.
+    """
+    parsed = Parsed(root, timed=False, points_place=Place(POSES_FILE, "points"))
+    table = _load(root, report)
+    if table is None:
+        return parsed
+    images = folder_images(root, "images", report)
+    if len(images) != len(table):
+        message = f"has {len(table)} rows for {len(images)} images in images/"
+        report.error(POSES_FILE, "", message, "each image needs one row, in the order of the sorted names")
+        return parsed
+    rows = [_row(values, f"[{index}]", report) for index, values in enumerate(table)]
+    for order, (path, row) in enumerate(zip(images, rows, strict=True)):
+        if row is None:
+            continue
+        pose = torch.from_numpy(row.world_from_camera).float()
+        camera = Camera(pose, row.focal, row.focal, row.width / 2, row.height / 2, row.width, row.height)
+        split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
+        parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
+        parsed.places.append(Place(POSES_FILE, f"[{order}]"))
+    usable = [row for row in rows if row is not None]
+    parsed.points = _points(usable)
+    _say_what_is_missing(root, usable, report)
+    return parsed
+
+
+def folder_images(root: Path, folder: str, report: Report) -> list[Path]:
+    """The images in a folder of the capture, sorted by name; those that lead out of it are reported and left out."""
+    if not (root / folder).is_dir():
+        return []
+    paths = []
+    for path in sorted((root / folder).iterdir()):
+        if path.suffix not in EXTENSIONS:
+            continue
+        try:
+            paths.append(inside(root, root / folder, path.name))
+        except NeecoError as error:
+            message, _, remedy = str(error).partition("; ")
+            report.error(f"{folder}/{path.name}", "", message, remedy)
+    return paths
+
+
+def _load(root: Path, report: Report) -> np.ndarray | None:
+    """The table [N, 17] as float64."""
+    remedy = "write an array of N x 17 numbers with numpy.save"
+    try:
+        # mapped, so that a lying header cannot make us allocate more than the file holds
+        table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
+    except NeecoError as error:
+        message, _, way = str(error).partition("; ")
+        report.error(POSES_FILE, "", message, way)
+        return None
+    except Exception:  # damaged headers make numpy raise nearly anything
+        report.error(POSES_FILE, "", "is damaged or not an array of plain numbers", remedy)
+        return None
+    if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
+        report.error(POSES_FILE, "", "is not an array of plain numbers", remedy)
+        return None
+    if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
+        report.error(POSES_FILE, "", f"has shape {shown(table.shape)}, expected N x {COLUMNS}", remedy)
+        return None
+    return np.array(table, dtype=np.float64)
+
+
+def _row(values: np.ndarray, field: str, report: Report) -> _Row | None:
+    matrix = values[:15].reshape(3, 5)
+    down, right, back, origin = (matrix[:, column] for column in range(4))
+    with np.errstate(invalid="ignore"):
+        pose = np.stack([right, down, -back, origin], axis=1)
+    rigid = Node(pose.tolist(), POSES_FILE, field, report).rigid()
+    height, width, focal = (float(value) for value in matrix[:, 4])
+    sized = 1 <= height < 65_536 and 1 <= width < 65_536 and height % 1 == 0 and width % 1 == 0
+    if not (sized and np.isfinite(focal) and focal > 0):
+        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}"
+        report.error(POSES_FILE, field, message, "write whole pixels and a positive focal length in the fifth column")
+        return None
+    if rigid is None:
+        return None
+    return _Row(rigid, int(width), int(height), focal, float(values[15]), float(values[16]))
+
+
+def _points(rows: list[_Row]) -> PointCloud | None:
+    """Random points about the middle of the depth bounds; None when the bounds are unusable."""
+    good = [row for row in rows if np.isfinite([row.near, row.far]).all() and 0 <= row.near < row.far < 1e9]
+    if not good or len(good) < len(rows):
+        return None
+    middles = np.array([(row.near + row.far) / 2 for row in good])
+    forward = np.stack([row.world_from_camera[:3, 2] for row in good])
+    centers = np.stack([row.world_from_camera[:3, 3] for row in good]) + middles[:, None] * forward
+    half_width = max(0.5 * row.width / row.focal * middle for row, middle in zip(good, middles, strict=True))
+    half_depth = max(0.5 * (row.far - row.near) for row in good)
+    return random_points(centers.mean(axis=0), max(half_width, half_depth))
+
+
+def _say_what_is_missing(root: Path, rows: list[_Row], report: Report) -> None:
+    report.warning(
+        POSES_FILE, "instruments", "no instrument states", "only methods that need none can be trained, such as 3dgs"
+    )
+    report.warning(POSES_FILE, "units", "names no unit of length", "lengths are taken as mm: distances may be off")
+    poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
+    if len(poses) > 1 and np.ptp(poses, axis=0).max() < STILL:
+        message = "the camera never moves, so the images do not tell depth"
+        report.warning(POSES_FILE, "poses", message, "views other than the recorded one will be wrong")
+    elif len(poses) > 1:
+        message = "camera axes are taken as LLFF's: down, right, backwards"
+        remedy = "folders prepared for some EndoNeRF successors hold right, down, forwards: reorder those"
+        report.warning(POSES_FILE, "poses", message, remedy)
+    if (root / MASKS).is_dir():
+        message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
+        remedy = f"`neeco ingest {shown(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
+        report.warning(f"{MASKS}/", "", message, remedy)
+    if (root / "depth").is_dir():
+        report.warning("depth/", "", "depth maps are not read", "training starts from random points")

@@ -1,0 +1,137 @@
+"""Turn a folder that already holds cameras (nerfstudio, Blender / D-NeRF, COLMAP, EndoNeRF) into a capture."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from neeco.capture.colmap import find_model
+from neeco.capture.endonerf import MASKS, folder_images, is_endonerf_folder
+from neeco.capture.images import read_mask, write_labels
+from neeco.capture.model import Capture, Frame
+from neeco.capture.parsed import Parsed
+from neeco.capture.problems import Problem, Report
+from neeco.capture.reader import parse_capture, stand_in_points
+from neeco.capture.transforms import SCHEMA, parses_as_json
+from neeco.capture.writer import write_capture
+from neeco.errors import NeecoError
+
+
+def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
+    """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
+
+    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool. The capture appears
+    whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output`
+    exists already, and when the disk refuses.
+    """
+    folder, output = Path(folder), Path(output)
+    if os.path.lexists(output) and not _is_empty_folder(output):
+        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
+    report = Report()
+    parsed = parse_capture(folder, report)
+    if not parsed.frames and not report.problems:
+        report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
+    tool_masks = _tool_masks(parsed, report) if _is_endonerf(folder) else []
+    report.raise_first(folder)
+    points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}."))
+    except OSError as error:
+        raise NeecoError(f"{output}: cannot write here: {error.strerror or error}") from error
+    try:
+        frames = _with_tool_masks(parsed.frames, tool_masks, work / "tool")
+        capture = Capture(parsed.root, tuple(frames), parsed.instruments, points, parsed.registered)
+        write_capture(capture, work / "capture")
+        os.chmod(work / "capture", 0o755)
+        os.replace(work / "capture", output)
+    except OSError as error:
+        raise NeecoError(f"{output}: cannot write: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return (*_lacking(parsed, folder, masked=bool(tool_masks)), *_warnings(report))
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink() and not any(path.iterdir())
+
+
+def _is_endonerf(folder: Path) -> bool:
+    """Whether the reader takes this folder as EndoNeRF's: the other formats come first."""
+    if not is_endonerf_folder(folder) or find_model(folder) is not None:
+        return False
+    names = ("transforms.json", *(f"transforms_{split}.json" for split in ("train", "val", "test")))
+    return not any((folder / name).is_file() for name in names)
+
+
+def _tool_masks(parsed: Parsed, report: Report) -> list[Path]:
+    """Each frame's tool mask, in the order of the sorted names; [] where there are none."""
+    paths = folder_images(parsed.root, MASKS, report)
+    if paths and len(paths) != len(parsed.frames):
+        message = f"has {len(paths)} masks for {len(parsed.frames)} images"
+        report.error(f"{MASKS}/", "", message, "each image needs one, in the order of the sorted names")
+    return paths
+
+
+def _with_tool_masks(frames: list[Frame], tool_masks: list[Path], work: Path) -> list[Frame]:
+    """Frames whose loss mask ignores what their tool mask shows white. Raises NeecoError for a damaged mask."""
+    if not tool_masks:
+        return frames
+    masked = []
+    for frame, path in zip(frames, tool_masks, strict=True):
+        tool = read_mask(path, (frame.camera.width, frame.camera.height))
+        loss_path = work / f"{frame.name}.png"
+        write_labels(loss_path, (~tool).to(torch.uint8) * 255)
+        masked.append(replace(frame, mask_path=loss_path))
+    return masked
+
+
+def _lacking(parsed: Parsed, folder: Path, *, masked: bool) -> list[str]:
+    """What the capture lacks, and what that costs."""
+    sentences = []
+    if not parsed.instruments:
+        sentences.append(
+            "No instrument states: the methods that pose an instrument (kinematic, neeco) cannot be trained, only "
+            "those that need no state, such as 3dgs; nothing can be synthesised in new states."
+        )
+    for instrument in parsed.instruments:
+        if not instrument.joints:
+            sentences.append(f"{instrument.name} has no joint readings: its jaws can only move with its pose.")
+    if parsed.instruments and not parsed.registered:
+        sentences.append("Instrument poses stay in their own frame (instrument_frame: unregistered), not the cameras'.")
+    if not _says_units(folder):
+        sentences.append(
+            "The source names no unit of length: numbers are kept and read as mm, so lengths may be off by one factor."
+        )
+    if parsed.points is None or not parsed.points.measured:
+        sentences.append("No sparse points: training starts from random ones, and gets less.")
+    if not parsed.timed:
+        sentences.append("No times: the order of the frames stands in for seconds.")
+    if masked:
+        sentences.append("Tool masks became loss masks: the tool's pixels are ignored, so the tool is not learned.")
+    splits = Counter(frame.split for frame in parsed.frames)
+    if not splits["test"]:
+        sentences.append("No test frames: nothing will tell how good the scene is.")
+    return sentences
+
+
+def _says_units(folder: Path) -> bool:
+    file = folder if folder.is_file() else folder / "transforms.json"
+    document = parses_as_json(file)
+    return document.get("units") is not None or document.get("schema") == SCHEMA
+
+
+def _warnings(report: Report) -> list[str]:
+    """The reader's warnings, without those that `_lacking` says or that converting settles."""
+    said = {"instruments", "units"}
+
+    def is_new(problem: Problem) -> bool:
+        return problem.severity == "warning" and problem.field not in said and problem.file != f"{MASKS}/"
+
+    return [str(problem) for problem in report.problems if is_new(problem)]

@@ -1,0 +1,156 @@
+"""`neeco ingest`: from a video and logs to a capture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+if TYPE_CHECKING:
+    from neeco.capture.ingest.recording import Recording
+    from neeco.capture.ingest.result import IngestResult
+
+PAGE = "ingest.html"
+
+
+@dataclass(frozen=True)
+class Ingest:
+    """Make a capture from a recording: video and tracker logs; says how good it is in CAPTURE/ingest.html."""
+
+    source: Annotated[Path | None, tyro.conf.Positional] = None
+    """recording.yaml, or a folder in another format to convert (nerfstudio, Blender, COLMAP, EndoNeRF)."""
+    output: Path | None = None
+    """Folder of the capture to write; must not exist."""
+    video: Path | None = None
+    """Video file, or a folder of images."""
+    fps: float | None = None
+    """Frames per second, where the video does not say or is wrong."""
+    instrument: Path | None = None
+    """CSV log of the instrument's tracker."""
+    laparoscope: Path | None = None
+    """CSV log of the laparoscope's tracker; it puts the cameras into the tracker's frame, in mm."""
+    joint: Annotated[tuple[tuple[str, Path, Path], ...], tyro.conf.UseAppendAction] = ()
+    """Joint sensor: NAME LOG.csv CALIBRATION.csv (counts and angles). May be given several times."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """FX FY CX CY in pixels; estimated with distortion when left out."""
+    calibration: Path | None = None
+    """Intrinsics from a file instead: OpenCV/ROS YAML or nerfstudio JSON."""
+    sync: Path | None = None
+    """JSON with clock offsets (t_log = t_video + offset); found from the images when left out."""
+    frames: int | None = None
+    """How many frames to keep, spread over states and views."""
+    init: bool = False
+    """Look at the files in SOURCE (a folder; default: here) and write a commented recording.yaml into it."""
+    json: bool = False
+    """Print the numbers as JSON."""
+
+
+def run(args: Ingest) -> int:
+    """Ingest, convert, or write a template."""
+    from neeco.errors import NeecoError
+
+    if args.init:
+        return _init(args.source or Path())
+    if args.output is None:
+        raise NeecoError("--output: give the folder of the capture to write")
+    if args.source is not None and args.source.is_dir():
+        return _convert(args.source, args.output)
+    return _ingest(_recording(args), args.output, args.json)
+
+
+def _init(folder: Path) -> int:
+    from neeco.capture.ingest.template import write_template
+    from neeco.errors import NeecoError
+    from neeco.files import write_text
+
+    path = folder / "recording.yaml"
+    if path.exists():
+        raise NeecoError(f"{path}: already exists; edit it, or move it away first")
+    write_text(path, write_template(folder))
+    print(f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE")
+    return 0
+
+
+def _convert(folder: Path, output: Path) -> int:
+    from neeco.capture.ingest.convert import convert_folder
+
+    for sentence in convert_folder(folder, output):
+        print(f"note: {sentence}")
+    print(f"capture: {output}  (next: neeco check {output})")
+    return 0
+
+
+def _recording(args: Ingest) -> Recording:
+    from neeco.capture.ingest.recording import read_recording, recording_from_flags
+    from neeco.errors import NeecoError
+
+    if args.source is not None:
+        said = (args.video, args.instrument, args.laparoscope, args.joint, args.calibration, args.intrinsics, args.sync)
+        if any(said):
+            raise NeecoError(f"{args.source}: says what was recorded; give that file or the options, not both")
+        recording = read_recording(args.source)
+        return recording if args.frames is None else replace(recording, frames=args.frames)
+    if args.video is None:
+        raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
+    if args.intrinsics and args.calibration:
+        raise NeecoError("--calibration: given beside --intrinsics; give one of them")
+    return recording_from_flags(
+        args.video,
+        args.instrument,
+        args.laparoscope,
+        args.joint,
+        args.calibration or args.intrinsics,
+        args.sync,
+        args.frames,
+        args.fps,
+    )
+
+
+def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
+    from neeco.capture import check_capture
+    from neeco.capture.ingest.pipeline import ingest
+    from neeco.report.ingest_page import write_ingest_page
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def report(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                for task in tasks.values():
+                    bar.update(task, total=1, completed=1)
+                tasks[what] = bar.add_task(what, total=total or None)
+            bar.update(tasks[what], completed=done, total=total or None)
+
+        result = ingest(recording, output, report)
+        report("writing the page", 0, 0)
+        write_ingest_page(result, output / PAGE)
+    if as_json:
+        print(json.dumps(result.as_json(), indent=2))
+        return 0
+    _print(result)
+    problems = check_capture(output)
+    print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
+    print(f"how good it is: {output / PAGE}")
+    return 0
+
+
+def _print(result: IngestResult) -> None:
+    numbers = result.as_json()
+    print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
+    if result.registration is None:
+        print("not registered: instrument poses stay in their tracker's frame")
+    else:
+        fit = numbers["registration"]
+        print(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
+    for name, clock in result.clocks.items():
+        spread = f" +- {1000 * clock.sd:.1f}" if clock.sd > 0 else ""
+        print(f"clock {name}: {1000 * clock.seconds:.1f}{spread} ms ({clock.source})")
+    for note in result.notes:
+        print(f"note: {note}")

@@ -1,0 +1,185 @@
+"""Which states a capture holds: every degree of freedom of every instrument, by split, and where training ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import Capture
+from neeco.report.curves import nice_ticks
+
+WIDTH, HEIGHT = 340, 150  # view box units
+LEFT, RIGHT, TOP, BOTTOM = 12, 12, 26, 22
+BINS = 24
+SLACK = 0.02  # of the trained range: a state outside by less is not called outside
+CONSTANT = 1e-6  # mm or deg
+SPLIT_CLASSES = {"train": "s-train", "test": "s-test", "unseen": "s-unseen"}
+
+
+@dataclass(frozen=True)
+class Degree:
+    """One degree of freedom over the frames that have it. values [N] in `unit`; splits: N names."""
+
+    instrument: str
+    name: str
+    unit: str  # mm or deg
+    values: np.ndarray
+    splits: tuple[str, ...]
+
+    def of(self, split: str) -> np.ndarray:
+        return self.values[np.array(self.splits) == split]
+
+    @property
+    def trained(self) -> tuple[float, float] | None:
+        """Lowest and highest value of the training frames; None when there are none."""
+        values = self.of("train")
+        return (float(values.min()), float(values.max())) if len(values) else None
+
+    def outside(self, split: str) -> np.ndarray:
+        """The values of a split that lie beyond the trained range."""
+        values, trained = self.of(split), self.trained
+        if trained is None:
+            return values
+        slack = SLACK * (trained[1] - trained[0])
+        return values[(values < trained[0] - slack) | (values > trained[1] + slack)]
+
+
+def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) -> list[Degree]:
+    """Position x, y, z mm; pitch, yaw, roll deg about the mean direction of the training frames; each joint.
+
+    main_axes: each instrument's long axis [3] in its own frame; roll is about it. Where it is not known the tracked
+    frame's z axis stands in. Pitch, yaw and roll are intrinsic rotations in that order, away from the mean.
+    """
+    degrees = []
+    for instrument in capture.instruments:
+        frames = [frame for frame in capture.frames if instrument.name in frame.state.instruments]
+        if not frames:
+            continue
+        states = [frame.state.instruments[instrument.name] for frame in frames]
+        splits = tuple(frame.split for frame in frames)
+        poses = np.stack([state.pose.numpy() for state in states])
+        columns = [(f"position {axis}", "mm", poses[:, row, 3]) for row, axis in enumerate("xyz")]
+        turns = _turns(poses[:, :3, :3], splits, main_axes.get(instrument.name, np.array([0.0, 0.0, 1.0])))
+        columns += [(name, "deg", turns[:, index]) for index, name in enumerate(("pitch", "yaw", "roll"))]
+        for joint in instrument.joints:
+            values = np.array([state.joints.get(joint, np.nan) for state in states])
+            sliding = joint.endswith("_mm")
+            columns.append((joint, "mm" if sliding else "deg", values if sliding else np.degrees(values)))
+        for name, unit, values in columns:
+            known = np.isfinite(values)
+            kept = tuple(split for split, keep in zip(splits, known, strict=True) if keep)
+            if known.any():
+                degrees.append(Degree(instrument.name, name, unit, values[known], kept))
+    return degrees
+
+
+def _turns(rotations: np.ndarray, splits: Sequence[str], main_axis: np.ndarray) -> np.ndarray:
+    """[N, 3] pitch, yaw, roll in deg of rotations [N, 3, 3] away from the mean of the training frames."""
+    trained = np.array([split == "train" for split in splits])
+    turns = Rotation.from_matrix(rotations)
+    mean = turns[trained].mean() if trained.any() else turns.mean()
+    axis = main_axis / np.linalg.norm(main_axis)
+    helper = np.eye(3)[np.abs(axis).argmin()]
+    across = np.cross(helper, axis) / np.linalg.norm(np.cross(helper, axis))
+    basis = Rotation.from_matrix(np.stack([across, np.cross(axis, across), axis], axis=1))
+    return np.asarray((basis.inv() * mean.inv() * turns * basis).as_euler("XYZ", degrees=True))
+
+
+def extrapolations(degrees: Sequence[Degree]) -> list[str]:
+    """One sentence for every degree of freedom of which a capture's own frames leave the trained range."""
+    several = len({degree.instrument for degree in degrees}) > 1
+    sentences = []
+    for degree in degrees:
+        trained = degree.trained
+        if trained is None:
+            continue
+        parts = []
+        for split in dict.fromkeys(degree.splits):
+            outside, count = degree.outside(split), len(degree.of(split))
+            if split != "train" and len(outside):
+                reach = f"{_number(outside.min())} … {_number(outside.max())}" if len(outside) > 1 else ""
+                reach = reach or _number(float(outside[0]))
+                parts.append(f"{len(outside)} of {count} {split} frames ({reach} {degree.unit})")
+        if parts:
+            name = f"{degree.instrument} {degree.name}" if several else degree.name
+            low, high = map(_number, trained)
+            sentences.append(f"{name}: trained from {low} to {high} {degree.unit}; outside it {', '.join(parts)}.")
+    return sentences
+
+
+def unvisited(degrees: Sequence[Degree]) -> list[str]:
+    """Stretches inside the trained range, a tenth of it or longer, that no training frame visits."""
+    several = len({degree.instrument for degree in degrees}) > 1
+    sentences = []
+    for degree in degrees:
+        values = np.sort(degree.of("train"))
+        if len(values) < 2 or np.ptp(values) < CONSTANT:
+            continue
+        steps = np.diff(values)
+        name = f"{degree.instrument} {degree.name}" if several else degree.name
+        sentences += [
+            f"{name}: nothing between {_number(values[place])} and {_number(values[place + 1])} {degree.unit}."
+            for place in np.flatnonzero(steps > 0.1 * np.ptp(values))
+        ]
+    return sentences
+
+
+def histogram(degree: Degree) -> str:
+    """Stacked bars of a degree of freedom, coloured by split; ground outside the trained range is shaded."""
+    low, high = float(degree.values.min()), float(degree.values.max())
+    title = escape(f"{degree.name}, {degree.unit}")
+    trained = degree.trained
+    said = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
+    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="frames over {title}; {said}">']
+    parts.append(f'<text class="title" x="{LEFT}" y="15">{title}</text>')
+    if high - low < CONSTANT:
+        parts.append(f'<text x="{LEFT}" y="{HEIGHT / 2}">always {_number(low)}</text></svg>')
+        return "".join(parts)
+    parts.append(f'<text x="{WIDTH - RIGHT}" y="15" text-anchor="end">{said}</text>')
+    margin = 0.02 * (high - low)
+    left, right = low - margin, high + margin
+    base = HEIGHT - BOTTOM
+
+    def across(value: float) -> float:
+        return LEFT + (value - left) / (right - left) * (WIDTH - LEFT - RIGHT)
+
+    for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
+        if across(end) - across(start) > 4:
+            parts.append(
+                f'<rect class="beyond" x="{across(start):.1f}" y="{TOP}" width="{across(end) - across(start):.1f}" '
+                f'height="{base - TOP}"/>'
+            )
+    parts += _bars(degree, np.linspace(low, high, BINS + 1), across, base)
+    parts.append(f'<path class="grid" d="M{LEFT} {base}H{WIDTH - RIGHT}"/>')
+    for tick in nice_ticks(low, high, 4):
+        anchor = "start" if across(tick) < 20 else "end" if across(tick) > WIDTH - 20 else "middle"
+        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - 6}" text-anchor="{anchor}">{_number(tick)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def _bars(degree: Degree, edges: np.ndarray, across: Callable[[float], float], base: float) -> list[str]:
+    names = sorted(set(degree.splits), key=lambda name: [*SPLIT_CLASSES, name].index(name))
+    counts = np.stack([np.histogram(degree.of(name), edges)[0] for name in names])
+    tallest = max(1, int(counts.sum(axis=0).max()))
+    unit = (base - TOP) / tallest
+    bars = []
+    for column, (start, end) in enumerate(pairwise(edges)):
+        floor = base
+        for name, count in zip(names, counts[:, column], strict=True):
+            if count:
+                floor -= count * unit
+                bars.append(
+                    f'<rect class="{SPLIT_CLASSES.get(name, "s-other")}" x="{across(start) + 0.5:.1f}" y="{floor:.1f}" '
+                    f'width="{across(end) - across(start) - 1:.1f}" height="{count * unit:.1f}"/>'
+                )
+    return bars
+
+
+def _number(value: float) -> str:
+    text = f"{value:.0f}" if abs(value) >= 20 else f"{value:.1f}" if abs(value) >= 2 else f"{value:.2g}"
+    return "0" if float(text) == 0 else text.replace("-", "−")

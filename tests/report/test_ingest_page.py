@@ -1,0 +1,280 @@
+"""The ingest page says how good a capture is, in one offline file, whatever parts the recording had."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neeco.capture import read_capture
+from neeco.capture.ingest.clocks import ClockOffset
+from neeco.capture.ingest.moving import Shape
+from neeco.capture.ingest.registration import Registration
+from neeco.capture.ingest.result import IngestResult
+from neeco.errors import NeecoError
+from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
+from neeco.report.ingest_figures import in_view, main_axes
+from neeco.report.ingest_page import write_ingest_page
+from neeco.report.tracks import read_tracks
+from neeco.report.verdict import give_verdict
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
+VOID = {"meta", "img", "br", "path", "rect"}
+TIP_MM = 24.0
+
+
+class Page(HTMLParser):
+    """Collects references and checks that elements close in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.references, self.tags = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.references += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def shaft() -> Shape:
+    """The sample's instrument, roughly: a rod along its z axis that comes in from behind."""
+    z, x = np.meshgrid(np.arange(-40, TIP_MM + 1, 2.0), [-2.0, 0.0, 2.0])
+    return Shape(np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), 2.0, 0.8)
+
+
+def made(folder: Path, **changes) -> IngestResult:
+    """A result about the capture in `folder`, with a registration that is right to 0.5 mm."""
+    capture = read_capture(folder)
+    count = len(capture.frames)
+    times = np.array([frame.state.time for frame in capture.frames])
+    clock = ClockOffset(0.0388, 0.0012, "scope motion")
+    registration = Registration(
+        4.4,
+        np.eye(3),
+        np.zeros(3),
+        np.eye(4),
+        clock,
+        0.004,
+        np.full(count, 0.5),
+        np.full(count, 0.003),
+        np.arange(count),
+    )
+    dropped = tuple((frame, f"blurred: {frame % 50}% of its neighbours' sharpness") for frame in (96, 97, 98, 105))
+    result = IngestResult(
+        folder, "rec <1>.yaml", 106, 25.0, (240, 192), np.arange(count), times, (*dropped, (99, "no camera")),
+        {"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration, np.arange(count), 0.36,
+        len(capture.points.positions), {capture.instruments[0].name: shaft()} if capture.instruments else {},
+        "unseen: jaw_angle above 59 deg", ("12 rows dropped: <NaN>",),
+    )  # fmt: skip
+    return replace(result, **changes)
+
+
+def edited(folder: Path, change) -> Path:
+    """A copy of the sample with its transforms.json changed."""
+    shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns("truth"))
+    document = json.loads((folder / "transforms.json").read_text())
+    change(document)
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "ingest.html"
+    write_ingest_page(made(SAMPLE), path)
+    return path.read_text()
+
+
+def test_the_page_is_whole_and_fetches_nothing(text):
+    page = Page()
+    page.feed(text)
+    assert page.open == []
+    assert len(page.references) == 8
+    assert all(reference.startswith("data:image/jpeg") for reference in page.references)
+    assert "http" not in text
+    assert page.tags.count("svg") == 2 + 2 + 7  # residuals, views, degrees of freedom
+    assert "prefers-color-scheme: dark" in text
+    assert 'name="viewport"' in text
+
+
+def test_the_page_says_the_numbers(text):
+    for piece in ("Ready to train", "0.50 mm", "0.17°", "0.36 px", "+38.8", "±1.2", "scope motion", "−9.7"):
+        assert piece in text
+    assert "rms 0.5, largest 0.5" in text
+    assert "unseen: jaw_angle above 59 deg" in text
+
+
+def test_what_was_dropped_is_grouped_by_reason_with_frame_numbers(text):
+    assert "<td>blurred: …% of its neighbours&#x27; sharpness</td><td>4</td>" in text
+    assert "96–98, 105" in text
+    assert "<td>no camera</td><td>1</td>" in text
+
+
+def test_what_the_user_wrote_is_shown_as_text_not_as_markup(text):
+    assert "rec &lt;1&gt;.yaml" in text
+    assert "&lt;NaN&gt;" in text
+
+
+def test_the_view_that_turns_brings_its_data_and_runs_no_foreign_script(text):
+    data = json.loads(re.search(r"const data = (\{.*?\});\n", text)[1])
+    capture = read_capture(SAMPLE)
+    assert len(b64decode(data["lines"][0])) == 6 * len(capture.frames)
+    assert len(data["lines"]) == 2
+    assert len(b64decode(data["points"])) == 2 * len(b64decode(data["colors"]))
+
+
+def test_the_tracked_frame_is_drawn_where_the_instrument_is(tmp_path):
+    def first_picture(**changes):
+        write_ingest_page(made(SAMPLE, **changes), tmp_path / "page.html")
+        uri = re.search(r"src='data:image/jpeg;base64,([^']*)'", (tmp_path / "page.html").read_text())[1]
+        return np.asarray(Image.open(io.BytesIO(b64decode(uri))).convert("RGB")).astype(int)
+
+    capture = read_capture(SAMPLE)
+    frame = min(capture.frames, key=lambda frame: frame.state.time)
+    camera, state = frame.camera, next(iter(frame.state.instruments.values()))
+    pose = camera.world_from_camera.double().numpy()
+    x, y, z = (state.pose.numpy()[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
+    drawn, without_shape = first_picture(), first_picture(shapes={})
+    scale = drawn.shape[1] / camera.width
+    column, row = round((camera.fx * x / z + camera.cx) * scale), round((camera.fy * y / z + camera.cy) * scale)
+    assert drawn[row, column].min() > 200  # the white dot at the frame's origin
+    photograph = np.asarray(Image.open(frame.image_path).convert("RGB").resize(drawn.shape[1::-1])).astype(int)
+    changed = np.abs(without_shape - photograph).max(axis=2) > 120
+    assert changed.any()
+    assert np.hypot(*(np.argwhere(changed) - [row, column]).T).max() < 0.3 * drawn.shape[1]
+    assert (np.abs(drawn - without_shape).max(axis=2) > 120).sum() > 200  # outline and long axis
+
+
+def test_the_tip_is_the_end_that_is_in_view():
+    capture = read_capture(SAMPLE)
+    name = capture.instruments[0].name
+    axis = main_axes(capture, {name: shaft()})[name]
+    assert axis.tip[2] == pytest.approx(TIP_MM, abs=3)
+    assert axis.direction[2] == pytest.approx(1, abs=0.01)
+    assert in_view(capture, name)[1] == len(capture.frames)
+
+
+def test_extrapolation_is_found_where_the_sample_has_it():
+    capture = read_capture(SAMPLE)
+    degrees = degrees_of_freedom(capture, {capture.instruments[0].name: np.array([0.0, 0.0, 1.0])})
+    assert [degree.name for degree in degrees[3:]] == ["pitch", "yaw", "roll", "jaw_angle"]
+    told = extrapolations(degrees)
+    assert any(sentence.startswith("jaw_angle: trained from 0") for sentence in told)
+    assert any(sentence.startswith("roll: ") for sentence in told)
+    assert not any(" test frames" in sentence for sentence in told if sentence.startswith("jaw_angle"))
+    jaw = degrees[-1]
+    hole = replace(jaw, values=np.where(jaw.values > 30, jaw.values + 30, jaw.values))
+    assert any(sentence.startswith("jaw_angle: nothing between") for sentence in unvisited([hole]))
+
+
+def test_roll_about_the_long_axis_is_roll_alone():
+    capture = read_capture(SAMPLE)
+    name = capture.instruments[0].name
+    frames = []
+    start = capture.frames[0].state.instruments[name]
+    for frame, angle in zip(capture.frames, np.linspace(-0.7, 0.7, len(capture.frames)), strict=True):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose = start.pose @ start.pose.new_tensor(turn)
+        frames.append(
+            replace(frame, split="train", state=replace(frame.state, instruments={name: replace(start, pose=pose)}))
+        )
+    degrees = {
+        d.name: d for d in degrees_of_freedom(replace(capture, frames=tuple(frames)), {name: np.array([0, 0, 1.0])})
+    }
+    assert np.ptp(degrees["roll"].values) == pytest.approx(np.degrees(1.4))
+    assert np.abs(degrees["pitch"].values).max() < 1e-6
+    assert np.abs(degrees["yaw"].values).max() < 1e-6
+
+
+def test_the_side_view_has_the_tissue_ahead_of_the_camera():
+    tracks = read_tracks(read_capture(SAMPLE))
+    assert np.median(tracks.points[:, 2]) > tracks.camera[:, 2].max()
+    assert (tracks.looking[:, 2] > 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "piece"),
+    [
+        ({}, "good", "Ready to train"),
+        ({"reprojection_px": 1.7}, "careful", "1.70 px"),
+        ({"reprojection_px": 4.0}, "bad", "4.00 px"),
+        ({"points": 40}, "careful", "40 tissue points"),
+        ({"clocks": {"em": ClockOffset(0.0, 0.08, "scope motion")}}, "bad", "Clock em"),
+        ({"clocks": {"jaw_angle": ClockOffset(0.0, float("nan"), "assumed")}}, "careful", "jaw_angle"),
+        ({"dropped": tuple((i, "blurred") for i in range(60))}, "careful", "60 of 106"),
+        ({"dropped": tuple((i, "not among the 40 that cover") for i in range(60))}, "good", "Ready"),
+    ],
+)  # fmt: skip
+def test_the_verdict_names_what_is_doubtful(changes, level, piece):
+    verdict = give_verdict(made(SAMPLE, **changes), read_capture(SAMPLE))
+    assert verdict.level == level
+    assert piece in " ".join([verdict.headline, *verdict.doubts])
+
+
+def test_frames_that_left_the_capture_after_registering_are_no_residuals_of_it(tmp_path):
+    count = len(read_capture(SAMPLE).frames)
+    rows = np.where(np.arange(count) < 3, -1, np.arange(count))
+    write_ingest_page(made(SAMPLE, registered_frames=rows), tmp_path / "page.html")
+    dots = re.search(r'class="dots" d="([^"]*)"', (tmp_path / "page.html").read_text())[1]
+    assert dots.count("M") == count - 3
+
+
+def test_without_registration_and_joints_the_page_says_so(tmp_path):
+    def strip(document):
+        document["instrument_frame"] = "unregistered"
+        document.pop("instruments", None)
+        for frame in document["frames"]:
+            for state in frame["instruments"]:
+                state["joints"] = {}
+
+    folder = edited(tmp_path / "bare", strip)
+    bare = made(folder, registration=None, clocks={}, shapes={}, registered_frames=np.array([]), dropped=(), notes=())
+    write_ingest_page(bare, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    for piece in (
+        "do not meet",
+        "nothing can be drawn over",
+        "No joint was read",
+        "left out: its poses",
+        "proportions only",
+    ):
+        assert piece in text
+    assert "<h2>Clocks" not in text
+    assert "Nothing: every video frame" in text
+
+
+def test_without_an_instrument_or_points_there_is_still_a_page(tmp_path):
+    def strip(document):
+        document.pop("ply_file_path")
+        document.pop("instruments", None)
+        for frame in document["frames"]:
+            frame["instruments"] = []
+
+    folder = edited(tmp_path / "cameras", strip)
+    result = made(folder, registration=None, reprojection_px=None, clocks={}, points=0, registered_frames=np.array([]))
+    write_ingest_page(result, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    for piece in ("Cameras only", "no instrument states", "random stand-ins"):
+        assert piece in text
+
+
+def test_a_capture_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(NeecoError, match="no such folder"):
+        write_ingest_page(replace(made(SAMPLE), capture=tmp_path / "gone"), tmp_path / "page.html")
