@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
+from neeco.capture.model import Frame, State
 from neeco.capture.points import read_ply
+from neeco.capture.reader import stand_in_points
 from neeco.capture.truth import load_truth_mask
 from neeco.errors import NeecoError
+from neeco.raster import Camera
 
 ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")
 ASCII_HEADER += b"end_header\n"
@@ -90,6 +94,21 @@ def test_instruments_are_derived_from_frames_when_not_declared(folder):
     (instrument,) = read_capture(folder.root).instruments
     assert instrument.name == "grasper"
     assert dict(instrument.joints) == {"jaw_angle": None}
+
+
+def test_a_scope_that_turns_about_its_trocar_gets_points_in_front_of_it():
+    tilts = [Rotation.from_rotvec([0.2 * math.cos(a), 0.2 * math.sin(a), 0]).as_matrix() for a in range(6)]
+    frames = []
+    for tilt in tilts:
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.from_numpy(tilt)
+        pose[:3, 3] = 120 * pose[:3, 2]  # the lens, 120 mm from the trocar at the origin, looking away from it
+        frames.append(Frame(Path("none.png"), Camera(pose, 100, 100, 32, 24, 64, 48), State(), "train"))
+    points = torch.from_numpy(stand_in_points(frames).positions).double()
+    for frame in frames:
+        pose = frame.camera.world_from_camera
+        depth = (points - pose[:3, 3]) @ pose[:3, 2]
+        assert (depth > 0).float().mean() > 0.9
 
 
 def test_a_capture_without_points_starts_from_random_ones_where_cameras_look(folder):

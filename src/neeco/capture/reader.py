@@ -74,16 +74,18 @@ def parse_capture(
 def stand_in_points(frames: Sequence[Frame]) -> PointCloud:
     """Random points where the cameras look, for captures that bring none.
 
-    A cube about the point nearest to all optical axes, as wide as the cameras are far from it.
+    A cube about the point nearest to all optical axes, as wide as the cameras are far from it. Axes that meet nowhere,
+    or behind the cameras (a scope turns about its trocar), leave the distance unknown.
     """
     poses = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])  # [F, 4, 4]
     centers, axes = poses[:, :3, 3], poses[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along each axis
     normal = across.sum(axis=0)
-    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(frames):  # parallel axes meet nowhere
-        meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
-    else:
-        meeting = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+    meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
+    if np.linalg.eigvalsh(normal)[0] >= 1e-3 * len(frames):  # else the axes are parallel
+        nearest = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+        if np.median(((nearest - centers) * axes).sum(axis=1)) > 0:
+            meeting = nearest
     distance = float(np.median(np.linalg.norm(centers - meeting, axis=1)))
     return random_points(meeting, 0.5 * max(distance, 1e-3))
 
