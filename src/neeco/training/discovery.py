@@ -57,7 +57,7 @@ def find_instruments(
                 f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
                 "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
-        if not _judge_evidence(scene, evidence, instrument.name, shape, report):
+        if not judge_evidence(scene, evidence, instrument.name, shape, report):
             shape = shape_around_frame(shape, evidence.distance, generator)
         hinges = hinged.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
@@ -67,7 +67,7 @@ def find_instruments(
     scene.canonical = join_bodies(bodies)
 
 
-def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
+def judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
     """Does the evidence move with the instrument? Exchange the poses among frames: it must get worse.
 
     Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
