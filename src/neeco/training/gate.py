@@ -50,7 +50,7 @@ def close_gate(
     inside = gate.contains(scene.canonical.means)
     if int(inside.sum()) < LEAST * len(inside):
         raise NeecoError(
-            f"deformation.gate_mm: only {int(inside.sum())} of {len(inside)} Gaussians lie within {gate.margin_mm} mm of "
-            "the instruments' path; give a greater distance"
+            f"deformation.gate_mm: only {int(inside.sum())} of {len(inside)} Gaussians lie within {gate.margin_mm} mm "
+            "of the instruments' path; give a greater distance"
         )
     report(f"the network is evaluated on {int(inside.sum())} of {len(inside)} Gaussians")
