@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.model import Capture, Instrument, InstrumentState
+from neeco.evaluation.truth import REFERENCE_FOLDER
 
 TOOL_LENGTH, WRIST_LENGTH, REMOTE_CENTER = 416.2, 9.1, 431.8  # mm
 JOINTS = ("outer_yaw_rad", "outer_pitch_rad", "insertion_mm", "outer_roll_rad", "wrist_pitch_rad", "wrist_yaw_rad")
@@ -88,6 +90,9 @@ def main() -> None:
     parser.add_argument("--transforms", default="transforms.json")
     given = parser.parse_args()
     write_capture(with_shafts(read_capture(given.capture, given.transforms)), given.output)
+    references = given.capture / REFERENCE_FOLDER
+    if references.is_dir():  # hand-made masks that `neeco evaluate` scores against
+        shutil.copytree(references, given.output / REFERENCE_FOLDER, dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ NEECO_INLINE Light light_lanes(const GaussianInputs& in, const Projected& p, con
     Light light;
     light.distance2 = p.x * p.x + p.y * p.y + p.z * p.z;
     light.log2_distance = 0.5f * log2_fast(light.distance2 * 1e-4f);  // of distance / 100 mm
-    light.t = (p.x * p.x + p.y * p.y) * p.inverse_z * p.inverse_z;
+    light.t = p.slope_x * p.slope_x + p.slope_y * p.slope_y;  // clamped: beyond the field its powers would blind the image
     const vf vignette = in.vignette[0] * light.t + in.vignette[1] * light.t * light.t;
     const vf exponent = kLog2E * vignette - gather(in.falloff, index, 1) * light.log2_distance;
     const vi ok = finite(exponent);  // a NaN falloff must stay NaN

@@ -82,9 +82,10 @@ NEECO_INLINE void color_gradient(const Frame& frame, const GaussianInputs& in, c
         if (to.falloff) scatter(to.falloff, index, 1, live, to_log * light.log2_distance * -kLn2);
         const vf by_distance = -falloff * to_log / light.distance2;
         const vf by_t = to_log * (in.vignette[0] + 2.f * in.vignette[1] * light.t) * 2.f * p.inverse_z;
-        m.camera[0] += by_distance * p.x + by_t * p.x * p.inverse_z;
-        m.camera[1] += by_distance * p.y + by_t * p.y * p.inverse_z;
-        m.camera[2] += by_distance * p.z - by_t * light.t;
+        const vf free_x = select(p.clamped_x, all(0.f), p.slope_x), free_y = select(p.clamped_y, all(0.f), p.slope_y);
+        m.camera[0] += by_distance * p.x + by_t * free_x;
+        m.camera[1] += by_distance * p.y + by_t * free_y;
+        m.camera[2] += by_distance * p.z - by_t * (free_x * free_x + free_y * free_y);
         sums[15] += to_log * light.t;
         sums[16] += to_log * light.t * light.t;
     }

@@ -140,6 +140,23 @@ def test_gaussians_behind_the_camera_and_off_screen_draw_nothing(simd: str) -> N
     assert all(not gradients[name].any() for name in ("means", "quats", "sh", "world_from_camera", "center_offsets"))
 
 
+def test_a_gaussian_beside_the_camera_does_not_blind_the_image(simd: str) -> None:
+    """Its slope x / z of 33 lies far outside the field; to the fourth power it would make the vignette e^11000."""
+    scene = make_scene(1, sh_count=1, seed=6, channels=0, frames=False, opacity=0.9)
+    scene.tensors |= {
+        "means": torch.tensor([[30.0, 0.0, 0.9]]),
+        "scales": torch.full((1, 3), 20.0),
+        "vignette": torch.tensor([0.014, 0.009]),
+        "falloff": torch.zeros(1),
+        "sh": torch.ones(1, 1, 3),
+        "background": torch.zeros(3),
+        "world_from_camera": torch.eye(4),
+    }
+    assert_same_as_reference(scene)
+    out, _ = draw(scene, torch.float32, "cpu", torch.ones(scene.height, scene.width))
+    assert 0.1 < float(out.color.detach().max()) < 1
+
+
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh", "channels", "falloff", "sh_frames"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_gaussians_that_are_not_finite_draw_nothing(simd: str, field: str, value: float) -> None:

@@ -35,17 +35,19 @@ def instrument_points(reading: float) -> Tensor:
     return torch.cat([shaft, *jaws])
 
 
-def make_evidence(shaft_from_sensor: Tensor, frames: int = 40) -> Evidence:
-    """Silhouettes of the instrument in random poses before a still camera; `shaft_from_sensor`: how the sensor sits."""
+def make_evidence(shaft_from_sensor: Tensor, frames: int = 40, motion: float = 1.0) -> Evidence:
+    """Silhouettes of the instrument in random poses before a still camera; `shaft_from_sensor`: how the sensor sits,
+    `motion`: how far the poses range."""
     rng = np.random.default_rng(0)
     camera = Camera(torch.eye(4), 200.0, 200.0, 80.0, 64.0, 160, 128)
     hits, taken = [], []
     for number in range(frames):
         reading = float(rng.uniform(0.0, 1.0))
-        roll, tilt, pan = rng.uniform(-1, 1), rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5)
+        roll, tilt, pan = rng.uniform(-1, 1), motion * rng.uniform(-0.5, 0.5), motion * rng.uniform(-0.5, 0.5)
         lean = rigid_from_vector(torch.tensor([1.0, 0.6, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
         spin = rigid_from_vector(torch.tensor([tilt, pan, roll, 0.0, 0.0, 0.0], dtype=torch.float64))
-        place = torch.tensor([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(75, 95)], dtype=torch.float64)
+        place = torch.tensor([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(-10, 10)], dtype=torch.float64)
+        place = motion * place + torch.tensor([0.0, 0.0, 85.0], dtype=torch.float64)
         world_from_shaft = rigid(lean[:3, :3] @ spin[:3, :3], place)
         world = instrument_points(reading).double() @ world_from_shaft[:3, :3].T + world_from_shaft[:3, 3]
         u = (world[:, 0] / world[:, 2] * camera.fx + camera.cx).long()
@@ -99,6 +101,18 @@ def test_the_hinge_is_found_without_training(mounting: str) -> None:
     assert math.degrees(math.acos(min(1.0, abs(float(axis @ truth))))) < 20
     pivot = true_from_carved @ torch.tensor([0.0, 0.0, balanced_depth(guesses), 1.0])
     assert abs(float(pivot[2]) - PIVOT_MM) < 7  # training takes it from here
+
+
+def test_background_that_nothing_explains_is_not_carved() -> None:
+    """A third of the still image is always evident; the instrument, which moves a little, is found beside it."""
+    evidence = make_evidence(MOUNTINGS["straight"], motion=0.5)
+    evidence.hits[:, :, :55] = 1
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    assert shape is not None
+    direction, origin = shape.instrument_from_shaft[:3, 2], shape.instrument_from_shaft[:3, 3]
+    assert math.degrees(math.acos(float(direction[2]))) < 8
+    assert float((origin - direction * origin[2] / direction[2])[:2].norm()) < 2.5
+    assert float((shape.seeds[:, :2].norm(dim=1) < 3 * RADIUS_MM).float().mean()) > 0.9
 
 
 def test_nothing_is_carved_where_poses_have_nothing_to_do_with_the_images() -> None:

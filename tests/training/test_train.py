@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import neeco.training.session
 from neeco.errors import NeecoError
 from neeco.training import train as module
 from neeco.training.options import training_config
+from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
 
@@ -55,6 +57,31 @@ def test_an_interrupted_run_ends_in_the_same_bytes(method: str, stop: int, captu
     assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
     iterations = [json.loads(line)["iteration"] for line in (resumed / "metrics.jsonl").read_text().splitlines()]
     assert iterations == list(range(5, 61, 5))
+
+
+def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_path: Path) -> None:
+    seen: list[int] = []
+    times = iter(range(10**6))  # every look at this clock takes a second
+
+    def watch(session) -> None:
+        seen.append(session.iteration)
+        session.scene.at(session.frames[0].state)
+        for _ in range(1000):
+            next(times)
+
+    plain = train(capture, tmp_path / "plain", config_of("neeco"))
+    watched = train(capture, tmp_path / "watched", config_of("neeco"), watch=watch, clock=lambda: float(next(times)))
+    assert seen == list(range(1, 61))
+    assert (watched / "scene.safetensors").read_bytes() == (plain / "scene.safetensors").read_bytes()
+    rows = [json.loads(line) for line in (watched / "metrics.jsonl").read_text().splitlines()]
+    assert 60 <= rows[-1]["seconds"] < 300
+
+
+def test_minutes_are_those_of_the_clock(capture: Path, tmp_path: Path) -> None:
+    seconds = iter(range(0, 10**6, 10))
+    config = dataclasses.replace(config_of("3dgs"), minutes=2.0)
+    run = train(capture, tmp_path / "run", config, clock=lambda: float(next(seconds)))
+    assert load_run(run).scene.diagnostics["iterations"] < 15
 
 
 def test_a_full_folder_is_left_alone(capture: Path, tmp_path: Path) -> None:

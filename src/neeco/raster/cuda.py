@@ -31,7 +31,7 @@ def rasterize_cuda(
     values = sh_colors(gaussians.sh[index].float(), means, pose[:3, 3], frames).clamp(min=0)
     if gaussians.headlight is not None:
         light = type(gaussians.headlight)(gaussians.headlight.falloff[index], gaussians.headlight.vignette)
-        values = values * headlight_factor(light, means @ rotation.T + translation)[:, None]
+        values = values * headlight_factor(light, camera, means @ rotation.T + translation)[:, None]
     if channels is not None:
         values = torch.cat([values, channels[index].float()], dim=-1)
 

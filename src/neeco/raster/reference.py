@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neeco.raster.field import field_slopes
 from neeco.raster.sh import headlight_factor, rotation_matrices, sh_colors
 from neeco.raster.types import Camera, Gaussians, Rendering
 
@@ -17,7 +18,6 @@ LOW_PASS = 0.3  # px^2 added to projected covariances
 FAINTEST = 1 / 255  # smallest alpha that is drawn
 OPAQUE = 0.999  # largest alpha
 FULL = 1e-4  # transmittance at which a pixel takes no more
-FIELD_MARGIN = 0.3  # share of half the field of view by which the linearisation point may lie outside
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,7 @@ def project(
     x, y, z = camera_means.unbind(-1)
     slope_x, slope_y = x / z, y / z
     centers = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], dim=-1) + offsets
-    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
-    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
-    slope_x = slope_x.clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
-    slope_y = slope_y.clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    slope_x, slope_y = field_slopes(camera, camera_means).unbind(-1)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [camera.fx / z, zero, -camera.fx * slope_x / z, zero, camera.fy / z, -camera.fy * slope_y / z], dim=-1
@@ -127,7 +124,7 @@ def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tenso
     centre = camera.world_from_camera[:3, 3].to(gaussians.means)
     colors = sh_colors(gaussians.sh, gaussians.means, centre, gaussians.sh_frames).clamp(min=0)
     if gaussians.headlight is not None:
-        colors = colors * headlight_factor(gaussians.headlight, camera_means)[:, None]
+        colors = colors * headlight_factor(gaussians.headlight, camera, camera_means)[:, None]
     return colors
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neeco.raster.types import Headlight
+from neeco.raster.field import field_slopes
+from neeco.raster.types import Camera, Headlight
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -56,9 +57,9 @@ def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tenso
     return torch.einsum("nk,nkc->nc", sh_basis(directions, sh.shape[1]), sh) + 0.5
 
 
-def headlight_factor(headlight: Headlight, camera_means: Tensor) -> Tensor:
+def headlight_factor(headlight: Headlight, camera: Camera, camera_means: Tensor) -> Tensor:
     """Brightness [N] of the headlight at means [N, 3] in the camera frame, mm."""
     x, y, z = camera_means.unbind(-1)
     log_distance = 0.5 * torch.log((x * x + y * y + z * z) / 100.0**2)
-    t = (x * x + y * y) / (z * z)
+    t = field_slopes(camera, camera_means).square().sum(-1)
     return torch.exp(headlight.vignette[0] * t + headlight.vignette[1] * t * t - headlight.falloff * log_distance)

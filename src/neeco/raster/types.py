@@ -14,7 +14,9 @@ class Headlight:
 
     A Gaussian's colour is multiplied by
     `(distance / 100 mm) ** -falloff * exp(vignette[0] * t + vignette[1] * t**2)`,
-    distance and t taken at its mean, in the camera frame: distance = |p|, t = (p_x^2 + p_y^2) / p_z^2.
+    distance and t taken at its mean, in the camera frame: distance = |p|, t = (p_x / p_z)^2 + (p_y / p_z)^2, the two
+    slopes brought into the field of view and its margin (`field_slopes`): beyond it the vignette means nothing, and its
+    powers would blind the image.
     """
 
     falloff: Tensor  # [N] exponent

@@ -1,7 +1,8 @@
 """An instrument's rough shape by space carving in its own tracked frame: which points are evidence in every image?
 
-Points of the rigid instrument fall on residual in all frames whatever its pose; points of tissue do not. From the
-carved volume come the shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
+Points of the rigid instrument fall on residual in all frames whatever its pose; points of tissue do not. Background
+that no fit explains does so too, but under any frame's pose: what scores as well with poses exchanged is left out. From
+the carved volume come the shaft's axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from torch import Tensor
 from neeco.training.evidence import Evidence
 
 COARSE = 48  # voxels per side of the first grid
-SOLID = 0.85  # mean evidence of a point surely inside
+SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
+ENOUGH = 8  # of them
+MOVES = 1.5  # ratio of evidence under its own poses to that under exchanged ones
+EXCHANGES = 4  # ways of exchanging the poses
 POSSIBLE = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
 
 
@@ -29,6 +33,7 @@ class CarvedShape:
     radius: float  # mm, of the solid part
     center_line: Tensor  # [Z, 3] mm: position along the shaft, and the solid's centre across it (x, y), shaft frame
     seeds: Tensor  # [M, 3] mm, points possibly inside, instrument frame
+    level: float  # mean evidence from which a point counts as solid
 
 
 def camera_from_instrument(evidence: Evidence, name: str) -> Tensor:
@@ -51,27 +56,62 @@ def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: 
     return torch.cat(scores), torch.cat(seen)
 
 
+@dataclass(frozen=True)
+class Views:
+    """How every frame's camera sees some frame fixed to an instrument, under its own poses and under exchanged ones."""
+
+    evidence: Evidence
+    own: Tensor  # [F, 4, 4]
+    exchanged: Tensor  # [EXCHANGES, F, 4, 4]
+
+    def seen_from(self, base: Tensor) -> Views:
+        """The same for another frame, `base` [4, 4] in the present one."""
+        return Views(self.evidence, self.own @ base, self.exchanged @ base)
+
+    def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """`score_points`, but 0 for what is nearly as evident under exchanged poses."""
+        score, seen = score_points(self.evidence, self.own, points)
+        likely = torch.nonzero(score > 0.5 * POSSIBLE)[:, 0]  # the others are nowhere near any threshold
+        standing = score[likely] <= MOVES * self.exchanged_scores(points[likely])
+        score[likely[standing]] = 0
+        return score, seen
+
+    def exchanged_scores(self, points: Tensor) -> Tensor:
+        """Mean evidence [Q] at points [Q, 3] over all exchanges of the poses."""
+        return torch.stack([score_points(self.evidence, other, points)[0] for other in self.exchanged]).mean(0)
+
+
+def views_of(evidence: Evidence, name: str) -> Views:
+    """The views of instrument `name`. An exchange keeps the cameras and shifts the poses among the frames."""
+    own = camera_from_instrument(evidence, name)
+    cameras = evidence.camera_from_world.double()
+    poses = torch.linalg.inv(cameras) @ own.double()
+    # uneven shifts, so that a motion that repeats itself does not come out the same
+    shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (EXCHANGES + 1)) for k in range(1, EXCHANGES + 1)]
+    return Views(evidence, own, torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts]))
+
+
 def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int = 3000) -> CarvedShape | None:
     """The shape of instrument `name`, or None when nothing in its frame is evident (wrong poses, or never in view)."""
     reach = 0.6 * evidence.distance
     ticks = torch.linspace(-reach, reach, COARSE)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
-    transforms = camera_from_instrument(evidence, name)
-    score, seen = score_points(evidence, transforms, grid)
-    solid = grid[(score > SOLID) & (seen > 0.25)]
-    if len(solid) < 8:
+    views = views_of(evidence, name)
+    score, seen = views.scores(grid)
+    level = next((level for level in SOLID if int(((score > level) & (seen > 0.25)).sum()) >= ENOUGH), None)
+    if level is None:
         return None
-    base = _shaft_frame(evidence, transforms, solid)
+    base = _shaft_frame(views, grid[(score > level) & (seen > 0.25)])
     spacing = float(ticks[1] - ticks[0])
-    base, line, radius = _refine_axis(evidence, transforms, base, spacing)
+    base, line, radius = _refine_axis(views, base, spacing, level)
     if line.shape[0] < 4:
         return None
     near, tip = float(line[0, 0]), float(line[-1, 0])
-    points = _sample_seeds(evidence, transforms @ base, near, tip, max(3 * radius, 0.08 * reach), seeds, generator)
-    return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3])
+    points = _sample_seeds(views.seen_from(base), near, tip, max(3 * radius, 0.08 * reach), seeds, generator)
+    return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
 
 
-def _shaft_frame(evidence: Evidence, transforms: Tensor, solid: Tensor) -> Tensor:
+def _shaft_frame(views: Views, solid: Tensor) -> Tensor:
     """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
     see."""
     center = solid.mean(0)
@@ -80,7 +120,7 @@ def _shaft_frame(evidence: Evidence, transforms: Tensor, solid: Tensor) -> Tenso
     direction = torch.from_numpy(np.linalg.eigh(covariance.numpy())[1][:, -1].copy()).float()
     along = (solid - center) @ direction
     ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
-    _, seen = score_points(evidence, transforms, ends)
+    _, seen = score_points(views.evidence, views.own, ends)
     if seen[0] > seen[1]:
         direction = -direction
     return _frame_along(center, direction)
@@ -98,12 +138,12 @@ def _frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     return frame
 
 
-def _refine_axis(evidence: Evidence, transforms: Tensor, base: Tensor, spacing: float) -> tuple[Tensor, Tensor, float]:
+def _refine_axis(views: Views, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
     """Fit the axis to the solid's centre in slices, thrice; returns (base, centre line [Z, 3], radius mm)."""
-    half = 0.09 * evidence.distance
+    half = 0.09 * views.evidence.distance
     line, radius = torch.zeros(0, 3), spacing
     for _ in range(3):
-        rows = _slice_centers(evidence, transforms @ base, spacing, half)
+        rows = _slice_centers(views.seen_from(base), spacing, half, level)
         if len(rows) < 4:
             return base, torch.zeros(0, 3), radius
         line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
@@ -123,28 +163,28 @@ def _refine_axis(evidence: Evidence, transforms: Tensor, base: Tensor, spacing: 
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape) -> Tensor:
     """[Z, 3] like `CarvedShape.center_line`, from other frames."""
-    transforms = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft
-    return _slice_centers(evidence, transforms, (shape.tip - shape.near) / 30, 4 * shape.radius)[:, :3]
+    views = views_of(evidence, name).seen_from(shape.instrument_from_shaft)
+    return _slice_centers(views, (shape.tip - shape.near) / 30, 4 * shape.radius, shape.level)[:, :3]
 
 
-def _slice_centers(evidence: Evidence, transforms: Tensor, spacing: float, half: float) -> Tensor:
+def _slice_centers(views: Views, spacing: float, half: float, level: float) -> Tensor:
     """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
     see it."""
     ticks = torch.linspace(-half, half, 21)
     cell = float(ticks[1] - ticks[0]) ** 2
     x, y = torch.meshgrid(ticks, ticks, indexing="ij")
     rows = []
-    reach = 0.6 * evidence.distance
+    reach = 0.6 * views.evidence.distance
     for z in torch.arange(-reach, reach, spacing):
         plane = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), float(z))], -1)
-        score, seen = score_points(evidence, transforms, plane)
+        score, seen = views.scores(plane)
         score = torch.where(seen > 0.15, score, torch.zeros(()))
         if score.max() < POSSIBLE:
             continue
-        weight = (score - SOLID).clamp_min(0)
+        weight = (score - level).clamp_min(0)
         weight = weight if weight.sum() > 0 else (score - 0.95 * score.max()).clamp_min(0)
         center = (weight[:, None] * plane).sum(0) / weight.sum()
-        area = (score > SOLID).sum() * cell
+        area = (score > level).sum() * cell
         rows.append(torch.stack([z, center[0], center[1], area, seen.max()]))
     return torch.stack(rows) if rows else torch.zeros(0, 5)
 
@@ -169,8 +209,7 @@ def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
 
 
 def _sample_seeds(
-    evidence: Evidence,
-    transforms: Tensor,
+    views: Views,
     near: float,
     tip: float,
     width: float,
@@ -182,7 +221,7 @@ def _sample_seeds(
     drawn = torch.rand(20 * count, 3, generator=generator)
     along = near - 0.1 * length + drawn[:, 2] * 1.2 * length
     points = torch.stack([(2 * drawn[:, 0] - 1) * width, (2 * drawn[:, 1] - 1) * width, along], -1)
-    score, seen = score_points(evidence, transforms, points)
+    score, seen = views.scores(points)
     chosen = points[(score > POSSIBLE) & (seen > 0.05)]
     if len(chosen) < count:  # thin instruments: fill up with jittered copies
         source = chosen if len(chosen) else points

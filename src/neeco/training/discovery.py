@@ -15,7 +15,7 @@ from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussian
 from neeco.scene.deformations._hinges import PART_LOGITS, Hinged, Hinges
 from neeco.scene.deformations.static import Static
 from neeco.scene.scene import Recording, Scene
-from neeco.training.carving import CarvedShape, camera_from_instrument, carve, score_points
+from neeco.training.carving import MOVES, CarvedShape, carve, score_points, views_of
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.evidence import Evidence, gather_evidence
 from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
@@ -24,8 +24,9 @@ from neeco.training.schedule import order_by_pose
 from neeco.training.session import Session
 
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
+LONGER_STEPS = 1500  # of the one with density control, where the sparse points alone explain too little
+UNEXPLAINED = 0.25  # mean evidence that is too much for instruments alone
 SEEDS = 3000  # Gaussians per instrument at the start
-MOVES = 1.5  # ratio of evidence under its own poses to that under exchanged ones
 AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted frame seeds are strewn
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
 
@@ -57,7 +58,7 @@ def find_instruments(
                 f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
                 "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
-        if not _judge_evidence(scene, evidence, instrument.name, shape, report):
+        if not judge_evidence(scene, evidence, instrument.name, shape, report):
             shape = shape_around_frame(shape, evidence.distance, generator)
         hinges = hinged.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
@@ -67,17 +68,14 @@ def find_instruments(
     scene.canonical = join_bodies(bodies)
 
 
-def _judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
+def judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
     """Does the evidence move with the instrument? Exchange the poses among frames: it must get worse.
 
     Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
     """
-    transforms = camera_from_instrument(evidence, name)
-    own, _ = score_points(evidence, transforms, shape.seeds)
-    # the camera stays: only the instrument's pose is another frame's
-    world = torch.linalg.inv(evidence.camera_from_world.double()) @ transforms.double()
-    exchanged = (evidence.camera_from_world.double() @ world.roll(len(world) // 2, 0)).float()
-    other, _ = score_points(evidence, exchanged, shape.seeds)
+    views = views_of(evidence, name)
+    own, _ = score_points(evidence, views.own, shape.seeds)
+    other = views.exchanged_scores(shape.seeds)
     moves = float(own.mean()) > MOVES * float(other.mean())
     scene.diagnostics.setdefault("instruments", {})[name] = {
         "evidence": round(float(own.mean()), 4),
@@ -108,22 +106,43 @@ def tissue_evidence(
     masks: Sequence[Tensor | None],
     config: TrainConfig,
 ) -> Evidence:
-    """Fit a copy of the tissue with nothing moving for a few hundred steps; what is left over is the evidence."""
+    """Fit a copy of the tissue with nothing moving; what is left over is the evidence.
+
+    A few hundred steps of the sparse points do on tissue full of texture. Where much is left over, the points are too
+    few, and a longer fit may add Gaussians.
+    """
+    evidence = _evidence_after(TISSUE_STEPS, 10**9, scene, frames, images, masks, config)
+    if float(evidence.hits.mean()) <= UNEXPLAINED:
+        return evidence
+    return _evidence_after(LONGER_STEPS, 200, scene, frames, images, masks, config)
+
+
+def _evidence_after(
+    steps: int,
+    density_start: int,
+    scene: Scene,
+    frames: tuple[Frame, ...],
+    images: Sequence[Tensor],
+    masks: Sequence[Tensor | None],
+    config: TrainConfig,
+) -> Evidence:
+    """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
     alone = Scene("3dgs", tissue, Static(()), (), Recording(), scene.center)
     short = replace(
         config,
-        iterations=TISSUE_STEPS,
+        iterations=steps,
         minutes=None,
         schedule=method_defaults("3dgs").schedule,
         refine=RefineConfig(),
-        density_start=10**9,
+        density_start=density_start,
+        density_stop=0.8,
         opacity_penalty=0.0,
         label_sharpness=0.0,
         shaft_roll=0.0,
     )
     session = new_session(alone, frames, images, masks, short)
-    while session.iteration < TISSUE_STEPS:
+    while session.iteration < steps:
         session.step()
     alone.requires_grad_(False)
     return gather_evidence(alone, frames, images, masks)

@@ -15,6 +15,7 @@ from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Recording, Scene
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import find_instruments
+from neeco.training.gate import close_gate
 
 REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
 
@@ -50,6 +51,8 @@ def initial_scene(
     center = torch.from_numpy(np.median(positions, 0))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
     deformation.fit_ranges(list(recorded.states), tissue.means)
+    if deformation.gate_volume is not None:
+        close_gate(scene, deformation.gate_volume, frames, images, masks, config, report)
     if deformation.hinged is not None:
         find_instruments(scene, deformation.hinged, frames, images, masks, config, report)
     return scene

@@ -48,6 +48,7 @@ class ProgressRow:
 
 
 Progress = Callable[[ProgressRow], None]
+Watch = Callable[[Session], None]  # after every step; may draw the scene, must not change it
 
 
 def train(
@@ -57,13 +58,16 @@ def train(
     *,
     resume: bool = False,
     progress: Progress | None = None,
+    watch: Watch | None = None,
+    clock: Callable[[], float] = time.monotonic,
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
     Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an
     interrupted run under the settings it was started with. The same seed gives the same scene, interrupted or not,
-    unless `minutes` is set. Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without
-    `resume`, or a loss that is no number.
+    unless `minutes` is set: minutes of `clock` (s; time.process_time counts the processor's), without what `watch`
+    takes. Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss
+    that is no number.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way
     KeyboardInterrupt says how to go on. What fails before the first step leaves no run folder behind.
@@ -76,7 +80,7 @@ def train(
     elif output.is_dir() and any(output.iterdir()):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
     capture, frames = _open_capture(capture_path, config)
-    log = _Log(output / "metrics.jsonl", progress)
+    log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
     with new_folder(output), _torch_threads(config.method):
         try:
@@ -124,7 +128,7 @@ def _begin(
     """The session before its first step, or where the checkpoint in `output` left it."""
     images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
     masks = [frame.load_mask() for frame in frames]
-    started = time.monotonic()
+    started = log.clock()
     torch.manual_seed(config.seed)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
@@ -134,7 +138,7 @@ def _begin(
         scene = initial_scene(capture, frames, images, masks, config, log.note)
         session = new_session(scene, frames, images, masks, config)
     log.keep_until(session.iteration)
-    session.seconds += time.monotonic() - started
+    session.seconds += log.clock() - started
     return session
 
 
@@ -157,15 +161,15 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
 def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
     """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
     losses, psnrs, phase = [], [], session.schedule.phase
-    clock = time.monotonic()
+    last = log.clock()
     try:
         while session.progress < 1:
             before = session.progress
             result = session.step()
             losses.append(result.loss)
             psnrs.append(result.psnr)
-            now = time.monotonic()
-            session.seconds, clock = session.seconds + now - clock, now
+            now = log.clock()
+            session.seconds, last = session.seconds + now - last, now
             if session.schedule.phase != phase:
                 phase = session.schedule.phase
                 log.note(f"phase {phase} begins" + (" (forced)" if session.schedule.forced else ""))
@@ -178,6 +182,10 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
                 save_checkpoint(session, output)
             if stop.heard:
                 raise KeyboardInterrupt
+            if log.watch:
+                began = log.clock()
+                log.watch(session)
+                last += log.clock() - began
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
@@ -197,11 +205,13 @@ def _finish(session: Session) -> None:
 
 
 class _Log:
-    """metrics.jsonl and the progress callback."""
+    """metrics.jsonl, the callbacks, and the clock that all rows are timed by."""
 
-    def __init__(self, path: Path, progress: Progress | None) -> None:
+    def __init__(self, path: Path, progress: Progress | None, watch: Watch | None, clock: Callable[[], float]) -> None:
         self.path = path
         self.progress = progress
+        self.watch = watch
+        self.clock = clock
         self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
 
     def row(self, session: Session, loss: float, psnr: float) -> None:

@@ -13,6 +13,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinged
+from neeco.scene.swept import SweptVolume
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
 PLAIN_TRAINING: Mapping[str, Any] = {
@@ -85,6 +86,11 @@ class Deformation(nn.Module):
     @property
     def hinged(self) -> Hinged | None:
         """The shafts and hinges whose place training is to look for; None: the scene starts from the tissue alone."""
+        return None
+
+    @property
+    def gate_volume(self) -> SweptVolume | None:
+        """The volume that bounds where Gaussians can move; covered before training. None: anywhere."""
         return None
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:

@@ -16,11 +16,14 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed, state_of
 from neeco.scene.rotations import matrix_to_quat
+from neeco.scene.swept import SweptVolume
 
 MEMBERSHIP = "membership"
+STILL = 1e-6  # mm; what moves less does not move
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
@@ -40,7 +43,8 @@ class NPS(Deformation):
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
     `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
-    evaluation when no gradient is wanted.
+    evaluation when no gradient is wanted. `gate_mm` (None: off, as published): Gaussians farther than this from all
+    that the instruments were recorded to sweep stay canonical without being evaluated; `gate` is that volume.
     """
 
     training_defaults: ClassVar[Mapping[str, Any]] = {}  # the paper's
@@ -64,8 +68,13 @@ class NPS(Deformation):
         state: str = "full",
         half: bool = False,
         chunk: int = 65536,
+        gate_mm: float | None = None,
     ) -> None:
         super().__init__()
+        if gate_mm is not None and not gate_mm > 0:
+            raise NeecoError(
+                f"deformation.gate_mm: {gate_mm} is not a positive distance in mm; leave it out for no gate"
+            )
         self.instruments = instruments
         self._config = {
             "depth": depth,
@@ -76,7 +85,9 @@ class NPS(Deformation):
             "state": state,
             "half": half,
             "chunk": chunk,
+            "gate_mm": gate_mm,
         }
+        self.gate = None if gate_mm is None else SweptVolume(gate_mm)
         self.L_mean, self.L_state, self.identity, self.state_kind = L_mean, L_state, identity, state
         self.half_precision, self.chunk = half, chunk
         size = self.state_size()
@@ -121,6 +132,10 @@ class NPS(Deformation):
         per_instrument = 4 if self.state_kind == "rotation_jaw" else 7
         return sum(per_instrument + len(instrument.joints) for instrument in self.instruments)
 
+    @property
+    def gate_volume(self) -> SweptVolume | None:
+        return self.gate
+
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Normalise p by the recorded range and mu by the points' extent, both to [-1, 1]."""
         if self.instruments:
@@ -155,7 +170,7 @@ class NPS(Deformation):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if not self.instruments:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        change = self.network(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
+        change = self._change(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
         means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
         quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
         return Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
@@ -164,6 +179,14 @@ class NPS(Deformation):
         """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""
         encoded = encode(self.state_vector(state), self.L_state, identity=self.identity)
         return encoded + noise * torch.randn_like(encoded) if noise > 0 else encoded
+
+    def _change(self, means: Tensor, encoded_state: Tensor) -> Tensor:
+        """The network's output [N, 10]; zero for means [N, 3] outside the gate."""
+        if self.gate is None or not self.gate.bounded:
+            return self.network(means, encoded_state)
+        near = torch.nonzero(self.gate.contains(means))[:, 0]
+        evaluated = self.network(means[near], encoded_state)
+        return evaluated.new_zeros(len(means), evaluated.shape[1]).index_copy(0, near, evaluated)
 
     def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
         """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above)."""
@@ -199,8 +222,10 @@ def mark_moving(deformation: NPS, canonical: CanonicalGaussians, states: list[St
     logarithm."""
     moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
     spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
-    threshold = otsu(spread.clamp_min(1e-6).log())
-    return canonical.with_extras(**{MEMBERSHIP: (spread.clamp_min(1e-6).log() > threshold).float()})
+    size = spread.clamp_min(STILL).log()
+    evaluated = spread > STILL  # those behind the gate would be a second cluster of their own
+    threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
+    return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
 
 
 def otsu(values: Tensor, bins: int = 256) -> float:
