@@ -17,6 +17,7 @@ from neeco.capture import check_capture, read_capture
 from neeco.capture.check import errors_only
 from neeco.capture.ingest.pipeline import ingest
 from neeco.capture.ingest.recording import read_recording
+from neeco.capture.ingest.work import begin, states_at
 from neeco.errors import NeecoError
 
 pytest.importorskip("cv2")
@@ -131,6 +132,26 @@ def test_an_output_that_exists_is_not_touched(recording: Path, tmp_path: Path) -
     with pytest.raises(NeecoError, match="already exists"):
         ingest(read_recording(recording), tmp_path / "capture", silent)
     assert (tmp_path / "capture" / "mine.txt").read_text() == "keep"
+
+
+def states_with_limits(recording: Path, limits: list[float], folder: Path) -> list[float]:
+    document = yaml.safe_load(recording.read_text())
+    document["instruments"][0]["joints"]["jaw_angle"]["limits"] = limits
+    document["sync"]["em"] = OFFSET
+    recording.write_text(yaml.safe_dump(document))
+    work = begin(read_recording(recording), folder, silent)
+    states, usable = states_at(work, work.times)
+    return states["tool"][1]["jaw_angle"][usable].tolist()
+
+
+def test_noise_does_not_carry_readings_beyond_their_limits(recording: Path, tmp_path: Path) -> None:
+    free = states_with_limits(recording, [-1.0, 3.0], tmp_path)
+    least, greatest = min(free) + 0.02, max(free) + 0.5
+    held = states_with_limits(recording, [least, greatest], tmp_path)
+    assert min(held) == pytest.approx(least)
+    assert max(held) == pytest.approx(max(free))
+    with pytest.raises(NeecoError, match=r"jaw\.csv: readings go .* beyond the joint's limits"):
+        states_with_limits(recording, [min(free) + 0.2, greatest], tmp_path)
 
 
 def test_logs_that_never_meet_the_video_are_refused_before_any_work(recording: Path, tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ and the offset of its clock. All of it is solved at once, robustly:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -134,19 +135,28 @@ def _refine(
     turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
     middle = start.scale * start.rotation.apply(centre) + start.translation
     _, valid = _sensor_poses(times, log, offset)
+    # on the video's clock: seconds since 1970 leave too few digits for derivatives
+    near = replace(
+        log, times=log.times - offset, gaps=tuple((before - offset, after - offset) for before, after in log.gaps)
+    )
+
+    @lru_cache(maxsize=4)  # most columns of the Jacobian leave the clock alone
+    def sensor_poses(lag: float) -> tuple[np.ndarray, np.ndarray]:
+        return poses_at(near, times + lag)
+
     hats = _hat_functions(times, DRIFT_KNOT)  # [N, K]
     knots = hats.shape[1]
 
     def unpack(x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float]:
         rotation = Rotation.from_rotvec(x[1:4]) * start.rotation
         hand = start.camera_from_sensor * Rotation.from_rotvec(x[7:10])
-        clock = offset if keep_offset else offset + x[13]
+        clock = 0.0 if keep_offset else float(x[13])
         return start.scale * np.exp(x[0]), rotation, middle + x[4:7], hand, start.lever + x[10:13], clock
 
     def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position error [N, 3] mm (drift not yet taken off), rotation error [N, 3] rad, on the log [N]."""
         scale, rotation, origin, hand, lever, clock = unpack(x)
-        poses, still = poses_at(log, times + clock)
+        poses, still = sensor_poses(clock)
         placed = rotation * turns
         position = scale * rotation.apply(arms) + origin + placed.apply(lever) - poses[:, :3, 3]
         sensors = Rotation.from_matrix(np.where(still[:, None, None], poses[:, :3, :3], np.eye(3)))
@@ -172,12 +182,15 @@ def _refine(
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)), 0.0))
     camera_from_sensor = np.eye(4)
     camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
+    found = (
+        ClockOffset(offset, 0.0, "given") if keep_offset else ClockOffset(offset + clock, float(sd[13]), "scope motion")
+    )
     return Registration(
         scale,
         rotation.as_matrix(),
         origin - scale * rotation.apply(centre),
         camera_from_sensor,
-        ClockOffset(float(clock), 0.0 if keep_offset else float(sd[13]), "given" if keep_offset else "scope motion"),
+        found,
         float(sd[0]),
         np.linalg.norm(position[used], axis=1),
         np.linalg.norm(turn[used], axis=1),

@@ -19,6 +19,8 @@ from neeco.errors import NeecoError
 
 States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
 
+LIMIT_SLACK = 0.03  # rad beyond a joint's limits that noise and calibration make
+
 
 @dataclass
 class Logs:
@@ -131,13 +133,17 @@ def states_at(work: Work, times: np.ndarray) -> tuple[States, np.ndarray]:
     """Every tracked instrument's states at video times [N], and where all of them are known."""
     states: States = {}
     usable = np.ones(len(times), dtype=bool)
+    limits = {
+        item.name: {joint: source.limits for joint, source in item.joints.items()}
+        for item in work.recording.instruments
+    }
     for name, log in work.logs.poses.items():
         poses, valid = instrument_poses(work, log, times)
         usable &= valid
         readings = {}
         for joint, reading in work.logs.joints[name].items():
             values, known = readings_at(reading, times + work.clocks[reading.clock].seconds)
-            readings[joint] = values
+            readings[joint] = _within_limits(work, reading, limits[name][joint], values)
             usable &= known
         states[name] = (poses, readings)
     if not usable.any():
@@ -145,6 +151,24 @@ def states_at(work: Work, times: np.ndarray) -> tuple[States, np.ndarray]:
             f"{work.recording.path}: no frame has a state of every instrument; check the logs' clocks in `sync`"
         )
     return states, usable
+
+
+def _within_limits(work: Work, log: ReadingLog, limits: tuple[float, float] | None, values: np.ndarray) -> np.ndarray:
+    """Readings [N] rad held within the joint's stated limits, where only noise carries them out."""
+    if limits is None:
+        return values
+    held = np.clip(values, *limits)
+    excess = float(np.nanmax(np.abs(values - held), initial=0.0))
+    if excess > LIMIT_SLACK:
+        raise NeecoError(
+            f"{log.path}: readings go {np.degrees(excess):.1f} deg beyond the joint's limits {limits[0]:g} .. "
+            f"{limits[1]:g} rad; correct `limits` in the recording, or the calibration"
+        )
+    if excess > 0:
+        note_once(
+            work, f"{log.path.name}: readings up to {np.degrees(excess):.1f} deg beyond the limits are held at them"
+        )
+    return held
 
 
 def state_of(states: States, row: int, time: float) -> State:
