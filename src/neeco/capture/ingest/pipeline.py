@@ -167,8 +167,9 @@ def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | No
     if scope is None:
         note_once(
             work,
-            "the laparoscope was not tracked: instrument poses stay in the tracker's frame (unregistered), and lengths "
-            f"are scaled as if the tissue were {SCENE_MM:g} mm away",
+            "the laparoscope was not tracked: "
+            + ("instrument poses stay in the tracker's frame (unregistered), and " if work.logs.poses else "")
+            + f"lengths are scaled as if the tissue were {SCENE_MM:g} mm away",
         )
         return None
     given = work.clocks.get(scope.clock)

@@ -69,7 +69,7 @@ def begin(recording: Recording, folder: Path, progress: Progress) -> Work:
         if item.poses is None:
             notes.append(f"instrument {item.name!r} was not tracked: it is left out of the capture's states")
     if not tracked:
-        notes.append("no instrument was tracked: the capture has cameras and images only (methods 3dgs and 4dgs train)")
+        notes.append("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
     work = Work(recording, folder, progress, video, video.frame_times(), logs, notes)
     for name, seconds in recording.sync.items():
         work.clocks[name] = ClockOffset(float(seconds), 0.0, "given")
