@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.ingest.clocks import correlate
+from neeco.capture.ingest.clocks import correlate, offset_from_instrument
 from neeco.capture.ingest.logs import PoseLog
 from neeco.capture.ingest.registration import register_with_laparoscope
 from neeco.errors import NeecoError
@@ -103,3 +103,39 @@ def test_correlation_peaks_where_a_signal_was_cut_out() -> None:
     lags, scores = correlate(long[200:450], long)
     assert lags[scores.argmax()] == 200
     assert scores.max() == pytest.approx(1.0)
+
+
+def swing(times: np.ndarray) -> np.ndarray:
+    """[N, 3] mm: strokes that grow faster and rest now and then, so that no two seconds are alike."""
+    phase = 0.7 * times + 0.1 * times**2
+    pace = phase + 0.9 * np.sin(1.7 * times) + 0.6 * np.sin(0.61 * times**1.3)
+    return np.stack([25 * np.sin(pace), 12 * np.sin(0.53 * pace + 1), 7 * np.cos(0.31 * pace)], -1)
+
+
+def instrument_log(offset: float, seed: int = 0) -> PoseLog:
+    rng = np.random.default_rng(seed)
+    ticks = np.arange(0.0, 12.5, 0.025)
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(ticks), 1))
+    return PoseLog(Path("tool.csv"), "em", ticks + offset, swing(ticks) + rng.normal(0, 0.3, (len(ticks), 3)), quats)
+
+
+def motion_seen(times: np.ndarray) -> np.ndarray:
+    """[N-1] px between frames: the instrument's motion from a distance that varies, and flow that errs."""
+    rng = np.random.default_rng(1)
+    moved = np.linalg.norm(np.diff(swing(times), axis=0), axis=1)
+    return 2.4 * moved * (1 + 0.3 * np.sin(times[1:])) + np.abs(rng.normal(0, 0.4, len(moved)))
+
+
+def test_the_instruments_clock_is_told_by_how_fast_it_moves_in_the_images() -> None:
+    times = np.arange(0.4, 12, 0.04)
+    found = offset_from_instrument(motion_seen(times), times, instrument_log(0.237))
+    assert found.seconds == pytest.approx(0.237, abs=0.015)
+    assert 0 < found.sd < 0.1
+    assert found.source == "instrument motion"
+
+
+def test_motion_of_something_else_tells_no_clock() -> None:
+    times = np.arange(0, 11, 0.04)
+    other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
+    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
+        offset_from_instrument(other, times, instrument_log(0.0))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.ingest.interpolate import poses_at
 from neeco.capture.ingest.logs import PoseLog
 from neeco.errors import NeecoError
 
@@ -40,17 +41,61 @@ def offset_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: P
     video = turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
     sensor = turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
     lags, scores = correlate(video, sensor)
+    return float(log_grid[0] - video_grid[0] + _peak(lags, scores, log) * STEP)
+
+
+def offset_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -> ClockOffset:
+    """Offset from how fast the picture of the instrument moved, against how fast its tracker did.
+
+    motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. Raises NeecoError when the two never
+    fit, or fit at several offsets. The uncertainty is what halves of the video disagree by.
+    """
+    steps = np.diff(times)
+    middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
+    grid = np.arange(middle[0], middle[-1], STEP)
+    log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
+    if len(grid) < 100 or len(log_grid) < 100:
+        raise NeecoError(f"{log.path}: video or log is shorter than two seconds; give its clock offset in `sync`")
+    before, after = (poses_at(log, log_grid + side * STEP) for side in (-1, 1))
+    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP)
+    tracked = np.where(before[1] & after[1], tracked, np.nanmedian(tracked))
+    seen = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
+    lags, scores = correlate(seen, np.sqrt(tracked))
+    best = _peak(lags, scores, log)
+    start = log_grid[0] - grid[0]
+    quarter = len(grid) // 4
+    halves = []
+    for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
+        near, fit = correlate(seen[part], np.sqrt(tracked))
+        around = np.abs((near - part.start - best) * STEP) < LOBE
+        if around.any():
+            halves.append(_vertex(near[around] - part.start, fit[around]))
+    spread = float(np.std(halves)) * STEP if len(halves) > 1 else LOBE
+    return ClockOffset(float(start + _vertex(lags, scores) * STEP), max(spread, STEP / 4), "instrument motion")
+
+
+def _peak(lags: np.ndarray, scores: np.ndarray, log: PoseLog) -> int:
+    """The best lag. Raises NeecoError when it is no fit, or one of several."""
     best = int(scores.argmax())
-    offset = log_grid[0] - video_grid[0] + lags[best] * STEP
     rivals = scores[np.abs(lags - lags[best]) * STEP > LOBE]
     rival = float(rivals.max()) if len(rivals) else -1.0
     if scores[best] < CLEAR or scores[best] - rival < DISTINCT:
         raise NeecoError(
-            f"{log.path}: its clock cannot be told from the images: the best offset ({offset:.2f} s) fits with "
-            f"correlation {scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake the scope at the "
-            "start of the recording"
+            f"{log.path}: its clock cannot be told from the images: the best offset fits with correlation "
+            f"{scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake what is tracked at the start "
+            "of the recording"
         )
-    return float(offset)
+    return int(lags[best])
+
+
+def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
+    """Lag of the parabola through the best score and its neighbours."""
+    best = int(scores.argmax())
+    if best in (0, len(scores) - 1):
+        return float(lags[best])
+    left, top, right = scores[best - 1 : best + 2]
+    bend = left - 2 * top + right
+    return float(lags[best] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
 def turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:

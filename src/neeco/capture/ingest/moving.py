@@ -19,6 +19,7 @@ from neeco.capture.ingest.sfm import Pinhole, SfmResult
 
 STEP = 4  # px between the places where flow is compared
 NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
+PATCH = 0.04  # of the image: about what an instrument's front takes
 MOVED = 1.5  # px of flow the still scene does not explain
 FRAMES = 60  # that shape is carved from
 CELLS = 48  # of the carving grid, per side
@@ -56,6 +57,25 @@ def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pi
             evidence[index] += np.linalg.norm(flow - expected, axis=-1) > MOVED
         evidence[index] /= max(len(others), 1)
     return evidence
+
+
+def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pinhole) -> np.ndarray:
+    """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
+    cv2 = optional_module("cv2")
+    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    grey = [cv2.cvtColor(load(0), cv2.COLOR_RGB2GRAY)]
+    height, width = grey[0].shape
+    v, u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+    patch = max(1, round(PATCH * u.size))
+    motion = np.zeros(len(sfm.indices) - 1)
+    for row in range(len(motion)):
+        grey = [grey[-1], cv2.cvtColor(load(row + 1), cv2.COLOR_RGB2GRAY)]
+        flow = estimator.calc(*grey, None)[v, u]  # [h, w, 2]
+        depth = _still_depth(sfm, row, pinhole, u, v)
+        still = _still_flow(sfm.world_from_camera[row], sfm.world_from_camera[row + 1], depth, pinhole, u, v)
+        left = np.linalg.norm(flow - still, axis=-1)
+        motion[row] = np.sort(left, axis=None)[-patch:].mean()
+    return motion
 
 
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Pinhole) -> Shape | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,8 +15,17 @@ from PIL import Image
 
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.ingest.border import SAMPLES, visible_mask
+from neeco.capture.ingest.clocks import offset_from_instrument
 from neeco.capture.ingest.lens import Lens, read_lens
-from neeco.capture.ingest.moving import FRAMES, Shape, carve_shape, moving_pixels, project_mask, project_points
+from neeco.capture.ingest.moving import (
+    FRAMES,
+    Shape,
+    carve_shape,
+    motion_between,
+    moving_pixels,
+    project_mask,
+    project_points,
+)
 from neeco.capture.ingest.recording import Recording, Splits
 from neeco.capture.ingest.registration import Registration, register_with_laparoscope
 from neeco.capture.ingest.result import IngestResult
@@ -75,6 +84,7 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
             _write_images(work, kept, lens)
         assert pinhole is not None
         registration = _register(work, kept, sfm)
+        _clocks_from_instruments(work, kept, motion, sfm, pinhole)
         doubtful, shapes = _on_instruments(work, kept, motion, sfm, pinhole, registration)
         sfm = motion.adjust(sfm, doubtful, progress)
         registration = _register(work, kept, sfm)
@@ -184,6 +194,32 @@ def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | No
     return registration
 
 
+def _loader(work: Work, motion: StructureFromMotion, sfm: SfmResult) -> Callable[[int], np.ndarray]:
+    """Image [H, W, 3] uint8 of a row of `sfm`."""
+
+    def load(row: int) -> np.ndarray:
+        with Image.open(work.folder / "raw" / motion.names[int(sfm.indices[row])]) as image:
+            return np.asarray(image.convert("RGB"))
+
+    return load
+
+
+def _clocks_from_instruments(
+    work: Work, kept: np.ndarray, motion: StructureFromMotion, sfm: SfmResult, pinhole: Pinhole
+) -> None:
+    """Clocks that neither `sync` nor the scope told: from how the instruments move in the images."""
+    unknown = {log.clock: log for log in work.logs.poses.values() if log.clock not in work.clocks}
+    if not unknown:
+        return
+    work.progress("finding the instrument's clock", 0, 0)
+    moved = motion_between(_loader(work, motion, sfm), sfm, pinhole)
+    for clock, log in unknown.items():
+        try:
+            work.clocks[clock] = offset_from_instrument(moved, work.times[kept[sfm.indices]], log)
+        except NeecoError as error:
+            note_once(work, str(error))
+
+
 def _on_instruments(
     work: Work,
     kept: np.ndarray,
@@ -198,13 +234,7 @@ def _on_instruments(
         return doubtful, {}
     work.progress("finding the instrument", 0, 0)
     rows = np.unique(np.linspace(0, len(sfm.indices) - 1, FRAMES).astype(int))
-    raw = {index: name for index, name in enumerate(motion.names)}
-
-    def load(row: int) -> np.ndarray:
-        with Image.open(work.folder / "raw" / raw[int(sfm.indices[row])]) as image:
-            return np.asarray(image.convert("RGB"))
-
-    evidence = moving_pixels(load, sfm, pinhole, rows)
+    evidence = moving_pixels(_loader(work, motion, sfm), sfm, pinhole, rows)
     cameras = registration.cameras(sfm.world_from_camera)
     shapes = {}
     for name, log in work.logs.poses.items():
