@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
+from neeco.scene.methods import check_fields
 from neeco.training.config import TrainConfig, method_defaults
 from neeco.training.run import config_from_dict, config_to_dict
 
@@ -21,18 +22,19 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
     """
     given = {name: value for name, value in values.items() if value is not None}
     config = dataclasses.replace(method_defaults(method), **given)
-    if config.iterations < 1:
-        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
-    if config.minutes is not None and not config.minutes > 0:
-        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
     try:
         config = config_from_dict(plain)
+        check_fields(config.method, config.deformation)
     except NeecoError as error:
         told = str(error).removeprefix("config.yaml: ").removesuffix("; train again")
         raise NeecoError(f"--set: {told}") from None
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")

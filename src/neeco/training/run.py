@@ -35,9 +35,8 @@ class Run:
         """The capture it was trained on. Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
-            raise NeecoError(
-                f"{self.path / 'config.yaml'}: capture: {root} no longer exists; edit the path or give --capture"
-            )
+            config = self.path / "config.yaml"
+            raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
         return read_capture(root, self.config["transforms"])
 
 
