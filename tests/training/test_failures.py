@@ -200,4 +200,4 @@ def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(
         assert f"{run / 'config.yaml'}: capture: {capture} no longer exists; put it back, or write there" in told
     config = run / "config.yaml"
     config.write_text(config.read_text().replace(str(capture), str(moved)))
-    assert main(["render", str(run), "--output", str(tmp_path / "drawn")]) == 0
+    assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0

@@ -7,10 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.scene.methods import METHODS, make_deformation
 from neeco.training.options import training_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
+
+
+ROD = (Instrument("rod"),)
 
 
 @pytest.mark.parametrize("method", list(METHODS))
@@ -64,8 +68,8 @@ def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
 
 
 def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
-    assert make_deformation("neeco", (), {"gate_mm": 20, "depth": 2}).config()["gate_mm"] == 20
-    assert make_deformation("neeco", (), {"gate_mm": None, "state": "rotation_jaw"}).config()["state"] == "rotation_jaw"
+    assert make_deformation("neeco", ROD, {"gate_mm": 20, "depth": 2}).config()["gate_mm"] == 20
+    assert make_deformation("neeco", ROD, {"gate_mm": None, "state": "rotation_jaw"}).config()["state"] == "rotation_jaw"
 
 
 @pytest.mark.parametrize(
