@@ -13,7 +13,6 @@ from neeco.scene.methods import METHODS, make_deformation
 from neeco.training.options import training_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
 
-
 ROD = (Instrument("rod"),)
 
 
@@ -40,6 +39,9 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("ssim_weight=[1", "is not a value"),
         ("ssim_weight=.nan", "is not a finite number"),
         ("deformation.speed=2", "method kinematic has no such field"),
+        ("method=3dgs", "use --method"),
+        ("joints=jaw_angle", r"'jaw_angle' is not a list; write \[jaw_angle\]"),
+        ("schedule.density=true", "'true' is none of on, off, inverse"),
         ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
@@ -69,7 +71,14 @@ def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
 
 def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
     assert make_deformation("neeco", ROD, {"gate_mm": 20, "depth": 2}).config()["gate_mm"] == 20
-    assert make_deformation("neeco", ROD, {"gate_mm": None, "state": "rotation_jaw"}).config()["state"] == "rotation_jaw"
+    drafts = make_deformation("neeco", ROD, {"gate_mm": None, "state": "rotation_jaw"})
+    assert drafts.config()["state"] == "rotation_jaw"
+
+
+@pytest.mark.parametrize("value", ["on", "off", "inverse"])
+@pytest.mark.parametrize("method", ["neeco", "kinematic"])
+def test_every_part_of_the_schedule_takes_the_words_the_manual_names(method: str, value: str) -> None:
+    assert training_config(method, {}, [f"schedule.density={value}"]).schedule.density == value
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,11 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
     open_ended = path == ["deformation"]
     if not isinstance(target, dict) or (last not in target and not open_ended):
         raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
+    if path == [] and last == "method":
+        raise NeecoError("--set method: would keep the other method's settings; use --method")
+    if isinstance(target.get(last), str):  # as it stands: YAML takes on and off for truth values
+        target[last] = text
+        return
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -65,6 +70,4 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
         raise NeecoError(f"--set {name}: {text!r} does not fit a field that holds {old!r}")
     if isinstance(old, int | float) and not isinstance(value, int | float):
         raise NeecoError(f"--set {name}: {text!r} is not a number")
-    if isinstance(old, str) and not isinstance(value, str):
-        value = text
     target[last] = value
