@@ -16,6 +16,7 @@ from neeco.errors import NeecoError
 MISSING = "/nowhere/at/all"
 WITH_BAD_PATH = {
     "check": [MISSING],
+    "ingest": [MISSING, "--output", "capture"],
     "train": [MISSING, "--output", "run"],
     "evaluate": [MISSING],
     "render": [MISSING, "--output", "drawn"],
