@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neeco.capture.images import write_labels
+from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 
@@ -120,3 +121,57 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
     only_training = make_run(world, tmp_path / "other", ("train",))
     with pytest.raises(NeecoError, match="all frames are training frames"):
         evaluate_run(only_training)
+
+
+def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
+    from neeco.evaluation import evaluate, lpips
+
+    seen = {}
+
+    def noting(where, function):
+        def call(*arguments, **options):
+            seen[where] = torch.get_num_threads()
+            return function(*arguments, **options)
+
+        return call
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        network = lpips.Lpips((lpips.Convolution(1, 1, 0, None, True),), one_by_one_filter())
+        monkeypatch.setattr(evaluate, "find_lpips", lambda folder: {"alexnet": network})
+        monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
+        monkeypatch.setattr(lpips, "conv2d", noting("lpips", lpips.conv2d))
+        evaluate_run(make_run(world, tmp_path), ["test"])
+        assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
+    finally:
+        torch.set_num_threads(before)
+
+
+def one_by_one_filter():
+    return {
+        "features.0.weight": torch.ones(1, 3, 1, 1),
+        "features.0.bias": torch.zeros(1),
+        "linear.0.weight": torch.ones(1),
+    }
+
+
+@pytest.mark.parametrize("place", ["taken/scores.json", "folder"])
+def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_path, monkeypatch, capsys, place):
+    run = make_run(world, tmp_path / "run")
+    (tmp_path / "taken").write_text("a file, not a folder")
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    monkeypatch.setattr("neeco.evaluation.evaluate.evaluate_run", lambda *_, **__: pytest.fail("scored"))
+    assert main(["evaluate", str(run.path), "--json", str(tmp_path / place)]) == 1
+    told = capsys.readouterr()
+    assert len(told.err.strip().splitlines()) == 1
+    assert str(tmp_path / place).split("/scores")[0] in told.err
+
+
+def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
+    run = make_run(world, tmp_path / "run")
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
+    assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
+    assert "photographs it never saw. " in (run.path / "report.html").read_text()

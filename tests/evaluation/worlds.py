@@ -13,6 +13,7 @@ from torch import Tensor
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.raster import Camera, Gaussians, rasterize
+from neeco.scene.deformations.static import Static
 
 WIDTH, HEIGHT = 48, 40
 
@@ -36,6 +37,7 @@ class TinyScene:
         self.colors = torch.rand(count, 1, 3, generator=random) * 2 - 1
         self.colors[len(self.tissue) :] += 1.2
         self.instruments = (Instrument("bar"),)
+        self.deformation = Static(self.instruments)
         self.label_names = (("bar", "shaft"), ("bar", "jaw_left")) if self.labelled else ()
 
     def at(self, state: State) -> Gaussians:

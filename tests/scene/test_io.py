@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.scene import Scene
-from neeco.scene.io import load_scene, save_scene
+from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors
 
 
 def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
@@ -94,6 +96,26 @@ def test_a_missing_tensor_is_refused(kinematic: Scene, tmp_path: Path, drop: str
     save_scene(kinematic, path)
     rewrite(path, lambda header: None, drop)
     with pytest.raises(NeecoError, match="damaged scene"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("canonical.quats", lambda tensor: tensor[:-1], r"quats has shape \[\d+, 4\], not \[\d+, 4\]"),
+        ("canonical.sh_dc", lambda tensor: tensor[..., :2], "sh_dc has shape"),
+        ("canonical.extras.part_logits", lambda tensor: tensor[:-1], "extras.part_logits has shape"),
+        ("canonical.means", lambda tensor: tensor * torch.nan, "means contains NaN"),
+        ("recorded.poses", lambda tensor: tensor[:1], "out of bounds"),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_refused(
+    kinematic: Scene, tmp_path: Path, name: str, change: Callable[[Tensor], Tensor], told: str
+) -> None:
+    tensors, header = pack_scene(kinematic)
+    path = tmp_path / "scene.safetensors"
+    save_tensors(tensors | {name: change(tensors[name]).contiguous()}, {"neeco": json.dumps(header)}, path)
+    with pytest.raises(NeecoError, match=f"scene.safetensors: damaged scene.*{told}"):
         load_scene(path)
 
 

@@ -5,9 +5,11 @@ import json
 import os
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import neeco.files
+from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import synthesize
@@ -40,7 +42,7 @@ def behind_the_camera(state, path) -> str:
     [
         ("nowhere.jsonl", "nowhere.jsonl: no such file; --states takes"),
         ("bad.jsonl", "bad.jsonl: line 1: not valid JSON"),
-        ("behind.jsonl", "behind.jsonl: every state was refused .*leaves the image"),
+        ("behind.jsonl", "behind.jsonl: every state was refused .*leaves the image.*; correct its poses"),
         ("inside", "image 0: no acceptable state in 3 tries"),
     ],
 )
@@ -73,6 +75,24 @@ def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tm
     assert len((cut / "states.jsonl").read_text().splitlines()) == 2
     assert synthesize(run, cut, replace(SETTINGS, tries=50), resume=True).made_now == 2
     assert contents(cut / "images") == contents(whole / "images")
+
+
+def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    real, left = dataset.make_sample, iter(range(2))
+
+    def stopped(*arguments):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    words = ["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "4", "--tries", "50"]
+    with monkeypatch.context() as patched:
+        patched.setattr(dataset, "make_sample", stopped)
+        assert main(words) == 130
+    assert capsys.readouterr().err.splitlines()[-1].endswith("run the same command again with --resume")
+    assert main([*words, "--resume"]) == 0
+    assert "4 images" in capsys.readouterr().out
 
 
 def test_a_refused_resume_changes_nothing(run, tmp_path):
@@ -128,3 +148,13 @@ def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
     with counting("synthesize", 3) as advance:
         advance(3)
     assert "3/3" in capsys.readouterr().err
+
+
+def test_a_given_state_with_its_own_camera_is_tried_once_and_not_counted_as_drawn(run, tmp_path, state):
+    camera = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()  # OpenGL axes of an OpenCV camera at the world's origin
+    lines = [state_to_json(given) | {"camera": camera} for given in (state(z=-50.0), state())]
+    path = tmp_path / "states.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    made = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2, states=str(path)))
+    assert (made.images, made.made_now, made.skipped) == (1, 1, [0])
+    assert made.refused == {"leaves the image": 1}

@@ -130,6 +130,10 @@ def test_states_written_are_states_read(tmp_path, scene, state):
         (lambda line: line.pop("instruments"), "instruments"),
         (lambda line: line.update(camera=[[1]]), "camera"),
         (lambda line: line.update(time="now"), "time"),
+        (lambda line: line.update(time=10**400), "time: expected a finite number"),
+        (lambda line: line["instruments"][0]["pose"][0].__setitem__(3, 10**400), r"instruments\[0\].pose"),
+        (lambda line: line["instruments"][0].update(name=["rod"]), r"instruments\[0\].name: \['rod'\] is not"),
+        (lambda line: line["instruments"].append(line["instruments"][0]), r"instruments\[1\].name: 'rod' comes twice"),
     ],
 )
 def test_a_bad_state_is_refused_with_its_line_and_field(tmp_path, scene, state, change, field):
@@ -162,3 +166,9 @@ def test_perturbed_views_stay_near_recorded_ones(camera):
     shifts = [np.linalg.norm(views(rng_of(k)).world_from_camera.numpy()[:3, 3]) for k in range(100)]
     assert 0 < np.mean(shifts) < 3
     assert views(rng_of(0)).fx == camera.fx
+
+
+@pytest.mark.parametrize("states", ["", "path:", "."])
+def test_a_folder_is_no_file_of_states(scene, states):
+    with pytest.raises(NeecoError, match=f"--states: '{states}' is neither inside, beyond"):
+        make_sampler(scene, states, 0.2, "recorded", 1)

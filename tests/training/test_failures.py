@@ -185,3 +185,19 @@ def test_what_a_loss_mask_hides_teaches_nothing(seen: bool, tmp_path: Path) -> N
         run = train(capture, tmp_path / f"run-{name}", CONFIG)
         scenes.append((run / "scene.safetensors").read_bytes())
     assert (scenes[0] != scenes[1]) is seen
+
+
+def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = train(capture, tmp_path / "run", CONFIG)
+    moved = capture.rename(tmp_path / "moved")
+    for words in (["evaluate", str(run)], ["render", str(run), "--output", str(tmp_path / "drawn")]):
+        capsys.readouterr()
+        assert main(words) == 1
+        told = capsys.readouterr().err
+        assert told.strip().splitlines() == [told.strip()]
+        assert f"{run / 'config.yaml'}: capture: {capture} no longer exists; put it back, or write there" in told
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace(str(capture), str(moved)))
+    assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -19,6 +20,7 @@ from neeco.cli import main
 from neeco.training import train as module
 from neeco.training.interrupt import hearing_stops
 from neeco.training.options import training_config
+from neeco.training.session import Session
 from neeco.training.train import ProgressRow, train
 
 PROGRAM = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())"]
@@ -64,6 +66,26 @@ def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
     train(capture, tmp_path / "cut", CONFIG, resume=True, progress=lambda row: steps.append(row.iteration))
     assert min(step for step in steps if step) == stop + 1  # nothing is done twice
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+
+
+def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "ROW_INTERVAL", 10)
+
+    def rows(folder: Path) -> list[dict]:
+        lines = (folder / "metrics.jsonl").read_text().splitlines()
+        return [{key: value for key, value in json.loads(line).items() if key != "seconds"} for line in lines]
+
+    def stop_within_the_row(session: Session) -> None:
+        if session.iteration == 17:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    train(capture, tmp_path / "whole", CONFIG)
+    with pytest.raises(KeyboardInterrupt, match="at iteration 18"):
+        train(capture, tmp_path / "cut", CONFIG, watch=stop_within_the_row)
+    train(capture, tmp_path / "cut", CONFIG, resume=True)
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
 
 
 def test_a_second_ctrl_c_stops_at_once(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,11 +76,9 @@ def test_a_new_method_that_needs_instruments_says_so(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_a_field_that_the_method_does_not_have_is_refused_by_name(tmp_path: Path) -> None:
-    config = training_config("drift", {"iterations": 12}, ["deformation.raech=3"])
-    with pytest.raises(NeecoError, match=r"deformation.raech: method drift has no such field; it has reach"):
-        train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
-    assert not (tmp_path / "run").exists()
+def test_a_field_that_the_method_does_not_have_is_refused_by_name() -> None:
+    with pytest.raises(NeecoError, match=r"--set: deformation.raech: method drift has no such field; it has reach"):
+        training_config("drift", {"iterations": 12}, ["deformation.raech=3"])
 
 
 def test_extras_with_a_rate_are_learned_and_others_hold_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,10 +7,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
-from neeco.scene.methods import METHODS
+from neeco.scene.methods import METHODS, make_deformation
 from neeco.training.options import training_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
+
+ROD = (Instrument("rod"),)
 
 
 @pytest.mark.parametrize("method", list(METHODS))
@@ -35,12 +38,55 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("refine=3", "is a group of fields; give one of registration"),
         ("ssim_weight=[1", "is not a value"),
         ("ssim_weight=.nan", "is not a finite number"),
+        ("deformation.speed=2", "method kinematic has no such field"),
+        ("method=3dgs", "use --method"),
+        ("joints=jaw_angle", r"'jaw_angle' is not a list; write \[jaw_angle\]"),
+        ("schedule.density=true", "'true' is none of on, off, inverse"),
         ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
     with pytest.raises(NeecoError, match=f"--set.*{named}"):
         training_config("kinematic", {}, [assignment])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "named"),
+    [
+        ("state", "foo", "'foo' is none of full, rotation_jaw"),
+        ("half", "no", "'no' is not true or false"),
+        ("half", 1, "1 is not true or false"),
+        ("depth", True, "True is not a whole number"),
+        ("width", 2.5, "2.5 is not a whole number"),
+        ("gate_mm", "far", "'far' is not a number"),
+        ("speed", 1, "has no such field"),
+    ],
+)
+def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
+    field: str, value: object, named: str
+) -> None:
+    with pytest.raises(NeecoError, match=f"deformation.{field}: .*{named}"):
+        make_deformation("neeco", (), {field: value})
+
+
+def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
+    assert make_deformation("neeco", ROD, {"gate_mm": 20, "depth": 2}).config()["gate_mm"] == 20
+    drafts = make_deformation("neeco", ROD, {"gate_mm": None, "state": "rotation_jaw"})
+    assert drafts.config()["state"] == "rotation_jaw"
+
+
+@pytest.mark.parametrize("value", ["on", "off", "inverse"])
+@pytest.mark.parametrize("method", ["neeco", "kinematic"])
+def test_every_part_of_the_schedule_takes_the_words_the_manual_names(method: str, value: str) -> None:
+    assert training_config(method, {}, [f"schedule.density={value}"]).schedule.density == value
+
+
+@pytest.mark.parametrize(
+    ("assignment", "named"), [("iterations=0", "--iterations: 0"), ("minutes=-1", "--minutes: -1")]
+)
+def test_a_run_of_no_length_is_refused_however_it_is_asked_for(assignment: str, named: str) -> None:
+    with pytest.raises(NeecoError, match=f"{named} is not a positive number"):
+        training_config("3dgs", {}, [assignment])
 
 
 @pytest.mark.parametrize("values", [{"iterations": 0}, {"minutes": 0.0}, {"minutes": float("nan")}])

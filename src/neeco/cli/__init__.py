@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"neeco: error: {where}{error.strerror or error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
-        told = " ".join(map(str, interrupt.args)) or "what was finished is kept"
+        told = " ".join(map(str, interrupt.args)) or "run the same command again"
         print(f"\nneeco: interrupted: {told}", file=sys.stderr)
         return INTERRUPTED
     finally:

@@ -33,12 +33,15 @@ def run(args: Arguments) -> int:
     if args.output.exists() and (not args.output.is_dir() or any(args.output.iterdir())):
         raise NeecoError(f"{args.output}: exists already; give another --output, or remove it")
     start = time.monotonic()
-    capture = sample_capture()
-    _check(capture)
-    trained = _train(capture, args.output / "run", args.minutes)
-    dataset = args.output / "dataset"
-    _synthesize(trained, dataset)
-    report = _evaluate(trained, dataset)
+    capture, dataset = sample_capture(), args.output / "dataset"
+    try:
+        _check(capture)
+        trained = _train(capture, args.output / "run", args.minutes)
+        _synthesize(trained, dataset)
+        report = _evaluate(trained, dataset)
+    except KeyboardInterrupt:
+        before = f"remove {args.output} and " if args.output.exists() else ""
+        raise KeyboardInterrupt(f"{before}run the same command again") from None
     print(f"\nDone in {time.monotonic() - start:.0f} s.")
     for what, path in (
         ("capture", capture),
@@ -96,7 +99,7 @@ def _synthesize(trained: Run, output: Path) -> None:
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
-    with counting("synthesize", IMAGES) as advance:
+    with trained.scene.deformation.torch_threads(), counting("synthesize", IMAGES) as advance:
         synthesize(trained, output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
 
 

@@ -59,8 +59,11 @@ def run(arguments: Arguments) -> int:
     settings = Settings(**{name: getattr(arguments, name) for name in Settings.__dataclass_fields__})
     settings.check()
     trained = load_run(arguments.run)
-    with counting("synthesize", arguments.count) as advance:
-        summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
+    with trained.scene.deformation.torch_threads(), counting("synthesize", arguments.count) as advance:
+        try:
+            summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("what was drawn is kept; run the same command again with --resume") from None
     print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
     for reason, times in summary.refused.items():
         print(f"refused {times} states: instrument {reason}")

@@ -69,13 +69,23 @@ def evaluate_run(
     """
     capture, scene = run.capture(), run.scene
     splits = _chosen_splits(capture, splits)
-    networks = find_lpips(lpips_weights)
+    networks = find_lpips(lpips_weights)  # these keep torch's threads, the rest of the scoring takes fewer
     report = progress or (lambda what, done, total: None)
-    report("training views", 0, 1)
-    context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
-    report("training views", 1, 1)
-    kinds = ("given", "aligned") if align else ("given",)
-    notes = _scene_notes(scene, networks)
+    with scene.deformation.torch_threads():
+        report("training views", 0, 1)
+        context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
+        report("training views", 1, 1)
+        evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
+    write_json(run.path / EVALUATION_FILE, evaluation)
+    return evaluation
+
+
+def _evaluate_splits(
+    context: _Context, splits: Sequence[str], kinds: tuple[str, ...], report: Progress
+) -> dict[str, Any]:
+    """What `evaluate_run` returns."""
+    scene, capture = context.scene, context.capture
+    notes = _scene_notes(scene, context.networks)
     result: dict[str, Any] = {kind: {} for kind in kinds}
     labels: dict[str, Any] = {
         "threshold": LABEL_THRESHOLD,
@@ -97,10 +107,9 @@ def evaluate_run(
             labels["jaw_assignment"][kind][split] = assignment
             per_frame[kind][split] = tally.rows
         notes += _split_notes(split, result["given"][split])
-    evaluation = result | {"notes": notes, "labels": labels, "per_frame": per_frame}
-    evaluation = _clean(evaluation)
-    write_json(run.path / EVALUATION_FILE, evaluation)
-    return evaluation
+    cleaned = _clean(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
+    assert isinstance(cleaned, dict)
+    return cleaned
 
 
 def _chosen_splits(capture: Capture, splits: Sequence[str] | None) -> tuple[str, ...]:

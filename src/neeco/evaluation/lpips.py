@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, max_pool2d, relu
 
 from neeco.errors import NeecoError
+from neeco.raster.threads import torch_threads
 
 WEIGHTS_VARIABLE = "NEECO_LPIPS_WEIGHTS"
 MIN_SIZE = 32  # px; below it the pooled maps vanish
@@ -49,6 +50,7 @@ class Lpips:
 
     layers: tuple[Convolution, ...]
     weights: dict[str, Tensor]  # features.i.weight [O, I, k, k], features.i.bias [O], linear.j.weight [O]
+    threads: int = field(default_factory=torch.get_num_threads)  # of torch: these convolutions gain from several
 
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
@@ -57,13 +59,14 @@ class Lpips:
         scale = torch.tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
         maps: list[Tensor] = []
         x = ((image.float().permute(2, 0, 1) * 2 - 1 - shift) / scale)[None]
-        for index, layer in enumerate(self.layers):
-            if layer.pool is not None:
-                x = max_pool2d(x, *layer.pool)
-            weight, bias = self.weights[f"features.{index}.weight"], self.weights[f"features.{index}.bias"]
-            x = relu(conv2d(x, weight, bias, stride=layer.stride, padding=layer.padding))
-            if layer.tap:
-                maps.append(x[0] / (x[0].norm(dim=0, keepdim=True) + 1e-10))
+        with torch_threads(self.threads):
+            for index, layer in enumerate(self.layers):
+                if layer.pool is not None:
+                    x = max_pool2d(x, *layer.pool)
+                weight, bias = self.weights[f"features.{index}.weight"], self.weights[f"features.{index}.bias"]
+                x = relu(conv2d(x, weight, bias, stride=layer.stride, padding=layer.padding))
+                if layer.tap:
+                    maps.append(x[0] / (x[0].norm(dim=0, keepdim=True) + 1e-10))
         return maps
 
     @torch.no_grad()

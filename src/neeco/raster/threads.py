@@ -1,6 +1,11 @@
-"""How many threads the CPU kernels use, which instruction set, and what becomes of freed memory."""
+"""How many threads the CPU kernels and torch use, which instruction set, and what becomes of freed memory."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
 
 from neeco.errors import NeecoError
 from neeco.raster.native import native
@@ -16,6 +21,21 @@ def set_threads(count: int) -> None:
 def threads() -> int:
     """Threads that the CPU kernels use."""
     return native().thread_count()
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch's own operations use `count` threads until the end of the block; the kernels keep theirs.
+
+    Threads that share a small operation wait for each other, at full load, longer than they work: one is best for the
+    operations between two drawings.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def simd() -> str:

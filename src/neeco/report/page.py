@@ -59,7 +59,8 @@ def write_report(
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
-    figures = frame_figures(evaluation, capture, scene, kind)
+    with scene.deformation.torch_threads():
+        figures = frame_figures(evaluation, capture, scene, kind)
     sections = [
         _header(run_path, evaluation, capture, scene),
         _tiles(evaluation),
@@ -87,10 +88,11 @@ def write_report(
 def _header(run_path: Path, evaluation: dict[str, Any], capture: Capture, scene: Scene) -> str:
     instruments = ", ".join(item.name for item in scene.instruments) or "no instrument"
     trained = len(capture.split("train"))
+    seen = " (split train apart)" if "train" in evaluation["given"] else ""
     return (
         f"<header><h1>{escape(capture.root.name)} <span class='soft'>learned by {escape(scene.method)}</span></h1>"
         f"<p>A Gaussian-splatting model of this recording ({escape(instruments)}), learned from {trained} frames and "
-        f"compared here with photographs it never saw. Everything below was drawn by the model itself.</p>"
+        f"compared here with photographs it never saw{seen}. Everything below was drawn by the model itself.</p>"
         f"<p class='soft'>{datetime.now().astimezone():%Y-%m-%d %H:%M %Z} · neeco {escape(neeco.__version__)} · "
         f"{escape(str(run_path))}</p></header>"
     )

@@ -15,11 +15,19 @@ from neeco import __version__
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
-from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Recording, Scene
 
 SCHEMA = "neeco-scene/1"
+CANONICAL_SHAPES = {  # of one Gaussian
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "opacity_logits": (),
+    "sh_dc": (1, 3),
+    "sh_rest": (SH_COEFFICIENTS - 1, 3),
+}
 
 
 def save_scene(scene: Scene, path: Path) -> None:
@@ -55,7 +63,9 @@ def load_scene(path: Path) -> Scene:
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
     try:
         return unpack_scene(tensors, header)
-    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+    except NeecoError as error:
+        raise NeecoError(f"{path}: {error}; train again") from None
+    except (LookupError, ValueError, TypeError, RuntimeError) as error:
         raise NeecoError(f"{path}: damaged scene ({error}); train again") from None
 
 
@@ -98,6 +108,19 @@ def pack_scene(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, header
 
 
+def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
+    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
+    if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
+        raise ValueError(f"{missing[0]} is missing")
+    for name, tensor in tensors.items():
+        found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
+        if found != wanted:
+            raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
+        if not torch.isfinite(tensor).all():
+            raise ValueError(f"{name} contains NaN or infinity")
+    return CanonicalGaussians.from_tensors(tensors, counts)
+
+
 def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
     """The inverse of `pack_scene`."""
     instruments = tuple(
@@ -122,7 +145,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
         tuple(states),
         tuple(cameras),
     )
-    canonical = CanonicalGaussians.from_tensors(
+    canonical = _canonical(
         {name.removeprefix("canonical."): t for name, t in tensors.items() if name.startswith("canonical.")},
         tuple(header["counts"]),
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import types
+import typing
 from typing import Any
 
 from neeco.capture.model import Instrument
@@ -11,6 +13,8 @@ from neeco.scene.deformations.base import Deformation
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.deformations.nps import NPS
 from neeco.scene.deformations.static import Static
+
+WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 METHODS: dict[str, type[Deformation]] = {"kinematic": Kinematic, "neeco": NPS, "3dgs": Static}
 
@@ -24,13 +28,38 @@ def deformation_class(method: str) -> type[Deformation]:
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Deformation:
     """The deformation of `method` with its own config. Raises NeecoError for an unknown name or field."""
+    check_fields(method, config)
+    try:
+        return deformation_class(method)(instruments, **config)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise NeecoError(f"deformation: method {method}: {str(error).splitlines()[0]}; see --set deformation") from None
+
+
+def check_fields(method: str, config: dict[str, Any]) -> None:
+    """Raises NeecoError for a field that the deformation of `method` does not have, or whose type does not fit."""
     kind = deformation_class(method)
     known = list(inspect.signature(kind).parameters)[1:]
     if unknown := [name for name in config if name not in known]:
         raise NeecoError(
             f"deformation.{unknown[0]}: method {method} has no such field; it has {', '.join(known) or 'none'}"
         )
-    try:
-        return kind(instruments, **config)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise NeecoError(f"deformation: method {method}: {str(error).splitlines()[0]}; see --set deformation") from None
+    hints = typing.get_type_hints(kind.__init__)
+    for name, value in config.items():
+        _check_field(f"deformation.{name}", value, hints[name])
+
+
+def _check_field(name: str, value: Any, kind: Any) -> None:
+    """Raises NeecoError when `value` is not of type `kind`: a Literal, a plain type, or either or None."""
+    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    arms = typing.get_args(kind) if union else (kind,)
+    if value is None and type(None) in arms:
+        return
+    for arm in arms:
+        if typing.get_origin(arm) is typing.Literal:
+            if value not in typing.get_args(arm):
+                raise NeecoError(f"{name}: {value!r} is none of {', '.join(map(str, typing.get_args(arm)))}")
+            return
+    wanted = [arm for arm in arms if arm is not type(None)]
+    allowed = (*wanted, int) if float in wanted else tuple(wanted)  # a whole number is a number too
+    if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in wanted):
+        raise NeecoError(f"{name}: {value!r} is not {' or '.join(WORDS.get(arm, arm.__name__) for arm in wanted)}")

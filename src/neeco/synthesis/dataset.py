@@ -18,7 +18,7 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.evaluation.labels import LABEL_THRESHOLD
 from neeco.files import new_folder, read_json, write_json
-from neeco.synthesis.acceptance import Acceptance, find_tolerance
+from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.annotation import KEYPOINTS, annotate
 from neeco.synthesis.drawing import (
     CompositedLabels,
@@ -52,6 +52,10 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"
+REMEDIES = {  # where every given state was refused
+    LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
+    ENTERS_TISSUE: "give a larger --tissue-tolerance-mm, or --no-tissue-check",
+}
 
 
 @dataclass(frozen=True)
@@ -104,14 +108,13 @@ def synthesize(
                 record = load_record(output, index) if begun else None
                 if record is None:
                     record = make_sample(scene, labeller, sampler, acceptance, settings, output, index)
-                    made += 1
+                    made += not record.get("skipped")
                 records.append(record)
                 on_progress(index + 1)
             if not _drawn(records):
                 reasons = ", ".join(f"{reason}: {count}" for reason, count in _refusals(records).items())
-                raise NeecoError(
-                    f"{settings.states}: every state was refused ({reasons}); try --no-tissue-check or --min-share"
-                )
+                remedies = "; ".join(REMEDIES[reason] for reason in _refusals(records) if reason in REMEDIES)
+                raise NeecoError(f"{settings.states}: every state was refused ({reasons}); {remedies}")
         except (KeyboardInterrupt, NeecoError):
             if begun or _drawn(records):
                 with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
@@ -190,7 +193,7 @@ def _first_acceptable(
 ) -> tuple[Drawing | None, Counter[str]]:
     rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
     refused: Counter[str] = Counter()
-    for _ in range(settings.tries):
+    for _ in range(1 if sampler.fixed(index) else settings.tries):
         state, camera = sampler(index, rng)
         drawing = draw(scene, labeller, state, camera, settings.speckle)
         reason = acceptance.why_refused(scene, drawing)

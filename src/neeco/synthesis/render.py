@@ -74,15 +74,16 @@ def render(
     """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view. Raises NeecoError."""
     channels = scene.label_channels() if scene.label_names else None
     done = 0
-    for view in views:
-        rendering = rasterize(scene.at(view.state), scene.camera(view.camera), channels=channels)
-        write_image(folder / f"{view.name}.png", rendering.color)
-        if channels is not None:
-            parts = composited_parts(rendering).cpu()
-            write_labels(folder / f"{view.name}_parts.png", parts)
-            write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
-        done += 1
-        on_progress(done)
+    with scene.deformation.torch_threads():
+        for view in views:
+            rendering = rasterize(scene.at(view.state), scene.camera(view.camera), channels=channels)
+            write_image(folder / f"{view.name}.png", rendering.color)
+            if channels is not None:
+                parts = composited_parts(rendering).cpu()
+                write_labels(folder / f"{view.name}_parts.png", parts)
+                write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
+            done += 1
+            on_progress(done)
     return Rendered(folder, done, channels is not None)
 
 

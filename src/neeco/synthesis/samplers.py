@@ -50,6 +50,10 @@ class Sampler:
         """Whether the state of an index is given rather than random."""
         return self.states.prescribed
 
+    def fixed(self, index: int) -> bool:
+        """Whether both state and camera of image `index` are given: another draw would be the same."""
+        return self.prescribed and self.cameras[index % len(self.cameras)] is not None
+
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
         """The next (state, camera) for image `index`.
 
@@ -91,7 +95,7 @@ def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: 
 def states_file(states: str) -> Path:
     """The file that `--states` names; NeecoError when it is meant to be a sampler's name but is none."""
     path = Path(states.removeprefix(PATH_PREFIX))
-    if not path.suffix and not path.exists():
+    if path.is_dir() or (not path.suffix and not path.exists()):
         raise NeecoError(f"--states: {states!r} is neither inside, beyond, grid, path:FILE.jsonl nor a file")
     return path
 

@@ -7,6 +7,7 @@ One state a line: `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +74,7 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
-        raise NeecoError(f"{where}: not valid JSON: {error.msg}") from None
+        raise NeecoError(f"{where}: not valid JSON: {error.msg}; give one JSON object per line") from None
     if not isinstance(value, dict) or not isinstance(value.get("instruments"), list):
         raise NeecoError(f'{where}: instruments: missing; expected {{"instruments": [{{"name", "pose", "joints"}}]}}')
     time = _number(value.get("time", 0.0), f"{where}: time")
@@ -82,8 +83,10 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     for position, entry in enumerate(value["instruments"]):
         name = entry.get("name") if isinstance(entry, dict) else None
         at = f"{where}: instruments[{position}]"
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise NeecoError(f"{at}.name: {name!r} is not in the scene; it has {', '.join(known) or 'no instruments'}")
+        if name in states:
+            raise NeecoError(f"{at}.name: {name!r} comes twice in this line; give every instrument once")
         pose = _rigid(entry.get("pose"), f"{at}.pose")
         states[name] = InstrumentState(torch.from_numpy(pose), _joints(entry, known[name], at))
     if missing := [name for name in known if name not in states]:
@@ -110,15 +113,19 @@ def _joints(entry: dict[str, Any], instrument: Instrument, at: str) -> dict[str,
 
 
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise NeecoError(f"{where}: expected a finite number, not {value!r}")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:  # JSON knows integers that no float can hold
+        number = math.inf
+    if not math.isfinite(number):
+        raise NeecoError(f"{where}: expected a finite number, not {str(value)[:20]!r}")
+    return number
 
 
 def _rigid(value: Any, where: str) -> np.ndarray:
     try:
         matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise NeecoError(f"{where}: expected a 4x4 matrix of finite numbers")

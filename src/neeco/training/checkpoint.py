@@ -13,7 +13,7 @@ from torch import Tensor
 from neeco.errors import NeecoError
 from neeco.scene.io import pack_scene, save_tensors, unpack_scene
 from neeco.scene.scene import Scene
-from neeco.training.session import Session
+from neeco.training.session import Session, StepResult
 
 SCHEMA = "neeco-checkpoint/1"
 
@@ -45,6 +45,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         "queue_phase": session.queue_phase,
         "iteration": session.iteration,
         "seconds": session.seconds,
+        "window": [[step.loss, step.psnr] for step in session.window],
     }
     metadata = {"neeco": json.dumps(header)}
     save_tensors(tensors, metadata, checkpoint_path(run))
@@ -61,7 +62,7 @@ def read_checkpoint(run: Path) -> tuple[Scene, dict[str, Any], dict[str, Tensor]
             raise ValueError(f"schema {header['schema']!r}, this version reads {SCHEMA!r}")
         parts = {name.removeprefix("scene/"): t for name, t in tensors.items() if name.startswith("scene/")}
         scene = unpack_scene(parts, header["scene"])
-    except (SafetensorError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+    except (SafetensorError, OSError, LookupError, ValueError, TypeError, RuntimeError) as error:
         raise NeecoError(
             f"{path}: cannot resume from this checkpoint ({error}); train again without --resume"
         ) from None
@@ -82,4 +83,5 @@ def restore_session(session: Session, header: dict[str, Any], tensors: dict[str,
     session.generator.set_state(tensors["random/generator"])
     torch.set_rng_state(tensors["random/torch"])
     session.queue, session.queue_phase = header["queue"], header["queue_phase"]
+    session.window = [StepResult(loss, psnr) for loss, psnr in header.get("window", [])]  # not in older ones
     session.iteration, session.seconds = header["iteration"], header["seconds"]

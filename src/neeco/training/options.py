@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
+from neeco.scene.methods import check_fields
 from neeco.training.config import TrainConfig, method_defaults
 from neeco.training.run import config_from_dict, config_to_dict
 
@@ -21,18 +22,19 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
     """
     given = {name: value for name, value in values.items() if value is not None}
     config = dataclasses.replace(method_defaults(method), **given)
-    if config.iterations < 1:
-        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
-    if config.minutes is not None and not config.minutes > 0:
-        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
     try:
         config = config_from_dict(plain)
+        check_fields(config.method, config.deformation)
     except NeecoError as error:
         told = str(error).removeprefix("config.yaml: ").removesuffix("; train again")
         raise NeecoError(f"--set: {told}") from None
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
@@ -50,6 +52,11 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
     open_ended = path == ["deformation"]
     if not isinstance(target, dict) or (last not in target and not open_ended):
         raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
+    if path == [] and last == "method":
+        raise NeecoError("--set method: would keep the other method's settings; use --method")
+    if isinstance(target.get(last), str):  # as it stands: YAML takes on and off for truth values
+        target[last] = text
+        return
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -63,6 +70,4 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
         raise NeecoError(f"--set {name}: {text!r} does not fit a field that holds {old!r}")
     if isinstance(old, int | float) and not isinstance(value, int | float):
         raise NeecoError(f"--set {name}: {text!r} is not a number")
-    if isinstance(old, str) and not isinstance(value, str):
-        value = text
     target[last] = value

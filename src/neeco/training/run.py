@@ -35,9 +35,8 @@ class Run:
         """The capture it was trained on. Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
-            raise NeecoError(
-                f"{self.path / 'config.yaml'}: capture: {root} no longer exists; edit the path or give --capture"
-            )
+            config = self.path / "config.yaml"
+            raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
         return read_capture(root, self.config["transforms"])
 
 
@@ -113,4 +112,8 @@ def _build(kind: Any, value: Any) -> Any:
         return _build(next(arm for arm in typing.get_args(kind) if arm is not type(None)), value)
     if typing.get_origin(kind) is typing.Literal and value not in typing.get_args(kind):
         raise ValueError(f"{value!r} is none of {', '.join(map(str, typing.get_args(kind)))}")
-    return tuple(value) if typing.get_origin(kind) is tuple and value is not None else value
+    if typing.get_origin(kind) is tuple and value is not None:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{value!r} is not a list; write [{value}]")
+        return tuple(value)
+    return value

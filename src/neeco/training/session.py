@@ -65,6 +65,7 @@ class Session:
     queue_phase: int = 1
     iteration: int = 0
     seconds: float = 0.0
+    window: list[StepResult] = field(default_factory=list)  # steps since the last row of metrics.jsonl
 
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.config.schedule)

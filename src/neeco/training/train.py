@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -82,7 +81,7 @@ def train(
     capture, frames = _open_capture(capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
-    with new_folder(output), _torch_threads(config.method):
+    with new_folder(output), deformation_class(config.method).torch_threads():
         try:
             session = _begin(capture, frames, output, config, resume, log)
         except KeyboardInterrupt:
@@ -108,18 +107,6 @@ def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
             f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
         )
     return config_from_dict(stored)
-
-
-@contextmanager
-def _torch_threads(method: str) -> Iterator[None]:
-    """One thread for torch's small operations, which only wait for each other: the kernels have their own threads."""
-    before = torch.get_num_threads()
-    if not deformation_class(method).large_operations:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _begin(
@@ -160,14 +147,12 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
 
 def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
     """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
-    losses, psnrs, phase = [], [], session.schedule.phase
+    phase = session.schedule.phase
     last = log.clock()
     try:
         while session.progress < 1:
             before = session.progress
-            result = session.step()
-            losses.append(result.loss)
-            psnrs.append(result.psnr)
+            session.window.append(session.step())
             now = log.clock()
             session.seconds, last = session.seconds + now - last, now
             if session.schedule.phase != phase:
@@ -176,8 +161,7 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
             if before < WRIST_FRACTION <= session.progress:
                 place_wrists(session)
             if session.iteration % ROW_INTERVAL == 0:
-                log.row(session, sum(losses) / len(losses), sum(psnrs) / len(psnrs))
-                losses, psnrs = [], []
+                log.row(session)
             if stop.heard or session.iteration % CHECKPOINT_INTERVAL == 0:
                 save_checkpoint(session, output)
             if stop.heard:
@@ -214,7 +198,11 @@ class _Log:
         self.clock = clock
         self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
 
-    def row(self, session: Session, loss: float, psnr: float) -> None:
+    def row(self, session: Session) -> None:
+        """Write the means over the session's window, and empty it."""
+        loss = sum(step.loss for step in session.window) / len(session.window)
+        psnr = sum(step.psnr for step in session.window) / len(session.window)
+        session.window.clear()
         self.last = ProgressRow(
             session.iteration,
             round(loss, 6),

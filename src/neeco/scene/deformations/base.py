@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.raster.threads import torch_threads
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinged
 from neeco.scene.swept import SweptVolume
@@ -74,6 +76,11 @@ class Deformation(nn.Module):
     extra_rates: ClassVar[Mapping[str, float]] = {}
     needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
     large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
+
+    @classmethod
+    def torch_threads(cls) -> AbstractContextManager[None]:
+        """As many of torch's threads as pay where scenes are posed and drawn: one, unless the operations are large."""
+        return nullcontext() if cls.large_operations else torch_threads(1)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -65,7 +65,7 @@ class NPS(Deformation):
         L_mean: int = 10,
         L_state: int = 10,
         identity: bool = False,
-        state: str = "full",
+        state: Literal["full", "rotation_jaw"] = "full",
         half: bool = False,
         chunk: int = 65536,
         gate_mm: float | None = None,
