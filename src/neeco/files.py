@@ -84,6 +84,12 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def require_file(path: Path, expected: str) -> None:
+    """Raise NeecoError when `path` is there but is no file: a folder, or a pipe or device whose reading may not end."""
+    if path.exists() and not path.is_file():
+        raise NeecoError(f"{path}: is not a file; expected {expected}")
+
+
 def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
     path = Path(path)

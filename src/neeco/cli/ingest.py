@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from neeco.capture.ingest.result import IngestResult
 
 PAGE = "ingest.html"
+RECORDING = "recording.yaml"
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,25 @@ def run(args: Ingest) -> int:
     from neeco.errors import NeecoError
 
     if args.init:
+        _refuse_beside(args, "--init", keep=())
         return _init(args.source or Path())
     if args.output is None:
         raise NeecoError("--output: give the folder of the capture to write")
     if args.source is not None and args.source.is_dir():
+        if (args.source / RECORDING).is_file():
+            raise NeecoError(f"{args.source}: holds a recording; give the file: {args.source / RECORDING}")
+        _refuse_beside(args, f"{args.source}: a folder in another format", keep=("output",))
         return _convert(args.source, args.output)
     return _ingest(_recording(args), args.output, args.json)
+
+
+def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
+    """Raise NeecoError when an option was given that would be ignored beside `what`."""
+    from neeco.errors import NeecoError
+
+    for option in fields(Ingest):
+        if option.name not in ("source", "init", *keep) and getattr(args, option.name) != option.default:
+            raise NeecoError(f"{what}, and --{option.name} would be ignored beside it; leave one of them out")
 
 
 def _init(folder: Path) -> int:
@@ -68,7 +82,7 @@ def _init(folder: Path) -> int:
     from neeco.errors import NeecoError
     from neeco.files import write_text
 
-    path = folder / "recording.yaml"
+    path = folder / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     write_text(path, write_template(folder))
@@ -86,18 +100,17 @@ def _convert(folder: Path, output: Path) -> int:
 
 
 def _recording(args: Ingest) -> Recording:
-    from neeco.capture.ingest.recording import read_recording, recording_from_flags
+    from neeco.capture.ingest.recording import check_frames, read_recording, recording_from_flags
     from neeco.errors import NeecoError
 
     if args.source is not None:
-        said = (args.video, args.instrument, args.laparoscope, args.joint, args.calibration, args.intrinsics, args.sync)
-        if any(said):
-            raise NeecoError(f"{args.source}: says what was recorded; give that file or the options, not both")
+        _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "json"))
+        check_frames(args.frames)
         recording = read_recording(args.source)
         return recording if args.frames is None else replace(recording, frames=args.frames)
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
-    if args.intrinsics and args.calibration:
+    if args.intrinsics is not None and args.calibration is not None:
         raise NeecoError("--calibration: given beside --intrinsics; give one of them")
     return recording_from_flags(
         args.video,
@@ -113,12 +126,13 @@ def _recording(args: Ingest) -> Recording:
 
 def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
     from neeco.capture import check_capture
+    from neeco.capture.check import errors_only
     from neeco.capture.ingest.pipeline import ingest
     from neeco.report.ingest_page import write_ingest_page
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as bar:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
 
         def report(what: str, done: int, total: int) -> None:
@@ -128,7 +142,10 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
                 tasks[what] = bar.add_task(what, total=total or None)
             bar.update(tasks[what], completed=done, total=total or None)
 
-        result = ingest(recording, output, report)
+        try:
+            result = ingest(recording, output, report)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("nothing was written") from None
         report("writing the page", 0, 0)
         write_ingest_page(result, output / PAGE)
     if as_json:
@@ -136,6 +153,8 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
         return 0
     _print(result)
     problems = check_capture(output)
+    for problem in errors_only(problems):
+        print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
     print(f"how good it is: {output / PAGE}")
     return 0

@@ -123,7 +123,7 @@ def test_images_that_show_nothing_leave_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "recording.yaml").write_text("images: {folder: images, fps: 25}\nintrinsics: [50, 50, 32, 24]\n")
     with pytest.raises(NeecoError, match=r"no cameras could be found|a camera was found for only"):
         ingest(read_recording(tmp_path / "recording.yaml"), tmp_path / "out" / "capture", silent)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_output_that_exists_is_not_touched(recording: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.ingest.interpolate import poses_at
@@ -17,6 +18,7 @@ CLEAR = 0.6  # correlation below which two motions are not the same
 DISTINCT = 0.08  # by how much the best offset must beat every other, apart from its own lobe
 LOBE = 0.3  # s
 OVERLAP = 0.6  # of the video that must lie on the log
+LONGEST = 24 * 3600.0  # s that a log may span for its clock to be looked for
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ def offset_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: P
     Speed of turning needs no calibration: it is the same for every point of a rigid scope. Raises NeecoError when the
     two never fit, or fit at several offsets.
     """
+    _check_span(log)
     video_grid = np.arange(times[0] + STRIDE, times[-1] - STRIDE, STEP)
     log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
     if len(video_grid) < 50 or len(log_grid) < 50:
@@ -50,6 +53,7 @@ def offset_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) 
     motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. Raises NeecoError when the two never
     fit, or fit at several offsets. The uncertainty is what halves of the video disagree by.
     """
+    _check_span(log)
     steps = np.diff(times)
     middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
     grid = np.arange(middle[0], middle[-1], STEP)
@@ -72,6 +76,15 @@ def offset_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) 
             halves.append(_vertex(near[around] - part.start, fit[around]))
     spread = float(np.std(halves)) * STEP if len(halves) > 1 else LOBE
     return ClockOffset(float(start + _vertex(lags, scores) * STEP), max(spread, STEP / 4), "instrument motion")
+
+
+def _check_span(log: PoseLog) -> None:
+    """Raise NeecoError when stray stamps make a log too long to search."""
+    if log.times[-1] - log.times[0] > LONGEST:
+        raise NeecoError(
+            f"{log.path}: its times span {(log.times[-1] - log.times[0]) / 3600:.3g} h; remove rows with stray times, "
+            "or give its clock offset in `sync`"
+        )
 
 
 def _peak(lags: np.ndarray, scores: np.ndarray, log: PoseLog) -> int:
@@ -118,11 +131,13 @@ def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarr
     overlap by at least OVERLAP of the shorter. Returns lags and scores."""
     least = int(OVERLAP * min(len(short), len(long)))
     lags = np.arange(-(len(short) - least), len(long) - least + 1)
+    # without their means, which correlation does not see, less is lost to rounding
+    short, long = short - short.mean(), long - long.mean()
     one = np.ones(len(short))
     inside = np.ones(len(long))
 
     def slide(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        full = np.correlate(b, a, "full")  # lag -(len(a) - 1) ... len(b) - 1
+        full = fftconvolve(b, a[::-1])  # lag -(len(a) - 1) ... len(b) - 1
         return full[lags + len(a) - 1]
 
     count = slide(one, inside)

@@ -15,12 +15,13 @@ import yaml
 from neeco.capture.ingest.requirements import optional_module
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json
+from neeco.files import read_json, require_file
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
+WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
 COUNTS = (0, 4, 5, 8, 12, 14)  # distortion coefficients that OpenCV's model comes with
 
 
@@ -52,6 +53,11 @@ class Lens:
             raise NeecoError(
                 f"{source}: the principal point ({self.cx:g}, {self.cy:g}) lies outside the {size[0]}x{size[1]} video; "
                 "give the calibration of this video"
+            )
+        if not all(WIDEST < focal / max(size) < LONGEST for focal in (self.fl_x, self.fl_y)):
+            raise NeecoError(
+                f"{source}: focal lengths {self.fl_x:g} and {self.fl_y:g} px fit no lens on a {size[0]}x{size[1]} "
+                "video; give the calibration of this video, in pixels"
             )
 
     def pinhole(self, size: tuple[int, int]) -> Lens:
@@ -110,6 +116,7 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
         return None
     if not isinstance(source, Path):
         return _checked("intrinsics", [*source], (), None)
+    require_file(source, "a calibration as YAML or JSON")
     if source.suffix.lower() == ".json":
         return _nerfstudio(source, read_json(source))
     return _opencv(source, _read_opencv_yaml(source))

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import binary_dilation
+from scipy.spatial import QhullError
 
 from neeco.capture.ingest.requirements import optional_module
 from neeco.capture.ingest.sfm import Pinhole, SfmResult
@@ -84,7 +85,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     evidence [R, h, w] from `moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
     instrument hardly moves, or its poses do not fit the cameras.
     """
-    distance = float(np.median(camera_from_instrument[:, 2, 3]))
+    distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:
         return None
     axis = np.linspace(-REACH, REACH, CELLS) * distance
@@ -101,7 +102,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     if best < 2 * background or best < 0.3:
         return None
     belongs = share > max(COVERED * best, 2 * background)
-    return Shape(grid[belongs], float(axis[1] - axis[0]), best)
+    return Shape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
 
 
 def project_mask(
@@ -147,14 +148,17 @@ def _still_depth(sfm: SfmResult, row: int, pinhole: Pinhole, u: np.ndarray, v: n
     spots, depth = project_points(
         sfm.points[sfm.observations[seen, 1].astype(int)], sfm.world_from_camera[row], pinhole
     )
-    near = np.median(depth)
+    near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
     keep = (depth > 0.3 * near) & (depth < 3 * near)
     spots, inverse = spots[keep], 1 / depth[keep]
+    if len(spots) == 0:
+        return np.full(u.shape, np.nan)  # nothing is known, so nothing is seen to move
     places = np.stack([u + 0.5, v + 0.5], -1)
     nearest = NearestNDInterpolator(spots, inverse)(places)
-    if len(spots) < 4:
+    try:
+        between = LinearNDInterpolator(spots, inverse)(places)
+    except QhullError:  # fewer than three, or all on one line
         return np.asarray(1 / nearest)
-    between = LinearNDInterpolator(spots, inverse)(places)
     return np.asarray(1 / np.where(np.isnan(between), nearest, between))
 
 

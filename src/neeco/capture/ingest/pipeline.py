@@ -46,6 +46,7 @@ from neeco.capture.ingest.work import (
 from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
+from neeco.files import new_folder
 from neeco.raster.types import Camera
 
 MOST_FRAMES = 400  # kept unless the recording asks for another number
@@ -58,20 +59,19 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
     Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and
     what to do.
     """
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
         raise NeecoError(f"{output}: already exists; choose another --output")
-    with _staging(output) as folder:
+    place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
+    with _staging(place) as folder:
         work = begin(recording, folder, progress)
-        lens = read_lens(recording.intrinsics)
-        if lens is not None:
-            lens.check_size(work.video.size, recording.intrinsics)
+        lens = _read_lens(recording, work.video.size)
         kept = _choose(work)
         names = _write_images(work, kept, lens)
         sfm_folder = folder / "sfm"
         sfm_folder.mkdir()
         visible = _visible(work, kept, lens, names)
         pinhole = _pinhole(lens, work.video.size)
-        motion = StructureFromMotion(sfm_folder, folder / "raw", names, pinhole, visible)
+        motion = StructureFromMotion(sfm_folder, work.video.path, folder / "raw", names, pinhole, visible)
         sfm = motion.reconstruct(progress)
         if pinhole is None:
             fl_x, fl_y, cx, cy, *distortion = (float(value) for value in sfm.camera_params)
@@ -94,15 +94,29 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
 @contextmanager
 def _staging(output: Path) -> Iterator[Path]:
     """A temporary folder beside the output, on the same disk, gone afterwards whatever happens."""
+    with new_folder(output.parent):
+        folder = Path(tempfile.mkdtemp(prefix=f".{output.name[:80]}-", dir=output.parent))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _read_lens(recording: Recording, size: tuple[int, int]) -> Lens | None:
+    """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
+    given = recording.intrinsics
+    where = given if isinstance(given, Path) else f"{recording.path}: intrinsics"
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    except OSError as error:
-        raise NeecoError(f"{output}: cannot be written there: {error.strerror}") from error
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        lens = read_lens(given)
+        if lens is not None:
+            lens.check_size(size, where)
+            lens.pinhole(size)
+    except NeecoError as error:
+        message = str(error)
+        for name in ("intrinsics", "lens"):  # which is all that numbers and distortion know of where they came from
+            message = message.replace(f"{name}: ", f"{where}: ", 1) if message.startswith(f"{name}: ") else message
+        raise NeecoError(message) from error
+    return lens
 
 
 def _choose(work: Work) -> np.ndarray:
@@ -159,7 +173,7 @@ def _visible(work: Work, kept: np.ndarray, lens: Lens | None, names: list[str]) 
     first = folder / f"{names[0]}.png"
     write_labels(first, torch.from_numpy(seen.astype(np.uint8) * 255))
     for name in names[1:]:
-        os.link(first, folder / f"{name}.png")
+        shutil.copyfile(first, folder / f"{name}.png")
     work.notes.append(f"the endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked")
     return folder
 
@@ -311,6 +325,9 @@ def _finish(
         for i in np.flatnonzero(chosen)
     )
     reliable = sfm.reliable_points()
+    if not reliable.any():
+        reliable = np.ones(len(sfm.points), dtype=bool)
+        work.notes.append("no tissue point is seen by several frames and fits well: all of them are kept")
     cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
     registered = registration is not None or not work.logs.poses
     capture = Capture(work.folder, capture_frames, instruments_of(work), cloud, registered)
@@ -318,7 +335,7 @@ def _finish(
     write_capture(capture, whole)
     if output.exists():
         output.rmdir()
-    whole.rename(output)
+    whole.rename(os.path.abspath(output))
     order = np.flatnonzero(chosen)
     position = {row: index for index, row in enumerate(order.tolist())}
     registered_frames = (
@@ -360,10 +377,27 @@ def _split(work: Work, frames: np.ndarray, states: States, usable: np.ndarray) -
     names = np.full(len(frames), LEFT_OUT, dtype=object)
     poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
     rule = work.recording.splits
+    by = rule.unseen_by if rule else None
+    if by is not None and by not in joints:  # another instrument's
+        owner = next((values for _, values in states.values() if by in values), None)
+        if owner is None:
+            raise NeecoError(
+                f"{work.recording.path}: splits.unseen_by: {by!r} is the joint of an instrument without poses; "
+                "name another"
+            )
+        joints = owner
     if not states and rule is None:
         rule = Splits(unseen_fraction=0.0)
     assigned = assign_splits(
         frames[usable], poses[usable], {joint: values[usable] for joint, values in joints.items()}, rule
     )
     names[usable] = assigned.names
+    if "train" not in assigned.names:
+        raise NeecoError(f"{work.recording.path}: splits: leave no frame to train on ({assigned.rule}); change them")
+    for kind, ranges in (("test", rule.test), ("unseen", rule.unseen)) if rule else ():
+        if ranges and kind not in assigned.names:
+            work.notes.append(
+                f"splits.{kind}: no frame of the capture lies in the ranges given (the video has "
+                f"{len(work.times)} frames)"
+            )
     return Assigned(tuple(names), assigned.rule)

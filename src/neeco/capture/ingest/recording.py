@@ -14,9 +14,10 @@ from neeco.capture.ingest.sections import Section, close_match, joint_columns, p
 from neeco.capture.ingest.video import VideoSource, open_images, open_video
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json
+from neeco.files import read_json, require_file
 
 TRACKER_CLOCK = "em"
+FEWEST_FRAMES = 10  # that cameras can be found from
 _SUFFIX = "_minus_video_s"
 
 
@@ -85,7 +86,7 @@ def read_recording(path: Path) -> Recording:
     sync, notes = _sync(top, _clocks(instruments, scope))
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
-        top.integer("frames", 2), _splits(top, instruments), notes,
+        top.integer("frames", FEWEST_FRAMES), _splits(top, instruments), notes,
     )  # fmt: skip
 
 
@@ -126,12 +127,19 @@ def recording_from_flags(
     folder = Path(video).is_dir()
     options = Section(Path("--sync"), "", {"sync": str(Path(sync).resolve())} if sync else {}, ("sync",))
     offsets, notes = _sync(options, _clocks(instruments, scope))
-    if frames is not None and frames < 2:
-        raise NeecoError(f"--frames: {frames} is too few; give 2 or more")
+    check_frames(frames)
+    if fps is not None and not 0 < fps < 1e6:  # NaN compares false
+        raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
     return Recording(
         Path(video), None if folder else Path(video), Path(video) if folder else None, fps, None, values, instruments,
         scope, offsets, frames, None, notes,
     )  # fmt: skip
+
+
+def check_frames(frames: int | None) -> None:
+    """Raise NeecoError when the option asks for too few frames."""
+    if frames is not None and frames < FEWEST_FRAMES:
+        raise NeecoError(f"--frames: {frames} is too few; give {FEWEST_FRAMES} or more")
 
 
 def _path(text: str | Path | Any | None) -> Path | None:
@@ -146,8 +154,23 @@ def _clocks(instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | No
     return tuple(dict.fromkeys(found))
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which a key given twice is an error: the first would be lost without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{shown(key.value)} is given twice; keep one of them", key.start_mark
+                )
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
 def _load(path: Path) -> Any:
     try:
+        require_file(path, "a recording as YAML")
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise NeecoError(f"{path}: no such file; `neeco ingest --init` writes one by looking at the files") from None
@@ -156,7 +179,7 @@ def _load(path: Path) -> Any:
     except (OSError, ValueError) as error:
         raise NeecoError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
     try:
-        document = yaml.safe_load(text)
+        document = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}: " if mark else ""
@@ -239,6 +262,7 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
     if isinstance(value, str):
         file = top.path("sync", required=True)
         assert file is not None
+        require_file(file, "clock offsets as JSON")
         value = read_json(file)
         if not isinstance(value, dict):
             raise NeecoError(f'{file}: expected clock offsets, as in {{"clocks": {{"em": 0.038}}}}')

@@ -43,7 +43,11 @@ class IngestResult:
             "kept": len(self.kept),
             "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
             "clocks": {
-                name: {"offset_s": clock.seconds, "sd_s": clock.sd, "source": clock.source}
+                name: {
+                    "offset_s": clock.seconds,
+                    "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # nobody knows
+                    "source": clock.source,
+                }
                 for name, clock in self.clocks.items()
             },
             "registration": None

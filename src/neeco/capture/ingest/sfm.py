@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from neeco.capture.ingest.recording import FEWEST_FRAMES
 from neeco.capture.ingest.requirements import require_installed
 from neeco.errors import NeecoError
 
@@ -21,7 +22,8 @@ KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes a keyframe is matched w
 NEAR_KEYFRAMES = 3  # on each side of another frame, that it is matched with
 LOOP_STRIDE = 4  # every so many keyframes, one that is matched to all others of its kind: closes loops
 FEATURES = 1200  # per image
-MIN_IMAGES = 10
+# run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
+WORKER = Path(__file__).with_name("_sfm_worker.py")
 
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
@@ -81,15 +83,22 @@ def image_pairs(count: int) -> list[tuple[int, int]]:
 class StructureFromMotion:
     """One reconstruction, with a folder of its own for pycolmap's files.
 
-    folder: holds the images `names` (in time order). pinhole: None to estimate focal lengths and distortion. masks: a
-    folder of `<name>.png`, black where no feature may lie. Raises NeecoError when pycolmap is not installed.
+    source: the recording's video or images, for messages. folder: holds its images `names` (in time order). pinhole:
+    None to estimate focal lengths and distortion. masks: a folder of `<name>.png`, black where no feature may lie.
+    Raises NeecoError when pycolmap is not installed.
     """
 
     def __init__(
-        self, work: Path, folder: Path, names: Sequence[str], pinhole: Pinhole | None, masks: Path | None = None
+        self,
+        work: Path,
+        source: Path,
+        folder: Path,
+        names: Sequence[str],
+        pinhole: Pinhole | None,
+        masks: Path | None = None,
     ) -> None:
         require_installed("pycolmap")
-        self.folder, self.names, self.work = folder, list(names), work
+        self.source, self.names, self.work = source, list(names), work
         self.job: dict[str, Any] = {
             "images": str(folder),
             "names": self.names,
@@ -102,7 +111,10 @@ class StructureFromMotion:
         }
 
     def reconstruct(self, progress: Progress) -> SfmResult:
-        """Cameras and points, not yet adjusted together. Raises NeecoError when fewer than MIN_IMAGES get a camera."""
+        """Cameras and points, not yet adjusted together.
+
+        Raises NeecoError when fewer than FEWEST_FRAMES images get a camera.
+        """
         pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(len(self.names))]
         keys = [self.names[index] for index in keyframes(len(self.names))]
         return self._run(self.job | {"pairs": pairs, "keyframes": keys}, progress)
@@ -118,24 +130,24 @@ class StructureFromMotion:
         job_file, result = self.work / "job.json", self.work / "result.npz"
         result.unlink(missing_ok=True)
         job_file.write_text(json.dumps(job))
-        _run_worker(job_file, progress)
+        run_worker(job_file, self.source, progress)
         if not result.exists():
             raise NeecoError(
-                f"{self.folder}: no cameras could be found: too few features match between the frames (dark, blurred "
+                f"{self.source}: no cameras could be found: too few features match between the frames (dark, blurred "
                 "or textureless images, or a scope that does not move); see docs/recording.md"
             )
-        return _load(result, self.names, self.folder)
+        return _load(result, self.names, self.source)
 
 
-def _run_worker(job_file: Path, progress: Progress) -> None:
-    """Pass the worker's events on; kill it when we are interrupted."""
+def run_worker(job_file: Path, source: Path, progress: Progress) -> None:
+    """Pass the worker's events on; kill it when we are interrupted. Raises NeecoError naming `source` when it fails."""
     log_file = job_file.with_name("worker.log")
-    # by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
-    worker = Path(__file__).with_name("_sfm_worker.py")
-    with log_file.open("w") as log:
-        process = subprocess.Popen(
-            [sys.executable, str(worker), str(job_file)], stdout=subprocess.PIPE, stderr=log, text=True
-        )
+    with (
+        log_file.open("w") as log,
+        subprocess.Popen(
+            [sys.executable, str(WORKER), str(job_file)], stdout=subprocess.PIPE, stderr=log, text=True
+        ) as process,
+    ):
         try:
             assert process.stdout is not None
             for line in process.stdout:
@@ -149,17 +161,22 @@ def _run_worker(job_file: Path, progress: Progress) -> None:
                 process.wait()
     if code != 0:
         tail = log_file.read_text(errors="replace").strip().splitlines()[-1:] or ["no message"]
-        raise NeecoError(f"ingest: structure from motion stopped with status {code}: {tail[0][:300]}")
+        raise NeecoError(
+            f"{source}: structure from motion stopped with status {code} ({tail[0][:300]}); is there memory left? "
+            "Try fewer --frames"
+        )
 
 
-def _load(path: Path, names: list[str], folder: Path) -> SfmResult:
+def _load(path: Path, names: list[str], source: Path) -> SfmResult:
     with np.load(path) as saved:  # plain arrays; object arrays are refused by default
         found = [str(name) for name in saved["names"]]
-        if len(found) < MIN_IMAGES:
+        if len(found) < FEWEST_FRAMES:
             raise NeecoError(
-                f"{folder}: a camera was found for only {len(found)} of {len(names)} frames (at least {MIN_IMAGES} are "
-                "needed); see docs/recording.md"
+                f"{source}: a camera was found for only {len(found)} of {len(names)} frames (at least {FEWEST_FRAMES} "
+                "are needed); see docs/recording.md"
             )
+        if len(saved["points"]) == 0:
+            raise NeecoError(f"{source}: no tissue point could be found between the frames; see docs/recording.md")
         row = {name: index for index, name in enumerate(names)}
         return SfmResult(
             np.array([row[name] for name in found]),

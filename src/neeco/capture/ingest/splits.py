@@ -46,6 +46,8 @@ def assign_splits(
     if fraction == 0:
         return Assigned(tuple(splits), f"{words}; unseen: none")
     unseen, why = _extremes(poses, joints, fraction, rule.unseen_by)
+    if not unseen.any():
+        return Assigned(tuple(splits), f"{words}; unseen: none, as nothing moves")
     splits[unseen] = "unseen"
     splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= GUARD)] = LEFT_OUT
     return Assigned(

@@ -54,7 +54,7 @@ REST = """
 # splits:                # in numbers of video frames, from 0
 #   test_every: 8        # every 8th frame tests (0: none); or given: test: [12, 30-40]
 #   unseen_fraction: 0.15   # kept apart, the extreme of a joint (0: none); or given: unseen: [255-299]
-#   unseen_by: jaw_angle    # else of all joints and of the instrument's direction
+#   unseen_by: jaw_angle    # else the first joint that moves, and the instrument's direction
 """
 
 

@@ -11,11 +11,15 @@ import torch
 from neeco.capture.ingest.clocks import ClockOffset
 from neeco.capture.ingest.interpolate import poses_at, readings_at
 from neeco.capture.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
-from neeco.capture.ingest.recording import TRACKER_CLOCK, Recording
+from neeco.capture.ingest.recording import Recording
 from neeco.capture.ingest.sfm import Progress
 from neeco.capture.ingest.video import VideoSource
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+
+SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
+LONGEST = 24 * 3600.0  # s
+SMALLEST = 32  # px: smaller frames have nothing to find cameras by
 
 States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
 
@@ -70,29 +74,60 @@ def begin(recording: Recording, folder: Path, progress: Progress) -> Work:
             notes.append(f"instrument {item.name!r} was not tracked: it is left out of the capture's states")
     if not tracked:
         notes.append("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
-    work = Work(recording, folder, progress, video, video.frame_times(), logs, notes)
+    work = Work(recording, folder, progress, video, _video_times(recording, video), logs, notes)
     for name, seconds in recording.sync.items():
         work.clocks[name] = ClockOffset(float(seconds), 0.0, "given")
-    _joint_clocks(work)
+    _assume_clocks(work)
     return work
 
 
-def _joint_clocks(work: Work) -> None:
-    """A joint's own clock is given or taken to be the video's: images do not tell it to better than some 20 ms."""
-    for logs in work.logs.joints.values():
-        for name, log in logs.items():
-            if log.clock in work.clocks or log.clock == TRACKER_CLOCK:
-                continue
-            if log.times[-1] < work.times[0] or log.times[0] > work.times[-1]:
-                raise NeecoError(
-                    f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's (0 to "
-                    f"{work.times[-1]:g} s); give the offset of its clock: sync: {{{log.clock}: seconds}}"
+def _video_times(recording: Recording, video: VideoSource) -> np.ndarray:
+    """The frames' times s. Raises NeecoError for those that no recording has, and for frames too small."""
+    times, source = video.frame_times(), recording.times or video.path
+    rate = 1 / float(np.median(np.diff(times)))
+    if not (SLOWEST < rate < FASTEST and times[-1] - times[0] < LONGEST):
+        raise NeecoError(
+            f"{source}: frames at {rate:.3g} a second over {(times[-1] - times[0]) / 3600:.3g} h cannot be; correct "
+            "fps or the times' unit"
+        )
+    if min(video.size) < SMALLEST:
+        width, height = video.size
+        raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {SMALLEST} or more each way")
+    return times
+
+
+def _assume_clocks(work: Work) -> None:
+    """Joints' clocks that nothing gives are taken to be the video's: images do not tell them to better than some 20 ms.
+
+    Trackers' clocks, and those of joints on one of them, are found later, from motion.
+    """
+    scope = [work.logs.scope] if work.logs.scope else []
+    found_later = {log.clock for log in [*work.logs.poses.values(), *scope]}
+    for name in work.logs.poses:
+        for joint, reading in work.logs.joints[name].items():
+            if reading.clock not in work.clocks and reading.clock not in found_later:
+                _assume(
+                    work, reading, f"the clock of joint {joint!r} was not given", ": at 1 rad/s, 20 ms off are 1.1 deg"
                 )
-            work.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
-            work.notes.append(
-                f"the clock of joint {name!r} was not given and is taken to be the video's: at 1 rad/s, 20 ms off are "
-                "1.1 deg"
-            )
+
+
+def _assume(work: Work, log: PoseLog | ReadingLog, why: str, cost: str = "") -> None:
+    """Take a log's clock to be the video's, with a note. Raises NeecoError when their times do not meet."""
+    if log.times[-1] < work.times[0] or log.times[0] > work.times[-1]:
+        raise NeecoError(
+            f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's "
+            f"({work.times[0]:g} to {work.times[-1]:g} s), and nothing ties the clocks; give the offset: "
+            f"sync: {{{log.clock}: seconds}}"
+        )
+    work.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
+    work.notes.append(f"{why} and is taken to be the video's{cost}")
+
+
+def offset_of(work: Work, log: PoseLog | ReadingLog) -> float:
+    """Seconds the log's clock is ahead; the video's own clock when motion did not tell it."""
+    if log.clock not in work.clocks:
+        _assume(work, log, f"the clock {log.clock!r} was not given and could not be found,")
+    return work.clocks[log.clock].seconds
 
 
 def note_once(work: Work, note: str) -> None:
@@ -102,20 +137,14 @@ def note_once(work: Work, note: str) -> None:
 
 def instrument_poses(work: Work, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses [N, 4, 4] in the tracker's frame at video times, and where known."""
-    clock = work.clocks.get(log.clock)
-    if clock is None:
-        if log.times[-1] < work.times[0] or log.times[0] > work.times[-1]:
-            raise NeecoError(
-                f"{log.path}: its times ({log.times[0]:g} to {log.times[-1]:g} s) do not meet the video's, and nothing "
-                f"ties the clocks; give the offset: sync: {{{log.clock}: seconds}}"
-            )
-        clock = work.clocks[log.clock] = ClockOffset(0.0, float("nan"), "assumed equal to the video's")
-        note_once(work, f"the clock {log.clock!r} was not given and could not be found; it is taken to be the video's")
-    return poses_at(log, times + clock.seconds)
+    return poses_at(log, times + offset_of(work, log))
 
 
 def states_for_choice(work: Work) -> tuple[np.ndarray, np.ndarray]:
-    """[V, 6 * instruments + joints] states for coverage, and where they are known; nothing while a clock is unknown."""
+    """[V, 6 * instruments + joints] states for coverage, and where they are known; nothing while a clock is unknown.
+
+    Raises NeecoError when a log has nothing to say of the video.
+    """
     columns, usable = [np.zeros((len(work.times), 6))], np.ones(len(work.times), dtype=bool)
     for log in work.logs.poses.values():
         clock = work.clocks.get(log.clock)
@@ -126,7 +155,26 @@ def states_for_choice(work: Work) -> tuple[np.ndarray, np.ndarray]:
         arms = np.where(valid[:, None], poses[:, :3, 3], 0.0)
         turns = np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0)
         columns.append(np.concatenate([arms, turns], 1))
+        _must_meet(work, log, valid)
+    for name in work.logs.poses:
+        for reading in work.logs.joints[name].values():
+            clock = work.clocks.get(reading.clock)
+            if clock is None:
+                continue
+            values, valid = readings_at(reading, work.times + clock.seconds)
+            usable &= valid
+            columns.append(np.where(valid, values, 0.0)[:, None])
+            _must_meet(work, reading, valid)
     return np.concatenate(columns[1:] or columns, 1), usable
+
+
+def _must_meet(work: Work, log: PoseLog | ReadingLog, valid: np.ndarray) -> None:
+    if not valid.any():
+        first, last = (end - work.clocks[log.clock].seconds for end in (log.times[0], log.times[-1]))
+        raise NeecoError(
+            f"{log.path}: has no sample for any video frame: by the video's clock it covers {first:g} to {last:g} s, "
+            f"the video {work.times[0]:g} to {work.times[-1]:g} s; correct the offset of its clock, sync: {log.clock}"
+        )
 
 
 def states_at(work: Work, times: np.ndarray) -> tuple[States, np.ndarray]:
@@ -142,7 +190,7 @@ def states_at(work: Work, times: np.ndarray) -> tuple[States, np.ndarray]:
         usable &= valid
         readings = {}
         for joint, reading in work.logs.joints[name].items():
-            values, known = readings_at(reading, times + work.clocks[reading.clock].seconds)
+            values, known = readings_at(reading, times + offset_of(work, reading))
             readings[joint] = _within_limits(work, reading, limits[name][joint], values)
             usable &= known
         states[name] = (poses, readings)
