@@ -94,7 +94,7 @@ def test_a_joint_log_that_ends_early_ends_the_capture_there(recorded):
 def test_a_scope_on_a_clock_of_its_own(recorded):
     result = run(recorded, laparoscope={"file": "camera.csv", "clock": "scope"}, sync={"scope": 0.04, "jaw_angle": 0.0})
     assert result.registration is not None
-    assert told(result, "the clock 'em' of instrument 'grasper' was not given")
+    assert told(result, "the clock 'em' was not given and could not be found")
 
 
 def test_a_joint_on_a_clock_that_no_tracker_has(recorded):
