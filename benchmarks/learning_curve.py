@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import tempfile
 import time
 from dataclasses import asdict, dataclass, fields
@@ -157,10 +158,16 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def plot(args: argparse.Namespace) -> None:
-    """FOLDER/curves.svg: whole-image PSNR on `test` (lines) and `unseen` (dashed) over minutes of processor time."""
+    """FOLDER/curves.svg: whole-image PSNR on `test` (lines) and `unseen` (dashed) over minutes of processor time.
+
+    Beside it curves_instrument.svg, unless no run was of a capture with true masks.
+    """
     rows = read_rows(args.folder)
     write_text(args.folder / "curves.svg", chart(rows, "psnr", "PSNR on held-out frames, dB"))
-    write_text(args.folder / "curves_instrument.svg", chart(rows, "psnr_instrument", "PSNR inside the instrument, dB"))
+    inside = [row for row in rows if math.isfinite(row.psnr_instrument)]
+    if inside:
+        chart_inside = chart(inside, "psnr_instrument", "PSNR inside the instrument, dB")
+        write_text(args.folder / "curves_instrument.svg", chart_inside)
     for row in rows:
         print(row)
 

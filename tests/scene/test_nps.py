@@ -32,6 +32,19 @@ def test_the_head_starts_at_zero_and_still_learns(neeco: Scene) -> None:
     assert neeco.deformation.head.weight.grad[:3].abs().max() > 0
 
 
+def test_a_resting_network_is_not_evaluated(neeco: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(NPS, "network", lambda *_: pytest.fail("evaluated"))
+    neeco.deformation.resting = True
+    posed = neeco.at(neeco.recorded.states[0])
+    assert torch.equal(posed.means, neeco.canonical.means)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_a_warm_up_is_a_share_of_the_training(share: float) -> None:
+    with pytest.raises(NeecoError, match=r"deformation\.warm_up: .* is not a share"):
+        make_deformation("neeco", (GRASPER,), {"warm_up": share})
+
+
 def test_encoding_by_hand() -> None:
     encoded = encode(torch.tensor([0.25]), 3)
     root = 0.5**0.5

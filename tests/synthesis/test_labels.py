@@ -67,6 +67,15 @@ def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera
     assert {point.visibility for name, point in label.keypoints.items() if name != "shaft_far"} == {1}
 
 
+def test_an_instrument_of_which_the_scene_has_nothing_has_no_keypoints(scene, state, camera, monkeypatch):
+    faint = scene.canonical.map(torch.clone)
+    faint.opacity_logits[faint.body(1)] = -8.0
+    monkeypatch.setattr(scene, "canonical", faint)
+    _, label = labelled(scene, state(), camera)
+    assert label.shape is None
+    assert {(point.x, point.y, point.visibility) for point in label.keypoints.values()} == {(0, 0, 0)}
+
+
 def test_keypoints_outside_the_image_say_so(scene, state, camera):
     _, label = labelled(scene, state(), camera)
     assert label.keypoints["shaft_far"].visibility == 0

@@ -57,7 +57,7 @@ def hinges_of(session: Session) -> Hinges:
 
 
 def verdict(session: Session) -> dict:
-    finish_instruments(session)
+    finish_instruments(session, print)
     return session.scene.diagnostics["joints"]["grasper.jaw_angle"]
 
 
@@ -82,6 +82,20 @@ def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: Session) ->
     assert "NOT found" in told["verdict"]
 
 
+def test_an_instrument_of_which_nothing_was_learned_is_told_of(session: Session) -> None:
+    told: list[str] = []
+    finish_instruments(session, told.append)
+    assert told == []
+    body = session.scene.canonical.body(1)
+    assert session.scene.diagnostics["instruments"]["grasper"]["solid_gaussians"] == body.stop - body.start
+    canonical = session.scene.canonical.map(lambda tensor: tensor.detach().clone())
+    canonical.opacity_logits[canonical.body(1)] = -5.0
+    session.scene.canonical = canonical
+    finish_instruments(session, told.append)
+    assert len(told) == 1
+    assert told[0].startswith("warning: grasper: hardly anything was learned of it (0 solid Gaussians)")
+
+
 def test_masked_pixels_do_not_judge_a_hinge(session: Session) -> None:
     before = verdict(session)["explained"]
     for image in session.images:
@@ -95,7 +109,7 @@ def test_masked_pixels_do_not_judge_a_hinge(session: Session) -> None:
 def test_the_wrist_begins_where_the_colour_changes(session: Session) -> None:
     place_wrists(session)
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
-    finish_instruments(session)
+    finish_instruments(session, print)
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
 
 
@@ -117,7 +131,7 @@ def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_r
 
 
 def test_the_extent_is_where_the_solid_is(session: Session) -> None:
-    finish_instruments(session)
+    finish_instruments(session, print)
     rear, tip = hinges_of(session).extent.tolist()
     assert rear == pytest.approx(-30, abs=3)
     assert tip == pytest.approx(20, abs=3)

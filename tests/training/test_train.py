@@ -77,6 +77,24 @@ def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_
     assert 60 <= rows[-1]["seconds"] < 300
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_network_rests_while_the_scene_takes_shape(share: float, capture: Path, tmp_path: Path) -> None:
+    """What moves it: nothing before its share of the iterations, and from then on the network."""
+    moved: dict[int, float] = {}
+
+    def watch(session) -> None:
+        deltas = session.scene.deltas(session.frames[0].state)
+        moved[session.iteration] = float(deltas.means.detach().abs().max())
+
+    small = ["deformation.width=16", "deformation.depth=2", f"deformation.warm_up={share}"]
+    run = train(capture, tmp_path / "run", training_config("neeco", {"iterations": 20}, small), watch=watch)
+    awake = [iteration for iteration in moved if iteration / 20 >= share]
+    assert all(moved[iteration] > 0 for iteration in awake)
+    assert all(moved[iteration] == 0 for iteration in moved if iteration not in awake)
+    scene = load_run(run).scene
+    assert float(scene.deltas(scene.recorded.states[0]).means.abs().max()) > 0
+
+
 def test_minutes_are_those_of_the_clock(capture: Path, tmp_path: Path) -> None:
     seconds = iter(range(0, 10**6, 10))
     config = dataclasses.replace(config_of("3dgs"), minutes=2.0)

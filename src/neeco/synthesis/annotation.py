@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 KEYPOINTS = ("shaft_far", "shaft_near", "hinge", "tip_left", "tip_right")
 SKELETON = (("shaft_far", "shaft_near"), ("shaft_near", "hinge"), ("hinge", "tip_left"), ("hinge", "tip_right"))
-OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2
+OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the scene has nothing of the instrument
 OTHERS_MM = 1.0  # a surface of something else this much nearer than a keypoint hides it
 SELF_MM = 6.0  # keypoints lie inside their instrument: its own surface hides them only from this much nearer
 
@@ -39,7 +39,7 @@ class Keypoint:
 
     x: float
     y: float
-    visibility: int  # 0 outside the image, 1 occluded, 2 visible
+    visibility: int  # OUTSIDE, OCCLUDED or VISIBLE
 
 
 @dataclass(frozen=True)
@@ -118,13 +118,17 @@ def project(point: np.ndarray, camera: Camera) -> tuple[float, float, float]:
 
 
 def project_keypoints(points: dict[str, Tensor], drawing: Drawing, instrument: str) -> dict[str, Keypoint]:
-    """Where an instrument's keypoints (world mm) fall, and whether anything stands before them."""
+    """Where an instrument's keypoints (world mm) fall, and whether anything stands before them.
+
+    Of an instrument with no pixel even when drawn alone nothing is hidden: its keypoints are not labelled (OUTSIDE).
+    """
     camera = drawing.camera
     others = [drawing.tissue_depth] + [alone.depth for name, alone in drawing.alone.items() if name != instrument]
+    absent = not drawing.alone[instrument].mask.any()
     projected = {}
     for name in sorted(points, key=lambda known: KEYPOINTS.index(known) if known in KEYPOINTS else len(KEYPOINTS)):
         x, y, z = project(_matrix(points[name]), camera)
-        if z <= camera.near or not (0 <= x < camera.width and 0 <= y < camera.height):
+        if absent or z <= camera.near or not (0 <= x < camera.width and 0 <= y < camera.height):
             projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
             continue
         row, column = int(y), int(x)

@@ -14,7 +14,7 @@ from neeco.files import write_atomically
 from neeco.synthesis.annotation import OCCLUDED, SKELETON
 from neeco.synthesis.writers.folder import Record
 
-TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION = 12, 4, 360, 14, 40
+TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
 PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
 BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
 PALETTE = np.array(
@@ -30,6 +30,7 @@ PALETTE = np.array(
     ]
 )
 TINT = 0.42
+CAPTION_FONTS = 13, 12  # px
 LABEL_COLUMN = 210
 
 
@@ -64,13 +65,27 @@ def draw_tile(root: Path, record: Record) -> Image.Image:
     canvas = ImageDraw.Draw(tinted)
     for label in record["labels"]:
         _draw_label(canvas, label, scale)
-    tile = Image.new("RGB", (size[0], size[1] + CAPTION), PAPER)
+    first, second = (wrap(items, size[0], font) for items, font in zip(_caption(record), CAPTION_FONTS, strict=True))
+    height = size[1] + 6 + CAPTION_LINE * (len(first) + len(second))
+    tile = Image.new("RGB", (size[0], height), PAPER)
     tile.paste(tinted)
-    first, second = _caption(record)
     text = ImageDraw.Draw(tile)
-    text.text((0, size[1] + 5), first, INK, _font(13))
-    text.text((0, size[1] + 22), second, FAINT, _font(12))
+    lines = [(line, INK, CAPTION_FONTS[0]) for line in first] + [(line, FAINT, CAPTION_FONTS[1]) for line in second]
+    for k, (line, color, font) in enumerate(lines):
+        text.text((0, size[1] + 5 + CAPTION_LINE * k), line, color, _font(font))
     return tile
+
+
+def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
+    """`items` joined by dots, in as few lines of at most `width` px as their order allows; an item is never broken."""
+    lines: list[str] = []
+    for item in items:
+        longer = f"{lines[-1]} · {item}" if lines else item
+        if lines and _font(font).getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(item)
+    return lines
 
 
 def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
@@ -99,20 +114,21 @@ def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], scale: float
 
 
 def _tag(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
-    """The name above the box, or inside it where there is no room above."""
+    """The name above the box, or inside it where there is no room above; never beyond the tile's right edge."""
     font = _font(11)
     width = canvas.textlength(text, font=font) + 8
-    top = y - 16 if y >= 16 else y
-    canvas.rectangle((x, top, x + width, top + 15), fill=BOX)
-    canvas.text((x + 4, top + 1), text, INK, font)
+    left, top = min(x, TILE_WIDTH - width), y - 16 if y >= 16 else y
+    canvas.rectangle((left, top, left + width, top + 15), fill=BOX)
+    canvas.text((left + 4, top + 1), text, INK, font)
 
 
-def _caption(record: Record) -> tuple[str, str]:
+def _caption(record: Record) -> tuple[list[str], list[str]]:
+    """Which image with which joint values, and what is seen of each instrument."""
     joints = [
         f"{joint} {value:.2f}" for instrument in record["instruments"] for joint, value in instrument["joints"].items()
     ]
     seen = [f"{label['name']} {label['visibility']:.0%} seen" for label in record["labels"]]
-    return " · ".join([f"{record['index']:06d}", record["split"], *joints]), " · ".join(seen)
+    return [f"{record['index']:06d}", record["split"], *joints], seen
 
 
 def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,11 +23,18 @@ SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
 COLOR_BINS = 24
 COLOR_SCATTER = 0.4  # of the profile's scatter that may be left when two colours explain it
 FOUND = 0.35  # share of the moving parts' error that the readings must explain: .5-.9 where found, .27 half-way off
+SOLID = 0.3  # opacity of a Gaussian that counts as the instrument's substance
+ENOUGH = 10  # solid Gaussians without which an instrument is as good as absent
+
+Report = Callable[[str], None]
 
 
 @torch.no_grad()
-def finish_instruments(session: Session) -> None:
-    """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`."""
+def finish_instruments(session: Session, report: Report) -> None:
+    """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`.
+
+    Says so when hardly anything was learned of an instrument: nothing else would tell of labels that stay empty.
+    """
     hinged = session.scene.deformation.hinged
     if hinged is None:
         return
@@ -39,6 +47,13 @@ def finish_instruments(session: Session) -> None:
         for joint, name in enumerate(hinges.joint_names):
             verdicts[f"{instrument.name}.{name}"] = _verdict(session, hinged, index, joint)
         scene = session.scene
+        solid = int(_solid(scene.canonical, index).sum())
+        scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = solid
+        if solid < ENOUGH:
+            report(
+                f"warning: {instrument.name}: hardly anything was learned of it ({solid} solid Gaussians), so its "
+                "labels will be empty; the images show it too little, or another that moves alike has its place"
+            )
         hinges.extent.copy_(_extent(scene.canonical, index, hinges))
         scene.canonical = extend_shaft(
             scene.canonical, index + 1, instrument.name, hinges, scene.recorded, 1.5 * session.extent
@@ -119,12 +134,15 @@ def _image_error(session: Session, index: int, perturbation: Perturbation) -> fl
     return float(error.mean() if mask is None else error[mask].mean())
 
 
+def _solid(canonical: CanonicalGaussians, index: int) -> Tensor:
+    """[M] bool: which Gaussians of instrument `index` are its substance."""
+    return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > SOLID
+
+
 def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor:
     """[2] mm along the shaft between which the solid Gaussians lie."""
-    rows = canonical.body(index + 1)
-    solid = torch.sigmoid(canonical.opacity_logits[rows]) > 0.3
-    along = hinges.along_shaft(canonical.means[rows][solid])
-    if len(along) < 10:
+    along = hinges.along_shaft(canonical.means[canonical.body(index + 1)][_solid(canonical, index)])
+    if len(along) < ENOUGH:
         return hinges.extent.clone()
     return torch.quantile(along, torch.tensor([0.02, 0.985]))
 

@@ -100,6 +100,7 @@ class Session:
         index = self._next_frame()
         scene, frame = self.scene, self.frames[index]
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
+        scene.deformation.resting = progress < scene.deformation.warm_up
         state, camera, penalty = self.refinement.apply(index, frame.state, frame.camera, self.iteration)
         labels = scene.label_channels().sum(1, keepdim=True) if self._sharpens() else None
         rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=labels)
@@ -170,7 +171,7 @@ class Session:
                 self.adam.step(name, tensor, rate)
         rates = scene.deformation.learning_rates(self.iteration)
         for name, parameter in scene.deformation.named_parameters():
-            if rates[name] > 0:
+            if rates[name] > 0 and not scene.deformation.resting:
                 self.adam.step(f"deformation.{name}", parameter, rates[name] * max(fall, MODULE_FLOOR))
             parameter.grad = None
         self.adam.step("falloff", scene.falloff, LIGHT_RATE)

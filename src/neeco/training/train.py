@@ -91,7 +91,7 @@ def train(
             _run(session, output, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
-            _finish(session)
+            _finish(session, log.note)
             save_scene(session.scene, output / "scene.safetensors")
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
@@ -175,7 +175,7 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
 
 
-def _finish(session: Session) -> None:
+def _finish(session: Session, report: Callable[[str], None]) -> None:
     """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
     scene = session.scene
     scene.requires_grad_(False)
@@ -185,7 +185,7 @@ def _finish(session: Session) -> None:
     scene.diagnostics["phase_2_began"] = session.schedule.phase_started
     scene.diagnostics["phase_2_forced"] = session.schedule.forced
     scene.canonical = scene.deformation.finished(scene.canonical, list(scene.recorded.states))
-    finish_instruments(session)
+    finish_instruments(session, report)
 
 
 class _Log:

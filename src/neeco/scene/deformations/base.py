@@ -69,12 +69,17 @@ class Deformation(nn.Module):
     "instrument", per instrument. `training_defaults` are fields of the training config that differ from the paper's,
     dotted names as in `neeco train --set`. `extra_rates` are Adam's learning rates of the per-Gaussian parameters that
     the method adds (`CanonicalGaussians.extras`) by name; an extra without one is not learned.
+
+    `warm_up` is the share of the training in [0, 1) over which the deformation rests: training then holds its
+    parameters still and sets `resting`, which lets `pose` leave out what would change nothing.
     """
 
     label_names: tuple[tuple[str, str], ...] = ()
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     extra_rates: ClassVar[Mapping[str, float]] = {}
     needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
+    warm_up: float = 0.0
+    resting: bool = False
     large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
 
     @classmethod

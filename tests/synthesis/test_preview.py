@@ -1,0 +1,40 @@
+"""The contact sheet: captions and names are read whole, however many instruments there are."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw, ImageFont
+
+from neeco.synthesis.preview import BOX, TILE_WIDTH, _tag, wrap
+
+ITEMS = ["arm1 16% seen", "arm1_shaft 99% seen", "arm2 0% seen", "arm2_shaft 97% seen", "camera_holder 5% seen"]
+
+
+def test_a_caption_is_wrapped_between_its_items():
+    lines = wrap(ITEMS, 240, 12)
+    width = ImageFont.load_default(12).getlength
+    assert " · ".join(lines) == " · ".join(ITEMS)
+    assert len(lines) > 1
+    assert all(width(line) <= 240 for line in lines)
+    assert all(width(f"{line} · {after.split(' · ')[0]}") > 240 for line, after in pairwise(lines))
+
+
+def test_a_caption_that_fits_stays_one_line():
+    assert wrap(ITEMS[:2], 400, 12) == ["arm1 16% seen · arm1_shaft 99% seen"]
+
+
+def test_an_item_wider_than_the_tile_has_a_line_of_its_own():
+    assert wrap(["a", "b" * 100, "c"], 100, 12) == ["a", "b" * 100, "c"]
+
+
+def test_no_items_no_lines():
+    assert wrap([], 100, 12) == []
+
+
+@pytest.mark.parametrize("x", [10.0, TILE_WIDTH - 5.0])
+def test_a_name_beside_the_right_edge_is_read_whole(x):
+    image = Image.new("RGB", (TILE_WIDTH, 60))
+    _tag(ImageDraw.Draw(image), x, 40, "arm1_shaft")
+    columns = np.flatnonzero((np.asarray(image)[24:40] == BOX).all(-1).any(0))
+    assert columns[-1] - columns[0] >= ImageFont.load_default(11).getlength("arm1_shaft") + 6
