@@ -98,8 +98,8 @@ def read_json(path: Path) -> Any:
     except FileNotFoundError:
         raise NeecoError(f"{path}: no such file") from None
     except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from error
     except UnicodeDecodeError:
         raise NeecoError(f"{path}: not a text file; expected JSON") from None
     except json.JSONDecodeError as error:
-        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}") from None
+        raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None

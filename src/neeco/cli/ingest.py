@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -58,14 +59,15 @@ def run(args: Ingest) -> int:
     if args.init:
         _refuse_beside(args, "--init", keep=())
         return _init(args.source or Path())
-    if args.output is None:
+    output = args.output and Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
+    if output is None:
         raise NeecoError("--output: give the folder of the capture to write")
     if args.source is not None and args.source.is_dir():
         if (args.source / RECORDING).is_file():
             raise NeecoError(f"{args.source}: holds a recording; give the file: {args.source / RECORDING}")
         _refuse_beside(args, f"{args.source}: a folder in another format", keep=("output",))
-        return _convert(args.source, args.output)
-    return _ingest(_recording(args), args.output, args.json)
+        return _convert(args.source, output)
+    return _ingest(_recording(args), output, args.json)
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:

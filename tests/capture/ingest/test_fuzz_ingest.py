@@ -215,17 +215,17 @@ def ingest(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert time.process_time() - start < 20
     assert status in (0, 1, 2)
     if status:
-        assert tree(folder) == before
+        assert tree(folder) == before, said.err
     if status == 1:
         assert said.err.count("\n") == 1
         assert said.err.startswith("neeco: error: ")
         message = said.err.removeprefix("neeco: error: ")
-        named = [Path(name).name for name in before] + ["--", *words]
+        named = [Path(name).name for name in before] + [str(folder), "--", *words]
         assert any(name and name in message for name in named), message
         assert any(mark in message for mark in (";", "?", "expected", "no such file", "see docs", "as in")), message
         assert str(folder) + "/." not in message, "a temporary folder's name says nothing"
     elif status == 0 and "--init" not in words:
-        output = folder / words[len(words) - words[::-1].index("--output")]
+        output = folder / os.path.normpath(words[len(words) - words[::-1].index("--output")])
         assert (output / "ingest.html").is_file()
         wrong = errors_only(check_capture(output))
         assert "--json" in words or all(str(problem) in said.out for problem in wrong)
@@ -238,7 +238,7 @@ def fuzz(seed: int, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
     for number in range(int(case.pick.choice([1, 1, 2]))):
         try:
             EDITS[seed % len(EDITS) if number == 0 else int(case.pick.integers(len(EDITS)))](case)
-        except (ValueError, OSError, IndexError, TypeError, yaml.YAMLError):
+        except (ValueError, OSError, IndexError, KeyError, TypeError, yaml.YAMLError):
             continue  # it does not apply to what another one left
     return ingest(case.words, folder, capsys)
 

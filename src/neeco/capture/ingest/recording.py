@@ -177,7 +177,9 @@ def _load(path: Path) -> Any:
     except UnicodeDecodeError:
         raise NeecoError(f"{path}: not a text file; expected a recording as YAML") from None
     except (OSError, ValueError) as error:
-        raise NeecoError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+        raise NeecoError(
+            f"{path}: cannot read: {getattr(error, 'strerror', None) or error}; correct the path"
+        ) from error
     try:
         document = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:

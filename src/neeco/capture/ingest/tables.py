@@ -76,7 +76,9 @@ def read_text(path: Path) -> str:
     except FileNotFoundError:
         raise NeecoError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
-        raise NeecoError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+        raise NeecoError(
+            f"{path}: cannot read: {getattr(error, 'strerror', None) or error}; correct the path"
+        ) from error
     encodings = ["utf-16"] if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "latin-1"]
     for encoding in encodings:
         try:

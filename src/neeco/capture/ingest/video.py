@@ -65,6 +65,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
         raise NeecoError(
             f"{folder}: {'is a file, expected a folder of images' if folder.exists() else 'no such folder'}"
         )
+    folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
     files = sorted(
         (file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=lambda file: _natural(file.name)
     )
