@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return PIPE_CLOSED
         where = f"{error.filename}: " if error.filename else ""
-        print(f"neeco: error: {where}{error.strerror or error}", file=sys.stderr)
+        print(f"neeco: error: {where}{error.strerror or error}; check that path and the disk", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         told = " ".join(map(str, interrupt.args)) or "run the same command again"

