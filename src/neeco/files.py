@@ -90,6 +90,33 @@ def require_file(path: Path, expected: str) -> None:
         raise NeecoError(f"{path}: is not a file; expected {expected}")
 
 
+def read_bytes(path: Path, expected: str, missing: str = "no such file") -> bytes:
+    """What a file holds.
+
+    Raises NeecoError saying `missing` when it is absent, what was `expected` when it is a folder or a pipe, and why
+    when it cannot be read.
+    """
+    try:
+        require_file(path, expected)
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise NeecoError(f"{path}: {missing}") from None
+    except (OSError, ValueError) as error:
+        raise NeecoError(
+            f"{path}: cannot read: {getattr(error, 'strerror', None) or error}; correct the path"
+        ) from error
+
+
+def read_text(path: Path, expected: str, missing: str = "no such file") -> str:
+    """A text file in UTF-8, lines ended by newlines alone. Raises NeecoError as `read_bytes`, and for one that is no
+    text."""
+    try:
+        text = read_bytes(path, expected, missing).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise NeecoError(f"{path}: not a text file; expected {expected}") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
     path = Path(path)

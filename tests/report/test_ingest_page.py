@@ -8,11 +8,11 @@ import re
 import shutil
 from base64 import b64decode
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from html_page import Page
 from PIL import Image
 
 from neeco.capture import read_capture
@@ -30,26 +30,6 @@ from neeco.report.verdict import give_verdict
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}
 TIP_MM = 24.0
-
-
-class Page(HTMLParser):
-    """Collects references and checks that elements close in order."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.references, self.tags = [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.references += [value for name, value in attrs if name in ("src", "href")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
 
 def shaft() -> Shape:
@@ -102,7 +82,7 @@ def text(tmp_path_factory):
 
 
 def test_the_page_is_whole_and_fetches_nothing(text):
-    page = Page()
+    page = Page(VOID)
     page.feed(text)
     assert page.open == []
     assert len(page.references) == 8

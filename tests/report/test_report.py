@@ -1,9 +1,9 @@
 """The report is one offline page that says what the numbers say."""
 
 import json
-from html.parser import HTMLParser
 
 import pytest
+from html_page import Page
 
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
@@ -12,26 +12,6 @@ from neeco.report.curves import curve, nice_ticks, phase_starts, read_metrics
 from neeco.report.figures import chosen_rows
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}
-
-
-class Page(HTMLParser):
-    """Collects references and checks that elements close in order."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.references, self.tags = [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.references += [value for name, value in attrs if name in ("src", "href")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +33,7 @@ def reported(world, tmp_path_factory):
 
 def test_the_page_is_whole_and_fetches_nothing(reported):
     text = reported[-1].read_text()
-    page = Page()
+    page = Page(VOID)
     page.feed(text)
     assert page.open == []
     assert all(reference.startswith("data:image/") for reference in page.references)

@@ -26,15 +26,7 @@ from neeco.training.train import ProgressRow, train
 CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
 
 
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    return write_capture(tmp_path / "capture")
-
-
-@pytest.fixture(autouse=True)
-def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ROW_INTERVAL", 5)
-    monkeypatch.setattr(module, "CHECKPOINT_INTERVAL", 20)
+pytestmark = pytest.mark.usefixtures("short_intervals")
 
 
 def hidden_files(folder: Path) -> list[Path]:

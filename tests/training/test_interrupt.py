@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 import pytest
-from capture_files import write_capture
 
 from neeco.cli import main
 from neeco.training import train as module
@@ -25,11 +24,6 @@ from neeco.training.train import ProgressRow, train
 
 PROGRAM = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())"]
 CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    return write_capture(tmp_path / "capture")
 
 
 @pytest.fixture(autouse=True)

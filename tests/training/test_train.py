@@ -7,25 +7,14 @@ import json
 from pathlib import Path
 
 import pytest
-from capture_files import write_capture
 
 import neeco.training.session
 from neeco.errors import NeecoError
-from neeco.training import train as module
 from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    return write_capture(tmp_path / "capture")
-
-
-@pytest.fixture(autouse=True)
-def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ROW_INTERVAL", 5)
-    monkeypatch.setattr(module, "CHECKPOINT_INTERVAL", 20)
+pytestmark = pytest.mark.usefixtures("short_intervals")
 
 
 def config_of(method: str):

@@ -185,6 +185,7 @@ def main(job_file: str) -> int:
         say("adjusting")
         model = pycolmap.Reconstruction(str(model_folder))
         drop(model, job["drop"])
+        adjust(model, job)
     else:
         found = build(job, work)
         if found is None:
@@ -192,8 +193,6 @@ def main(job_file: str) -> int:
         model = found
         model_folder.mkdir()
         model.write(str(model_folder))
-    if "drop" in job:
-        adjust(model, job)
     save(model, work / "result.npz")
     say("done", images=model.num_reg_images(), points=model.num_points3D())
     return 0

@@ -18,7 +18,7 @@ CLEAR = 0.6  # correlation below which two motions are not the same
 DISTINCT = 0.08  # by how much the best offset must beat every other, apart from its own lobe
 LOBE = 0.3  # s
 OVERLAP = 0.6  # of the video that must lie on the log
-LONGEST = 24 * 3600.0  # s that a log may span for its clock to be looked for
+LONGEST = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
 
 
 @dataclass(frozen=True)

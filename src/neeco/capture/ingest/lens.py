@@ -15,7 +15,7 @@ import yaml
 from neeco.capture.ingest.requirements import optional_module
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_file
+from neeco.files import read_json, read_text, require_file
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
@@ -216,14 +216,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _read_opencv_yaml(path: Path) -> Any:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise NeecoError(f"{path}: not a text file; expected OpenCV's calibration as YAML") from None
-    except (OSError, ValueError) as error:
-        raise NeecoError(f"{path}: cannot read: {getattr(error, 'strerror', None) or error}") from error
+    text = read_text(path, "OpenCV's calibration as YAML")
     if text.lstrip().startswith("<"):
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow

@@ -26,7 +26,7 @@ from neeco.capture.ingest.moving import (
     project_mask,
     project_points,
 )
-from neeco.capture.ingest.recording import Recording, Splits
+from neeco.capture.ingest.recording import FEWEST_FRAMES, Recording, Splits
 from neeco.capture.ingest.registration import Registration, register_with_laparoscope
 from neeco.capture.ingest.result import IngestResult
 from neeco.capture.ingest.select import choose_frames, look_over
@@ -135,10 +135,10 @@ def _choose(work: Work) -> np.ndarray:
     if work.recording.frames is None and count > MOST_FRAMES:
         work.notes.append(f"{MOST_FRAMES} of {count} frames are kept; ask for more with --frames")
     work.dropped |= dict(selection.dropped)
-    if len(selection.kept) < 10:
+    if len(selection.kept) < FEWEST_FRAMES:
         raise NeecoError(
-            f"{work.video.path}: only {len(selection.kept)} of {count} frames are usable (at least 10 are needed); "
-            f"most are dropped because: {_commonest(work.dropped)}"
+            f"{work.video.path}: only {len(selection.kept)} of {count} frames are usable (at least {FEWEST_FRAMES} are "
+            f"needed); most are dropped because: {_commonest(work.dropped)}"
         )
     return selection.kept
 

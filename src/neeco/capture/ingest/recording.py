@@ -14,7 +14,7 @@ from neeco.capture.ingest.sections import Section, close_match, joint_columns, p
 from neeco.capture.ingest.video import VideoSource, open_images, open_video
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_file
+from neeco.files import read_json, read_text, require_file
 
 TRACKER_CLOCK = "em"
 FEWEST_FRAMES = 10  # that cameras can be found from
@@ -169,17 +169,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _load(path: Path) -> Any:
-    try:
-        require_file(path, "a recording as YAML")
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file; `neeco ingest --init` writes one by looking at the files") from None
-    except UnicodeDecodeError:
-        raise NeecoError(f"{path}: not a text file; expected a recording as YAML") from None
-    except (OSError, ValueError) as error:
-        raise NeecoError(
-            f"{path}: cannot read: {getattr(error, 'strerror', None) or error}; correct the path"
-        ) from error
+    missing = "no such file; `neeco ingest --init` writes one by looking at the files"
+    text = read_text(path, "a recording as YAML", missing)
     try:
         document = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:

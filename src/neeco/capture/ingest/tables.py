@@ -12,7 +12,7 @@ import numpy as np
 
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import require_file
+from neeco.files import read_bytes
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
@@ -70,15 +70,7 @@ def listed(lines: Sequence[int] | np.ndarray) -> str:
 
 def read_text(path: Path) -> str:
     """A text file in UTF-8, UTF-16 with its mark, or Latin-1. Raises NeecoError when absent, empty or binary."""
-    try:
-        require_file(Path(path), "CSV with a header line")
-        content = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise NeecoError(
-            f"{path}: cannot read: {getattr(error, 'strerror', None) or error}; correct the path"
-        ) from error
+    content = read_bytes(Path(path), "CSV with a header line")
     encodings = ["utf-16"] if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "latin-1"]
     for encoding in encodings:
         try:

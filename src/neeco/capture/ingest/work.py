@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.ingest.clocks import ClockOffset
+from neeco.capture.ingest.clocks import LONGEST, ClockOffset
 from neeco.capture.ingest.interpolate import poses_at, readings_at
 from neeco.capture.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.capture.ingest.recording import Recording
@@ -18,7 +18,6 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
-LONGEST = 24 * 3600.0  # s
 SMALLEST = 32  # px: smaller frames have nothing to find cameras by
 
 States = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]  # instrument -> poses [N, 4, 4], readings [N] by joint
