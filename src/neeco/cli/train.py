@@ -18,7 +18,7 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str = "kinematic"
-    """kinematic, neeco (the paper) or 3dgs."""
+    """kinematic, neeco (the paper), 3dgs or nerfies."""
     iterations: int | None = None
     """Optimisation steps; by default as the method has it."""
     minutes: float | None = None

@@ -13,17 +13,27 @@ from neeco.scene.deformations.base import Deformation
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.deformations.nps import NPS
 from neeco.scene.deformations.static import Static
+from neeco.scene.nerfies.settings import Nerfies
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
-METHODS: dict[str, type[Deformation]] = {"kinematic": Kinematic, "neeco": NPS, "3dgs": Static}
+METHODS: dict[str, type[Deformation] | type[Nerfies]] = {"kinematic": Kinematic, "neeco": NPS, "3dgs": Static}
+METHODS["nerfies"] = Nerfies  # no deformation of Gaussians: a scene of its own (`scene/nerfies/`)
 
 
-def deformation_class(method: str) -> type[Deformation]:
-    """The class behind a method's name. Raises NeecoError for an unknown name."""
+def method_class(method: str) -> type[Deformation] | type[Nerfies]:
+    """What the methods say of themselves. Raises NeecoError for an unknown name."""
     if method not in METHODS:
         raise NeecoError(f"--method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
     return METHODS[method]
+
+
+def deformation_class(method: str) -> type[Deformation]:
+    """The deformation behind a method's name. Raises NeecoError for an unknown name or a method that has none."""
+    kind = method_class(method)
+    if not issubclass(kind, Deformation):
+        raise NeecoError(f"method {method} deforms no Gaussians; it has a scene of its own")
+    return kind
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Deformation:
@@ -35,9 +45,22 @@ def make_deformation(method: str, instruments: tuple[Instrument, ...], config: d
         raise NeecoError(f"deformation: method {method}: {str(error).splitlines()[0]}; see --set deformation") from None
 
 
+def make_field(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Nerfies:
+    """The settings of a method that is a field. Raises NeecoError for an unknown field or a value that does not fit."""
+    check_fields(method, config)
+    kind = method_class(method)
+    assert issubclass(kind, Nerfies)
+    return kind(instruments, **config)
+
+
+def is_field(method: str) -> bool:
+    """Whether the method's scene is a radiance field (`NerfScene`) and not Gaussians (`Scene`)."""
+    return issubclass(method_class(method), Nerfies)
+
+
 def check_fields(method: str, config: dict[str, Any]) -> None:
     """Raises NeecoError for a field that the deformation of `method` does not have, or whose type does not fit."""
-    kind = deformation_class(method)
+    kind = method_class(method)
     known = list(inspect.signature(kind).parameters)[1:]
     if unknown := [name for name in config if name not in known]:
         raise NeecoError(
