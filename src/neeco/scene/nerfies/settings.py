@@ -1,7 +1,7 @@
 """Method `nerfies`: what `scene/methods.py` and training ask of it, and its sizes.
 
 Nerfies (Park et al., ICCV 2021): a template NeRF, and for every moment a code from which an SE(3) field warps each
-sample of a ray into the template. Faithful to the source: SE(3) field with a skip at the middle layer, heads drawn from
+sample of a ray into the template. Faithful to the source: SE(3) field with a skip at layer 4, heads drawn from
 U(1e-4), its frequencies opened from coarse to fine over the first 32 % of the run (80k of 250k), elastic and background
 loss, rates from 1e-3 to 1e-4, a sample at infinity, codes of 8 numbers.
 
@@ -11,7 +11,7 @@ Departures, all for a processor without a GPU or for states that were never trai
 - codes of moments that were not trained are interpolated linearly between the neighbouring training frames' codes by
   time, and are the nearest one's outside; frames of one time share a code. The recorded instrument state is not used.
 - the elastic loss takes the Jacobian at the sample of median depth of `elastic_rays` rays (the source: of all samples,
-  weighted; its code offers the median too), by forward-mode differentiation.
+  weighted; its code offers the median too).
 - the background loss takes the capture's sparse points: structure from motion keeps what stands still. A capture
   without measured points has no such loss.
 - rays start where nothing was seen (`NEAR_SHARE` of the nearest sparse point's depth), not at the points: instruments
