@@ -10,7 +10,8 @@ import yaml
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.scene.methods import METHODS, make_deformation
-from neeco.training.options import training_config
+from neeco.training.config import method_defaults
+from neeco.training.options import schedule_parts, training_config, variant_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
 
 ROD = (Instrument("rod"),)
@@ -99,3 +100,39 @@ def test_a_run_of_no_length_is_refused(values: dict) -> None:
 def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: int) -> None:
     with pytest.raises(NeecoError, match=f"--{name.replace('_', '-')}: {value} is too small"):
         training_config("kinematic", {name: value})
+
+
+@pytest.mark.parametrize("method", ["3dgs", "deformable-3dgs", "4dgs", "kinematic"])
+def test_a_variant_turns_every_part_of_the_adjustment_on_and_nothing_else(method: str) -> None:
+    plain = config_to_dict(variant_config(method, {"seed": 3}))
+    adjusted = config_to_dict(variant_config(f"{method}+dta", {"seed": 3}))
+    assert plain == config_to_dict(training_config(method, {"seed": 3}))
+    assert {plain["schedule"].pop(part) for part in schedule_parts()} == {"off"}
+    assert {adjusted["schedule"].pop(part) for part in schedule_parts()} == {"on"}
+    assert adjusted == plain
+    assert adjusted["method"] == method
+
+
+def test_parts_of_the_adjustment_are_those_that_take_on_off_and_inverse() -> None:
+    plain = config_to_dict(method_defaults("neeco"))["schedule"]
+    assert schedule_parts() == tuple(name for name, value in plain.items() if value == "on")
+
+
+def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
+    config = variant_config("4dgs+dta", {}, ["schedule.compensation=off"])
+    assert (config.schedule.compensation, config.schedule.frame_order) == ("off", "on")
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("neeco+dta", "neeco trains with the dynamic adjustment by itself; leave out"),
+        ("4dgs+dat", r"'4dgs\+dat' is unknown; the one variant of a method is METHOD\+dta"),
+        ("4dgs+dta+dta", "is unknown"),
+        ("4dgs+", "is unknown"),
+        ("5dgs+dta", "'5dgs' is unknown; choose one of kinematic"),
+    ],
+)
+def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
+    with pytest.raises(NeecoError, match=f"--method: .*{named}"):
+        variant_config(name, {})
