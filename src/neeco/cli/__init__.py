@@ -26,6 +26,7 @@ VERBS = {
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
+    "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
