@@ -36,6 +36,8 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
     _check_published_steps(config)
+    if config.initial_points is not None and config.initial_points < 1:
+        raise NeecoError(f"--set initial_points: {config.initial_points} is too small; give at least 1")
     for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")

@@ -12,7 +12,15 @@ from neeco import __version__
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.experiments.ablation_results import LabelScores, table_of
-from neeco.evaluation.experiments.ablations import ABLATIONS, OURS, PAPER, PAPER_SETTINGS, Ablation, Variant
+from neeco.evaluation.experiments.ablations import (
+    ABLATIONS,
+    INITIAL_SHARE,
+    OURS,
+    PAPER,
+    PAPER_SETTINGS,
+    Ablation,
+    Variant,
+)
 from neeco.evaluation.experiments.derived import derive_capture
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.files import new_folder, read_json, write_json
@@ -135,12 +143,18 @@ def _takes(method: str, name: str) -> bool:
 
 
 def _job(plan: AblationPlan, variant: Variant) -> Job:
-    """The job of one variant. Settings: the paper's schedule, then the user's, then what the variant is about."""
+    """The job of one variant. Settings: the paper's schedule, then the user's, then what the variant is about.
+
+    Runs of `neeco` begin with INITIAL_SHARE of the tissue's budget unless `initial_points` is given: with the budget
+    full of sparse points density control could do nothing.
+    """
     budget = plan.budget(variant.method)
     given = [item for item in plan.settings if _takes(variant.method, item.partition("=")[0])]
     common = PAPER_SETTINGS if variant.method == "neeco" else ()
     values = {"iterations": budget.iterations, "seed": plan.seed, "transforms": plan.transforms}
     config = training_config(variant.method, values, [*common, *given, *variant.settings])
+    if variant.method == "neeco" and config.initial_points is None:
+        config = replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
     capture = plan.capture
     if variant.derived is not None:
         capture = plan.output / "captures" / variant.derived.name
