@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,8 +12,35 @@ import yaml
 
 from neeco.errors import NeecoError
 from neeco.scene.methods import check_fields
-from neeco.training.config import TrainConfig, method_defaults
+from neeco.training.config import TrainConfig, method_defaults, with_fields
 from neeco.training.run import config_from_dict, config_to_dict
+from neeco.training.schedule import Part, ScheduleConfig
+
+ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
+
+
+def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """`training_config` of a method or of a variant: METHOD+dta turns every part of the paper's dynamic training
+    adjustment on; `assignments` may turn single ones off again.
+
+    A part without an effect on the method (noise, where nothing is encoded) has none. Raises NeecoError for an unknown
+    variant, and for one that is the method itself.
+    """
+    method, plus, _ = name.partition("+")
+    if not plus:
+        return training_config(method, values, assignments)
+    if not name.endswith(ADJUSTED) or name.count("+") > 1:
+        raise NeecoError(f"--method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
+    base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
+    adjusted = with_fields(base, on)
+    if adjusted == base:
+        raise NeecoError(f"--method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
+    return _configured(adjusted, values, assignments)
+
+
+def schedule_parts() -> tuple[str, ...]:
+    """Names of the schedule's fields that are parts of the dynamic training adjustment."""
+    return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
 def training_config(method: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
@@ -20,8 +48,13 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
 
     Raises NeecoError naming the option when a name is unknown or a value does not fit.
     """
+    return _configured(method_defaults(method), values, assignments)
+
+
+def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Sequence[str]) -> TrainConfig:
+    """`base` changed and checked as `training_config` says."""
     given = {name: value for name, value in values.items() if value is not None}
-    config = dataclasses.replace(method_defaults(method), **given)
+    config = dataclasses.replace(base, **given)
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
