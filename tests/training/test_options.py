@@ -20,11 +20,11 @@ ROD = (Instrument("rod"),)
 @pytest.mark.parametrize("method", list(METHODS))
 def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
-    config = training_config(method, values, ["schedule.density=inverse", "refine.cameras=true"])
+    config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
     assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
     write_config(tmp_path, tmp_path / "capture", config)
     assert config_from_dict(read_config(tmp_path)) == config
-    assert config.schedule.density == "inverse"
+    assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
 
 
@@ -42,8 +42,8 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("deformation.speed=2", "method kinematic has no such field"),
         ("method=3dgs", "use --method"),
         ("joints=jaw_angle", r"'jaw_angle' is not a list; write \[jaw_angle\]"),
-        ("schedule.density=true", "'true' is none of on, off, inverse"),
-        ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
+        ("schedule.opacity_reset=true", "'true' is none of on, off, inverse"),
+        ("schedule.opacity_reset=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
@@ -76,10 +76,21 @@ def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
     assert drafts.config()["state"] == "rotation_jaw"
 
 
+@pytest.mark.parametrize("steps", ["0", "many", "2.5", "true"])
+def test_a_schedule_is_stated_for_a_whole_number_of_steps(steps: str) -> None:
+    with pytest.raises(NeecoError, match=r"published_steps: .* is not a positive whole number"):
+        training_config("neeco", {}, [f"schedule.published_steps={steps}"])
+
+
+def test_a_schedule_cannot_scale_to_a_run_of_unknown_length() -> None:
+    with pytest.raises(NeecoError, match=r"published_steps: .*give --iterations alone"):
+        training_config("neeco", {"minutes": 1.0}, ["schedule.published_steps=20000"])
+
+
 @pytest.mark.parametrize("value", ["on", "off", "inverse"])
 @pytest.mark.parametrize("method", ["neeco", "kinematic"])
 def test_every_part_of_the_schedule_takes_the_words_the_manual_names(method: str, value: str) -> None:
-    assert training_config(method, {}, [f"schedule.density={value}"]).schedule.density == value
+    assert training_config(method, {}, [f"schedule.opacity_reset={value}"]).schedule.opacity_reset == value
 
 
 @pytest.mark.parametrize(
