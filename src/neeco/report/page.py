@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from html import escape
 from pathlib import Path
@@ -73,16 +73,21 @@ def write_report(
         _made(run_path, capture, scene, rows),
     ]
     title = f"{capture.root.name}: {scene.method}"
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n"
-    )
+    page = html_page(title, STYLE, sections)
     path = run_path / REPORT_FILE
     write_text(path, page)
     return path
+
+
+def html_page(title: str, style: str, sections: Sequence[str]) -> str:
+    """A whole page of the sections that are not empty."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body>\n"
+        + "\n".join(section for section in sections if section)
+        + "\n</body></html>\n"
+    )
 
 
 def _header(run_path: Path, evaluation: dict[str, Any], capture: Capture, scene: Scene) -> str:
