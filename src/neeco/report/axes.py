@@ -37,7 +37,7 @@ class Axes:
 
     def grid(self, label: Callable[[float], str]) -> list[str]:
         """Lines at round values of y, written by `label`, and round values of x below."""
-        before, after, _, _ = self.margins
+        before, after, _, below = self.margins
         parts = []
         for tick in nice_ticks(self.low, self.high, 4):
             parts.append(f'<path class="grid" d="M{before} {self.down(tick):.1f}H{self.width - after}"/>')
@@ -45,7 +45,9 @@ class Axes:
         for tick in nice_ticks(self.left, self.right, 5):
             x = self.across(tick)
             anchor = "end" if x > self.width - after - 18 else "middle"
-            parts.append(f'<text x="{x:.1f}" y="{self.height - 8}" text-anchor="{anchor}">{short(tick)}</text>')
+            parts.append(
+                f'<text x="{x:.1f}" y="{self.height - below + 18}" text-anchor="{anchor}">{short(tick)}</text>'
+            )
         return parts
 
 

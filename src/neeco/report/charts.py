@@ -50,10 +50,12 @@ def chart(title: str, x_title: str, series: Sequence[Series]) -> str:
     return "".join([*parts, *_names(series, axes), "</svg>"])
 
 
-def legend(names: Sequence[str]) -> str:
-    """What line and mark each method has, in the order of the methods."""
+def legend(names: Sequence[str], shown: Sequence[str]) -> str:
+    """What line and mark each method has that is shown; `names`: all methods, whose order gives them these."""
     items = []
     for order, name in enumerate(names):
+        if name not in shown:
+            continue
         sample = (
             f'<svg viewBox="0 0 46 14"><path class="main" stroke="{color(order)}" '
             f'stroke-dasharray="{_dashes(order)}" d="M1 7H45"/>{mark(order, 23, 7)}</svg>'

@@ -32,9 +32,9 @@ from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import write_text
 from neeco.report.charts import Series, binned, chart, legend
 from neeco.report.comparison_shots import FrameRow, frame_rows, shots_html
-from neeco.report.page import REPORT_FILE, SPLITS, html_page
+from neeco.report.page import REPORT_FILE, SPLITS
 from neeco.report.standings import standings
-from neeco.report.style import CHART_STYLE, STYLE
+from neeco.report.style import CHART_STYLE, STYLE, html_page
 
 BINS = 6
 DISTANCE_SCORES = (("psnr_instrument", "PSNR in the instrument, dB"), ("psnr", "PSNR, dB"), ("mask_iou", "label IoU"))
@@ -101,8 +101,13 @@ def _standings(comparison: Mapping[str, Any]) -> str:
     sentences = standings(comparison)
     if not comparison.get("complete", True):
         sentences.insert(0, "Not all runs are finished: these are the numbers so far.")
-    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
+    items = "".join(f"<li>{_bold_split(sentence, comparison['splits'])}</li>" for sentence in sentences)
     return f"<div class='verdict'><ul class='verdicts'>{items}</ul></div>" if items else ""
+
+
+def _bold_split(sentence: str, splits: Sequence[str]) -> str:
+    split, colon, rest = sentence.partition(": ")
+    return f"<b>{escape(split)}</b>: {escape(rest)}" if colon and split in splits else escape(sentence)
 
 
 def _tables(comparison: Mapping[str, Any], data: Mapping[str, str]) -> str:
@@ -170,7 +175,7 @@ def _curves(comparison: Mapping[str, Any]) -> str:
                     seeds.setdefault(row["seed"], []).append((row["seconds"] * scale, row["psnr"]))
             series.append(Series(name, order, *_mean_line(list(seeds.values()))))
         charts.append(chart(f"PSNR, {split}, dB", f"training time, {clock}{unit}", series))
-    return _charts("PSNR over training time", charts, names, "Bold: mean over seeds; thin: each seed.")
+    return _charts("PSNR over training time", charts, names, curves, "Bold: mean over seeds; thin: each seed.")
 
 
 def _mean_line(lines: list[list[tuple[float, float]]]) -> tuple[Any, Any]:
@@ -209,14 +214,15 @@ def _distance(comparison: Mapping[str, Any]) -> str:
         f"Every held-out frame is a mark (mean over seeds); lines join the means of up to {BINS} groups of equal size. "
         "Distance is that from the nearest state trained on."
     )
-    return _charts("Quality against distance from the training states", charts, names, text)
+    return _charts("Quality against distance from the training states", charts, names, rows, text)
 
 
-def _charts(title: str, charts: Sequence[str], names: Sequence[str], text: str) -> str:
+def _charts(title: str, charts: Sequence[str], names: Sequence[str], rows: Rows, text: str) -> str:
     drawn = [item for item in charts if item]
     if not drawn:
         return ""
-    return f"<h2>{title}</h2><p class='soft'>{text}</p>{legend(names)}<div class='charts'>{''.join(drawn)}</div>"
+    key = legend(names, [row["name"] for row in rows])
+    return f"<h2>{title}</h2><p class='soft'>{text}</p>{key}<div class='charts'>{''.join(drawn)}</div>"
 
 
 def _speed(comparison: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from html import escape
 from pathlib import Path
@@ -15,7 +15,7 @@ from neeco.evaluation.difference import FULL_SCALE, PART_COLORS
 from neeco.files import write_text
 from neeco.report.curves import curve, read_metrics
 from neeco.report.figures import FrameFigure, file_uri, frame_figures
-from neeco.report.style import STYLE
+from neeco.report.style import STYLE, html_page
 from neeco.scene import Scene
 
 REPORT_FILE = "report.html"
@@ -77,17 +77,6 @@ def write_report(
     path = run_path / REPORT_FILE
     write_text(path, page)
     return path
-
-
-def html_page(title: str, style: str, sections: Sequence[str]) -> str:
-    """A whole page of the sections that are not empty."""
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{style}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n"
-    )
 
 
 def _header(run_path: Path, evaluation: dict[str, Any], capture: Capture, scene: Scene) -> str:

@@ -36,7 +36,10 @@ def standings(comparison: Mapping[str, Any]) -> list[str]:
 
 
 def first_in(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, digits: int) -> str | None:
-    """One clause on a metric of which higher is better; None when nobody has it."""
+    """One clause on a metric of which higher is better; None when nobody has it.
+
+    Two means are level when they differ by no more than the sum of their standard deviations over seeds.
+    """
     known = [(row["name"], row[key]) for row in rows if row.get(key) and row[key]["mean"] is not None]
     if not known:
         return None
@@ -46,11 +49,9 @@ def first_in(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str,
     if len(known) == 1:
         return f"only {name} has a {title}, {value}"
     second, next_best = known[1]
-    lead = best["mean"] - next_best["mean"]
-    ahead = f"{lead:.{digits}f}{unit} before {second}"
+    lead = f"{best['mean'] - next_best['mean']:.{digits}f}{unit}"
     if best["std"] is None or next_best["std"] is None:
-        return f"{name} first in {title}, {value}, {ahead} (spread over seeds not known)"
-    spread = best["std"] + next_best["std"]
-    if lead <= spread:
-        return f"{name} and {second} level in {title}: {value}, {ahead}, within their spread over seeds"
-    return f"{name} first in {title}, {value}, {ahead}, more than both spreads over seeds together"
+        return f"{name} first in {title}, {value}, {lead} before {second} (spread over seeds not known)"
+    if best["mean"] - next_best["mean"] <= best["std"] + next_best["std"]:
+        return f"{name} and {second} level in {title}, {value}, {lead} apart (within the seeds' spread)"
+    return f"{name} first in {title}, {value}, {lead} before {second} (clear of the seeds' spread)"

@@ -1,4 +1,9 @@
-"""The report's style sheet: light and dark, phone to print, nothing fetched."""
+"""The reports' style sheets and the page about them: light and dark, phone to print, nothing fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2024; --soft: #5c656e; --paper: #ffffff; --card: #f5f6f8; --edge: #dde1e6;
@@ -79,5 +84,17 @@ td.failed { text-align: left; color: var(--bad); white-space: normal; }
 .verdicts li { margin: 4px 0; max-width: 80ch; }
 @media (max-width: 640px) { .shots { grid-template-columns: repeat(2, 1fr); } }
 @media print { .download { display: none; } .best { color: #000; } .shots { grid-template-columns: repeat(4, 1fr); }
-  .charts { grid-template-columns: repeat(2, 1fr); } }
+  .charts { grid-template-columns: repeat(2, 1fr); } h3, h2 + p, h2 + p + p { break-after: avoid; }
+  .scroll, figure { break-inside: avoid; } }
 """
+
+
+def html_page(title: str, style: str, sections: Sequence[str]) -> str:
+    """A whole page of the sections that are not empty."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body>\n"
+        + "\n".join(section for section in sections if section)
+        + "\n</body></html>\n"
+    )
