@@ -27,6 +27,7 @@ VERBS = {
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
     "score-masks": "Score a folder of masks, whoever made them, against the truth.",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
+    "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."

@@ -1,7 +1,8 @@
-"""Charts that set methods beside each other, as inline SVG: told apart by colour, dashes and marks, named in place."""
+"""Charts of several series as inline SVG, told apart by colour, dashes and marks, and their numbers as a download."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -21,7 +22,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Series:
-    """One method in a chart. `order`: its place among the methods, which gives it colour, dashes and mark."""
+    """One method (or level) in a chart. `order`: its place among all, which gives it colour, dashes and mark."""
 
     name: str
     order: int
@@ -30,8 +31,8 @@ class Series:
     dots: tuple[Point, ...] = ()  # faint marks
 
 
-def chart(title: str, x_title: str, series: Sequence[Series]) -> str:
-    """Lines and marks over a shared frame; "" when nothing has two points."""
+def chart(title: str, x_title: str, series: Sequence[Series], *, lines: Sequence[tuple[float, str]] = ()) -> str:
+    """Lines and marks over a shared frame; "" when nothing has two points. `lines`: (x, words) of vertical lines."""
     points = [point for item in series for line in (item.main, *item.faint, item.dots) for point in line]
     if len({x for x, _ in points}) < 2:
         return ""
@@ -42,6 +43,10 @@ def chart(title: str, x_title: str, series: Sequence[Series]) -> str:
     parts += axes.grid(short)
     middle = (MARGINS[0] + WIDTH - MARGINS[1]) / 2
     parts[-1] += f'<text x="{middle:.0f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_title)}</text>'
+    for x, words in lines:
+        place = f"M{axes.across(x):.1f} {MARGINS[2]}V{HEIGHT - MARGINS[3]}"
+        text = f'<text class="phase-name" x="{axes.across(x) + 4:.1f}" y="{MARGINS[2] + 10}">{escape(words)}</text>'
+        parts.append(f'<path class="phase" d="{place}"/>{text}')
     for item in series:
         parts += [mark(item.order, axes.across(x), axes.down(y)) for x, y in item.dots]
         parts += [_line(item.order, axes, line, "faint") for line in item.faint]
@@ -122,3 +127,10 @@ def _names(series: Sequence[Series], axes: Axes) -> list[str]:
             f"{escape(name)}</text>"
         )
     return texts
+
+
+def download(text: str, name: str, words: str | None = None) -> str:
+    """A link that saves `text` as file `name`, without any server: the text is inside the link."""
+    data = base64.b64encode(text.encode("utf-8")).decode("ascii")
+    title = escape(name if words is None else words)
+    return f"<a class='download' download='{escape(name)}' href='data:text/csv;base64,{data}'>{title}</a>"

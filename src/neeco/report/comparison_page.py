@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import shlex
 import statistics
 from collections.abc import Mapping, Sequence
@@ -30,7 +29,7 @@ from neeco.evaluation.experiments.tables import (
 )
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import write_text
-from neeco.report.charts import Series, binned, chart, legend
+from neeco.report.charts import Series, binned, chart, download, legend
 from neeco.report.comparison_shots import FrameRow, frame_rows, shots_html
 from neeco.report.page import REPORT_FILE, SPLITS
 from neeco.report.standings import standings
@@ -68,16 +67,10 @@ def write_comparison_report(output: Path, comparison: dict[str, Any], capture: C
     return path
 
 
-def download(name: str, text: str) -> str:
-    """A link that saves `text` as file `name`, from inside the page."""
-    content = base64.b64encode(text.encode("utf-8")).decode("ascii")
-    return f"<a class='download' download='{escape(name)}' href='data:text/csv;base64,{content}'>{escape(name)}</a>"
-
-
 def _with_data(section: str, data: Mapping[str, str], *names: str) -> str:
     if not section:
         return ""
-    return section + f"<p class='soft'>{''.join(download(name, data[name]) for name in names)}</p>"
+    return section + f"<p class='soft'>{''.join(download(data[name], name) for name in names)}</p>"
 
 
 def _trained(comparison: Mapping[str, Any]) -> list[str]:
