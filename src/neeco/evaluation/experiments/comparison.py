@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from neeco.evaluation.experiments.cluster import threads_per_worker
 from neeco.evaluation.experiments.distance import distances_to_training
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, held_out_splits, run_jobs
 from neeco.evaluation.experiments.machine import machine
+from neeco.evaluation.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
 from neeco.evaluation.experiments.speed import measure_speed
 from neeco.evaluation.experiments.summary import summarise
 from neeco.evaluation.experiments.tables import write_tables
@@ -60,6 +62,7 @@ class _Plan:
     jobs: tuple[Job, ...]
     splits: tuple[str, ...]
     notes: tuple[str, ...]
+    given_masks: tuple[dict[str, Any], ...]  # scores of the folders of masks
 
 
 def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage | None = None) -> dict[str, Any]:
@@ -73,11 +76,17 @@ def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage
     report = stage or (lambda what, done, total: None)
     with new_folder(spec.output):
         write_json(spec.output / COMPARISON_FILE, _document(plan, []))
-        results = run_jobs(plan.jobs, spec.workers, progress)
-        result = _document(plan, results)
-        result["speed"] = _speed(plan, results, report)
-        result["summary"] = summarise(_names(plan), plan.splits, results, result["speed"]["rows"])
-        result["complete"] = True
+        finished: dict[int, dict[str, Any]] = {}
+
+        def keep(news: JobNews) -> None:
+            if news.result is not None:  # what is known is on disk at every moment
+                finished[news.index] = news.result
+                write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
+            if progress:
+                progress(news)
+
+        result = _document(plan, run_jobs(plan.jobs, spec.workers, keep)) | {"complete": True}
+        _measure(plan, result, report)
         write_json(spec.output / COMPARISON_FILE, result)
         write_tables(spec.output, result)
     return result
@@ -106,7 +115,20 @@ def _plan(spec: ComparisonSpec) -> _Plan:
     capture = _open_capture(spec.capture, configs)
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
-    jobs = tuple(
+    jobs = _jobs(spec, configs)
+    splits = held_out_splits(jobs[0])
+    check_masks(spec.masks, capture, splits, spec.methods)
+    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
+    scored: list[dict[str, Any]] = []
+    for name, folder in spec.masks.items():
+        rows, told = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
+        scored += rows
+        notes += told
+    return _Plan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
+
+
+def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job, ...]:
+    return tuple(
         Job(
             name,
             seed,
@@ -120,8 +142,6 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
         for name, config in configs.items()
     )
-    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
-    return _Plan(spec, capture, jobs, held_out_splits(jobs[0]), tuple(notes))
 
 
 def _config(name: str) -> TrainConfig:
@@ -188,10 +208,11 @@ def _document(plan: _Plan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "splits": list(plan.splits),
         "methods": methods,
         "jobs": list(results),
-        "summary": summarise(_names(plan), plan.splits, results),
+        "summary": summarise(_names(plan), plan.splits, results, (), plan.given_masks),
         "curves": _curves(plan.spec, results),
         "distance": _distance(plan, results),
         "speed": {"rows": []},
+        "masks": list(plan.given_masks),
         "notes": list(plan.notes)
         + [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job],
     }
@@ -224,9 +245,14 @@ def _distance(plan: _Plan, results: Sequence[Mapping[str, Any]]) -> list[dict[st
     return rows
 
 
-def _speed(plan: _Plan, results: Sequence[Mapping[str, Any]], report: Stage) -> dict[str, Any]:
-    finished = [(job["name"], job["seed"]) for job in results if "error" not in job]
-    runs = [(name, seed, load_run(job_folder(plan.spec.output, name, seed))) for name, seed in finished]
-    if not runs:
-        return {"rows": []}
-    return measure_speed(runs, plan.capture, lambda done, total: report("measuring speed", done, total))
+def _measure(plan: _Plan, result: dict[str, Any], report: Stage) -> None:
+    """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
+    folder = plan.spec.output
+    done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
+    runs = [(name, seed, load_run(job_folder(folder, name, seed))) for name, seed in done]
+    if runs:
+        told = splits_with_truth(plan.capture, plan.splits)
+        scored = score_runs(runs, folder, plan.capture, told, partial(report, "scoring masks"))
+        result["masks"] = [*plan.given_masks, *scored]
+        result["speed"] = measure_speed(runs, plan.capture, partial(report, "measuring speed"))
+    result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])

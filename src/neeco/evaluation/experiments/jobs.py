@@ -101,7 +101,8 @@ class Job:
 
 @dataclass(frozen=True)
 class JobNews:
-    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage."""
+    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage; `result`
+    is there once the job is done or has failed."""
 
     index: int
     total: int
@@ -109,6 +110,7 @@ class JobNews:
     stage: str
     share: float = 0.0
     text: str = ""
+    result: dict[str, Any] | None = None
 
 
 def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
@@ -250,9 +252,14 @@ def _run_here(index: int, total: int, job: Job, report: Callable[[JobNews], None
         result = attempt_job(job, tell)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(stopped_line(f"job {index + 1} of {total} ({job.title})", interrupt)) from None
-    failure = result.get("error", "")
-    tell("failed" if failure else "done", 1.0, failure)
+    report(ended(index, total, job, result))
     return result
+
+
+def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
+    """The news that a job is done or has failed."""
+    failure = result.get("error", "")
+    return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
 
 
 def stopped_line(where: str, interrupt: KeyboardInterrupt) -> str:
