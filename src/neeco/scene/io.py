@@ -87,6 +87,7 @@ def pack_scene(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "deformation": scene.deformation.config(),
         "counts": list(scene.canonical.counts),
         "sh_degree": scene.sh_degree,
+        "backdrop": scene.backdrop,
         "diagnostics": scene.diagnostics,
         "instruments": [
             {"name": instrument.name, "joints": {name: limits for name, limits in instrument.joints.items()}}
@@ -152,6 +153,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
     deformation = make_deformation(header["method"], instruments, header["deformation"])
     scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
     scene.sh_degree = int(header["sh_degree"])
+    scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
     scene.load_state_dict(module)

@@ -142,6 +142,12 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
+    times = {frame.state.time for frame in frames} if capture.timed else set()
+    if deformation_class(config.method).needs_times and len(times) < 2:
+        raise NeecoError(
+            f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
+            "each frame its `time` in seconds), 3dgs does not"
+        )
     return capture, frames
 
 
