@@ -26,7 +26,7 @@ class Compare:
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder."""
     methods: tuple[str, ...]
-    """Names as in `neeco train --method`."""
+    """Names as in `neeco train --method`; METHOD+dta trains METHOD with the paper's dynamic training adjustment."""
     output: Path
     """Folder to write; absent, empty, or of this comparison begun earlier."""
     seeds: int = 1

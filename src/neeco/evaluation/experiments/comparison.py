@@ -16,7 +16,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.experiments.cluster import threads_per_worker
 from neeco.evaluation.experiments.distance import distances_to_training
-from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, held_out_splits, run_jobs
+from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.evaluation.experiments.machine import machine
 from neeco.evaluation.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
 from neeco.evaluation.experiments.speed import measure_speed
@@ -27,7 +27,7 @@ from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.methods import deformation_class
 from neeco.training.config import TrainConfig
-from neeco.training.options import training_config
+from neeco.training.options import variant_config
 from neeco.training.run import load_run
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
@@ -75,16 +75,19 @@ def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage
     plan = _plan(spec)
     report = stage or (lambda what, done, total: None)
     with new_folder(spec.output):
-        write_json(spec.output / COMPARISON_FILE, _document(plan, []))
-        finished: dict[int, dict[str, Any]] = {}
+        finished = _finished_before(plan)
+
+        def write() -> None:  # what is known is on disk at every moment
+            write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
 
         def keep(news: JobNews) -> None:
-            if news.result is not None:  # what is known is on disk at every moment
+            if news.result is not None:
                 finished[news.index] = news.result
-                write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
+                write()
             if progress:
                 progress(news)
 
+        write()
         result = _document(plan, run_jobs(plan.jobs, spec.workers, keep)) | {"complete": True}
         _measure(plan, result, report)
         write_json(spec.output / COMPARISON_FILE, result)
@@ -102,6 +105,13 @@ def failures(comparison: Mapping[str, Any]) -> list[str]:
     return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
 
 
+def _finished_before(plan: _Plan) -> dict[int, dict[str, Any]]:
+    """What earlier starts left of these jobs, by the job's place."""
+    files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
+    found = {index: read_json(file) for index, file in files.items() if file.exists()}
+    return {index: job for index, job in found.items() if list(job["splits"]) == list(plan.splits)}
+
+
 def _plan(spec: ComparisonSpec) -> _Plan:
     """Check everything that can be known before the work. Raises NeecoError."""
     spec.budget.check()
@@ -109,13 +119,15 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
         raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    configs = {name: _config(name) for name in spec.methods}
+    configs = {name: variant_config(name, {}) for name in spec.methods}
     if not configs:
         raise NeecoError("--methods: none is given; name at least one")
     capture = _open_capture(spec.capture, configs)
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
     jobs = _jobs(spec, configs)
+    for job in jobs:
+        check_folder(job)
     splits = held_out_splits(jobs[0])
     check_masks(spec.masks, capture, splits, spec.methods)
     notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
@@ -142,10 +154,6 @@ def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job
         for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
         for name, config in configs.items()
     )
-
-
-def _config(name: str) -> TrainConfig:
-    return training_config(name, {})
 
 
 def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:

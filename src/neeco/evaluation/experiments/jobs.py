@@ -181,7 +181,10 @@ def check_folder(job: Job) -> None:
             )
         for key in (key for key in identity if values[key] != identity[key]):
             raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
-    old, new = vars(config_from_dict(stored)), vars(job.train_config)
+    try:
+        old, new = vars(config_from_dict(stored)), vars(job.train_config)
+    except NeecoError as error:  # of another version
+        raise NeecoError(f"{folder / error.args[0].removesuffix('; train again')}; {differs}") from None
     for field in (name for name in new if old[name] != new[name]):
         raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 

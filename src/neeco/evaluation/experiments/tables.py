@@ -183,7 +183,7 @@ def markdown_text(comparison: Mapping[str, Any]) -> str:
         parts.append("| method | " + " | ".join(_md(_arrow(column)) for column in table.columns) + " |")
         parts.append("|---|" + "---:|" * len(table.columns))
         for method, cells in table.rows:
-            shown = [f"failed: {_md(table.failed[method])}"] + [""] * (len(cells) - 1)
+            shown = [f"failed: {_md(table.failed.get(method, ''))}"] + [""] * (len(cells) - 1)
             if method not in table.failed:
                 shown = [_md_cell(cell) for cell in cells]
             parts.append(f"| {_md(method)} | " + " | ".join(shown) + " |")
