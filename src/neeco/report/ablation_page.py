@@ -15,7 +15,7 @@ from neeco.evaluation.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.evaluation.experiments.ablation_tables import agreement, csv_text, grid
 from neeco.evaluation.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.files import write_text
-from neeco.report.charts import CHART_STYLE, Series, download, line_chart
+from neeco.report.ablation_charts import CHART_STYLE, Series, download, line_chart
 from neeco.report.style import STYLE
 
 PAGE_STYLE = """

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import statistics
@@ -125,7 +126,7 @@ def test_a_failed_run_is_told_in_its_place_and_ends_with_status_1(
     step = Session.step
 
     def diverging(session: Session):
-        if session.config.schedule.density == "on":
+        if session.config.schedule.sh_order == "on":
             raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
         return step(session)
 
@@ -202,8 +203,6 @@ def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(
     assert main(["compare", str(spec.capture), *words, "--output", str(spec.output)]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
-    import re
-
     assert re.search(told, lines[0])
     assert not spec.output.exists()
 

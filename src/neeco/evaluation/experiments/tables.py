@@ -263,18 +263,23 @@ def write_tables(output: Path, comparison: Mapping[str, Any]) -> None:
     write_text(output / "comparison.csv", csv_text(comparison))
     write_text(output / "comparison.md", markdown_text(comparison))
     write_text(output / "comparison.tex", latex_text(comparison))
-    data = output / "data"
+    for name, text in data_files(comparison).items():
+        write_text(output / "data" / name, text)
+
+
+def data_files(comparison: Mapping[str, Any]) -> dict[str, str]:
+    """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
     job_header = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
     jobs = [
         {**job, **numbers, "split": split}
         for job in comparison["jobs"]
         for split, numbers in (job["splits"] or {"": {}}).items()
     ]
-    write_text(data / "jobs.csv", rows_as_csv(jobs, job_header))
-    for key, header in (
-        ("curves", ["name", "seed", "seconds", "iteration", "split", "psnr"]),
-        ("distance", ["name", "seed", "split", "frame", "distance", "psnr", "psnr_instrument", "mask_iou"]),
-    ):
-        write_text(data / f"{key}.csv", rows_as_csv(comparison[key], header))
+    distance_header = ["name", "seed", "split", "frame", "distance", "psnr", "psnr_instrument", "mask_iou"]
     speed_header = ["name", "seed", "method", "backend", "fps", "milliseconds", "draws", "num_gaussians"]
-    write_text(data / "speed.csv", rows_as_csv(comparison["speed"]["rows"], speed_header))
+    return {
+        "jobs.csv": rows_as_csv(jobs, job_header),
+        "curves.csv": rows_as_csv(comparison["curves"], ["name", "seed", "seconds", "iteration", "split", "psnr"]),
+        "distance.csv": rows_as_csv(comparison["distance"], distance_header),
+        "speed.csv": rows_as_csv(comparison["speed"]["rows"], speed_header),
+    }
