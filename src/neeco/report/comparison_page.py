@@ -104,9 +104,7 @@ def _bold_split(sentence: str, splits: Sequence[str]) -> str:
 
 
 def _tables(comparison: Mapping[str, Any], data: Mapping[str, str]) -> str:
-    parts = [
-        "<h2>Numbers</h2><p class='soft'>Mean ± standard deviation over seeds; the best of a column stands out.</p>"
-    ]
+    parts = ["<h2>Numbers</h2><p class='soft'>Mean ± standard deviation over seeds; the best is bold.</p>"]
     for table in tables_of(comparison):
         split = table.title.removeprefix("split ")
         meaning = f" <span class='soft'>{escape(SPLITS[split])}</span>" if split in SPLITS else ""
@@ -115,10 +113,9 @@ def _tables(comparison: Mapping[str, Any], data: Mapping[str, str]) -> str:
             if part.columns:
                 parts.append(f"<h3>{escape(title)}{meaning}</h3>{_table(part)}")
     notes = "".join(f"<li>{escape(note)}</li>" for note in absent_notes(comparison))
-    parts.append(
-        f"<p class='soft'>{download('summary.csv', data['summary.csv'])}{download('jobs.csv', data['jobs.csv'])}</p>"
+    return _with_data("".join(parts), data, "summary.csv", "jobs.csv") + (
+        f"<ul class='note'>{notes}</ul>" if notes else ""
     )
-    return "".join(parts) + (f"<ul class='note'>{notes}</ul>" if notes else "")
 
 
 def _parted(table: Table) -> tuple[Table, Table]:

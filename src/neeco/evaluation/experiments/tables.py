@@ -35,8 +35,9 @@ SPLIT_COLUMNS = (
     Column("mask_iou", "label IoU", 3, "high"),
 )
 MASK_COLUMNS = (
-    Column("iou", "IoU", 3, "high"),
+    Column("iou", "label IoU", 3, "high"),
     Column("challenge_iou", "Challenge IoU", 3, "high"),
+    Column("challenge_iou_parts", "of parts", 3, "high"),
     Column("dice", "Dice", 3, "high"),
     Column("boundary_f", "boundary F", 3, "high"),
     Column("box_ap", "box AP", 3, "high"),
@@ -76,7 +77,9 @@ def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
     tables = []
     for split in comparison["splits"]:
         rows = [row for row in comparison["summary"] if row["split"] == split]
-        tables.append(_table(f"split {split}", SPLIT_COLUMNS + MASK_COLUMNS, rows, failed))
+        scored = any(row["iou"]["n"] for row in rows)  # the same number, for other people's masks too
+        ours = [column for column in SPLIT_COLUMNS if not (scored and column.key == "mask_iou")]
+        tables.append(_table(f"split {split}", (*ours, *MASK_COLUMNS), rows, failed))
     trained = {entry["name"] for entry in comparison["methods"] if entry["source"] == "train"}
     first = comparison["splits"][0]
     rows = [row for row in comparison["summary"] if row["split"] == first and row["name"] in trained]
@@ -180,7 +183,7 @@ def markdown_text(comparison: Mapping[str, Any]) -> str:
         parts.append("| method | " + " | ".join(_md(_arrow(column)) for column in table.columns) + " |")
         parts.append("|---|" + "---:|" * len(table.columns))
         for method, cells in table.rows:
-            shown = [f"failed: {_md(table.failed[method])}"] + [""] * (len(cells) - 1)
+            shown = [f"failed: {_md(table.failed.get(method, ''))}"] + [""] * (len(cells) - 1)
             if method not in table.failed:
                 shown = [_md_cell(cell) for cell in cells]
             parts.append(f"| {_md(method)} | " + " | ".join(shown) + " |")
