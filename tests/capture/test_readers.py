@@ -145,6 +145,21 @@ def test_blender_captures_are_composited_and_split_by_file(folder, tmp_path):
     )
 
 
+@pytest.mark.parametrize("timed", [(), (1,)])
+def test_a_blender_folder_without_any_time_stands_still(folder, tmp_path, timed):
+    frames = folder.document["frames"]
+    for index, frame in enumerate(frames):
+        frames[index] = {"file_path": frame["file_path"], "transform_matrix": frame["transform_matrix"]}
+        frames[index] |= {"time": 0.5} if index in timed else {}
+    for split, part in {"train": frames[:6], "test": frames[6:]}.items():
+        (folder.root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": part}))
+    (folder.root / "transforms.json").unlink()
+    times = [frame.state.time for frame in read_capture(folder.root).frames]
+    asked = [problem for problem in check_capture(folder.root) if "not every frame has a time" in problem.message]
+    assert times == ([0.0] * 8 if not timed else [float(order) for order in range(8)])
+    assert bool(asked) == bool(timed)
+
+
 def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE") -> None:
     capture = read_capture(folder.root)
     (folder.root / "images").rename(root / "images")

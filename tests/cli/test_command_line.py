@@ -19,8 +19,10 @@ WITH_BAD_PATH = {
     "ingest": [MISSING, "--output", "capture"],
     "train": [MISSING, "--output", "run"],
     "evaluate": [MISSING],
+    "compare": [MISSING, "--methods", "3dgs", "--iterations", "5", "--output", "compared"],
     "render": [MISSING, "--output", "drawn"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
+    "score-masks": [MISSING, MISSING],
     "demo": ["--output", "taken"],
 }
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -181,6 +182,19 @@ def test_a_quaternion_of_length_zero_draws_nothing(simd: str) -> None:
     scene.tensors["quats"][1] = 0
     assert_same_as_reference(scene)
     assert not draw(scene, torch.float32, "cpu", torch.ones(37, 45))[0].visible[1]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_the_backdrop_stands_in_where_no_background_is_asked_for(backend: str) -> None:
+    scene = make_scene(6)
+    _, gaussians, camera = leaves(scene, torch.float32)
+    white, grey = torch.ones(3), torch.full((3,), 0.5)
+    before = replace(gaussians, backdrop=white)
+    out = rasterize(before, camera, backend=backend)
+    assert torch.equal(out.color, rasterize(gaussians, camera, background=white, backend=backend).color)
+    assert not torch.equal(out.color, rasterize(gaussians, camera, backend=backend).color)
+    over = rasterize(before, camera, background=grey, backend=backend).color
+    assert torch.equal(over, rasterize(gaussians, camera, background=grey, backend=backend).color)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

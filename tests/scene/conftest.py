@@ -28,6 +28,6 @@ def neeco() -> Scene:
     return make_scene("neeco")
 
 
-@pytest.fixture(params=["kinematic", "neeco", "3dgs"])
+@pytest.fixture(params=["kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs"])
 def any_scene(request: pytest.FixtureRequest) -> Scene:
     return make_scene(request.param)

@@ -14,6 +14,7 @@ from neeco.scene.rotations import rigid_from_vector
 
 TISSUE, INSTRUMENT = 20, 40
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.5)})
+SMALL = {"4dgs": {"resolution": 8, "channels": 4, "moments": 5, "width": 16}, "deformable-3dgs": {"width": 32}}
 SURE = 30.0  # a part logit that leaves no doubt
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=61.0, cx=32.0, cy=24.0, width=64, height=48)
 
@@ -59,8 +60,8 @@ def make_scene(method: str) -> Scene:
     )
     names = tuple(f"{k:06d}" for k in range(8))
     recorded = Recording(names, ("train",) * 8, states, (CAMERA,) * 8)
-    config = {"half": False} if method == "neeco" else {}
-    deformation = make_deformation(method, instruments, config)
+    torch.manual_seed(0)
+    deformation = make_deformation(method, instruments, SMALL.get(method, {}))
     scene = Scene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
     scene.sh_degree = 2
     if method == "kinematic":
@@ -72,7 +73,7 @@ def make_scene(method: str) -> Scene:
             for parameter in hinges.parameters():
                 parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
             hinges.hinge_depth.fill_(5.0)
-    if method == "neeco":
+    if method not in ("kinematic", "3dgs"):
         torch.manual_seed(0)
         deformation.fit_ranges(list(states), canonical.means)
     return scene

@@ -14,7 +14,8 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene import Scene
-from neeco.scene.deformations.nps import NPS, encode, mark_moving, otsu
+from neeco.scene.deformations._moving import mark_moving, otsu
+from neeco.scene.deformations.nps import NPS, encode
 from neeco.scene.methods import make_deformation
 
 

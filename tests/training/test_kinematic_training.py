@@ -12,7 +12,7 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.scene.deformations import kinematic
+from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
@@ -33,7 +33,7 @@ CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.pla
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
-    monkeypatch.setattr(kinematic, "HINGE_START", 12)
+    monkeypatch.setattr(Kinematic, "learns_from", 12)
     monkeypatch.setattr(module, "ROW_INTERVAL", 1)
 
 

@@ -15,7 +15,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.nerfies.scene import NerfScene
-from neeco.training.options import training_config
+from neeco.training.options import training_config, variant_config
 from neeco.training.train import ProgressRow, train
 
 pytestmark = pytest.mark.usefixtures("short_intervals")
@@ -125,14 +125,15 @@ def test_what_a_loss_mask_hides_teaches_nothing(tmp_path: Path) -> None:
     assert scenes[0] == scenes[1]
 
 
-def test_frames_of_one_time_are_told_that_nothing_moves(tmp_path: Path) -> None:
+def test_frames_of_one_time_and_the_adjustment_of_gaussians_are_refused(tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture", instruments=False)
     document = json.loads((capture / "transforms.json").read_text())
     document["frames"] = [{**frame, "time": 0.5} for frame in document["frames"]]
     (capture / "transforms.json").write_text(json.dumps(document))
-    notes: list[str] = []
-    train(capture, tmp_path / "run", config_of(iterations=5), progress=lambda row: notes.append(row.note))
-    assert any("all training frames have one time" in note for note in notes)
+    with pytest.raises(NeecoError, match=r"time: .* method nerfies needs it"):
+        train(capture, tmp_path / "run", config_of(iterations=5))
+    with pytest.raises(NeecoError, match="nerfies has no Gaussians for the dynamic adjustment"):
+        variant_config("nerfies+dta", {})
 
 
 def test_evaluate_and_render_take_the_run_as_any_other(run: Path, tmp_path: Path, capsys) -> None:

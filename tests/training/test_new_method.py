@@ -1,7 +1,8 @@
-"""A new method is one class and its name in `scene/methods.py`; training asks the class for the rest."""
+"""A new method is one new file; it is found there, and training asks its class for the rest."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,23 +10,28 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from capture_files import write_capture
-from torch import Tensor, nn
+from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.scene import CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene import CanonicalGaussians, deformations, methods
+from neeco.scene.deformations.base import Posed
 from neeco.scene.io import load_scene
-from neeco.scene.methods import METHODS
 from neeco.training.config import method_defaults
 from neeco.training.options import training_config
 from neeco.training.train import train
 
+FILE = '''
+import torch
+from torch import nn
+
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
+
 
 class Drift(Deformation):
-    """Everything moves with time along one learned direction [3] mm, each Gaussian by its own learned share."""
+    """Everything moves with time along one learned direction [3] mm."""
 
-    training_defaults: ClassVar[Mapping[str, Any]] = {"schedule.frame_order": "off", "ssim_weight": 0.05}
-    extra_rates: ClassVar[Mapping[str, float]] = {}
+    method = "drift"
+    training_defaults = {"schedule.frame_order": "off", "ssim_weight": 0.05}
     needs_instruments = True
     label_names = (("grasper", "instrument"),)
 
@@ -35,34 +41,69 @@ class Drift(Deformation):
         self.direction = nn.Parameter(torch.zeros(3))
         self.register_buffer("duration", torch.ones(()))
 
-    def config(self) -> dict[str, Any]:
+    def config(self):
         return {"reach": self.reach}
 
-    def fit_ranges(self, states, means: Tensor) -> None:
+    def fit_ranges(self, states, means):
         self.duration.fill_(max(state.time for state in states))
 
-    def finished(self, canonical: CanonicalGaussians, states) -> CanonicalGaussians:
+    def finished(self, canonical, states):
         return canonical.with_extras(moved=torch.full((len(canonical),), float(len(states))))
 
-    def pose(self, canonical: CanonicalGaussians, state, perturbation: Perturbation = UNPERTURBED) -> Posed:
+    def pose(self, canonical, state, perturbation=UNPERTURBED):
         shift = self.direction * self.reach * (state.time / float(self.duration))
         return Posed(canonical.means + shift, canonical.quats, canonical.log_scales.exp())
 
-    def learning_rates(self, iteration: int) -> dict[str, float]:
-        return {"direction": 1e-2}
+    def regularisation(self, canonical):
+        return self.WEIGHT * (self.direction - 1).abs().sum()
+
+    WEIGHT = 0.0
+
+    def learning_rates(self, progress):
+        return {"direction": 1e-2 * (1 - progress)}
+'''
 
 
 @pytest.fixture(autouse=True)
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "drift", Drift)
+def drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The class, as found in a new file of a folder that stands for `deformations/`."""
+    folder = tmp_path / "deformations"
+    folder.mkdir()
+    (folder / "drift.py").write_text(FILE)
+    monkeypatch.setattr(deformations, "__path__", [*deformations.__path__, str(folder)])
+    monkeypatch.setattr(methods, "METHODS", methods.find_methods())
+    yield methods.METHODS["drift"]
+    del sys.modules["neeco.scene.deformations.drift"]
 
 
-def test_a_new_method_trains_is_finished_and_comes_back_from_disk(tmp_path: Path) -> None:
+def test_methods_are_found_in_their_files_the_default_one_first() -> None:
+    assert list(methods.METHODS) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco"]
+
+
+def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "deformations" / "drifting.py").write_text(FILE)
+    try:
+        with pytest.raises(NeecoError, match=r"drifting: method 'drift' is also in neeco.scene.deformations.drift"):
+            methods.find_methods()
+    finally:
+        del sys.modules["neeco.scene.deformations.drifting"]
+
+
+def test_a_methods_own_term_of_the_loss_moves_it(drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every step of Adam follows the sign of a large gradient; all at the rates that were asked for."""
+    monkeypatch.setattr(drift, "WEIGHT", 1e6)
+    config = training_config("drift", {"iterations": 12})
+    scene = load_scene(train(write_capture(tmp_path / "capture"), tmp_path / "run", config) / "scene.safetensors")
+    reached = sum(1e-2 * (1 - k / 12) for k in range(1, 13))
+    assert scene.deformation.direction.tolist() == pytest.approx([reached] * 3, rel=0.01)
+
+
+def test_a_new_method_trains_is_finished_and_comes_back_from_disk(drift: Any, tmp_path: Path) -> None:
     config = training_config("drift", {"iterations": 12}, ["deformation.reach=3"])
     assert (config.schedule.frame_order, config.ssim_weight) == ("off", 0.05)
     run = train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     scene = load_scene(run / "scene.safetensors")
-    assert isinstance(scene.deformation, Drift)
+    assert isinstance(scene.deformation, drift)
     assert scene.deformation.reach == 3
     assert float(scene.deformation.duration) == pytest.approx(0.28)  # fit_ranges was asked
     assert bool((scene.deformation.direction != 0).all())  # it was learned
@@ -81,11 +122,13 @@ def test_a_field_that_the_method_does_not_have_is_refused_by_name() -> None:
         training_config("drift", {"iterations": 12}, ["deformation.raech=3"])
 
 
-def test_extras_with_a_rate_are_learned_and_others_hold_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Shared(Drift):
+def test_extras_with_a_rate_are_learned_and_others_hold_still(
+    drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Shared(drift):
         extra_rates: ClassVar[Mapping[str, float]] = {"share": 1e-2}
 
-        def pose(self, canonical, state, perturbation=UNPERTURBED) -> Posed:
+        def pose(self, canonical, state, perturbation=None) -> Posed:
             posed = super().pose(canonical, state)
             extent = canonical.extras["share"] * canonical.extras["still"]
             return Posed(canonical.means + extent[:, None], posed.quats, posed.scales)
@@ -98,7 +141,7 @@ def test_extras_with_a_rate_are_learned_and_others_hold_still(tmp_path: Path, mo
         ones = torch.ones(len(positions))
         return real(positions, *rest).with_extras(share=0 * ones, still=ones)
 
-    monkeypatch.setitem(METHODS, "drift", Shared)
+    monkeypatch.setitem(methods.METHODS, "drift", Shared)
     monkeypatch.setattr(initial, "seed_gaussians", seeded)
     run = train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 12}))
     extras = load_scene(run / "scene.safetensors").canonical.extras

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.points import random_points
-from neeco.capture.problems import Report
+from neeco.capture.problems import Node, Report
 from neeco.capture.transforms import load_document, parse_frames, parse_points, parses_as_json, relative_name
 
 HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
@@ -24,17 +25,29 @@ def is_blender_file(file: Path) -> bool:
 def parse_blender(files: list[Path], root: Path, report: Report, background: float = 1.0) -> Parsed:
     """Read the files of a Blender capture, one split each, named by the file; problems go to `report`.
 
-    Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used.
+    Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used. Where no frame
+    at all has a time nothing moves (NeRF's synthetic scenes): every frame then has time 0.
     """
     parsed = Parsed(root)
+    moves = False
     for file in files:
         document = load_document(file, root, report)
+        moves = moves or _has_times(document)
         _, _, split = file.stem.rpartition("_")
         split_name = split if split in ("train", "val", "test") else None
         parse_frames(document, file.parent, parsed, background=background, split=split_name, extensions=EXTENSIONS)
         if parsed.points is None:
             parse_points(document, file.parent, parsed)
+    if not moves:
+        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
+        parsed.timed = True
     if parsed.points is None:
         parsed.points = random_points(np.zeros(3), HALF_SIZE)
         parsed.points_place = Place(relative_name(files[0], root), "ply_file_path")
     return parsed
+
+
+def _has_times(document: Node) -> bool:
+    """Whether any frame of the file says when it was taken."""
+    frames = document.value.get("frames")
+    return isinstance(frames, list) and any(isinstance(frame, dict) and "time" in frame for frame in frames)

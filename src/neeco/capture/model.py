@@ -85,6 +85,7 @@ class Capture:
     instruments: tuple[Instrument, ...]
     points: PointCloud
     registered: bool = True  # instrument poses are in the cameras' world frame
+    timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
 
     def split(self, name: str) -> tuple[Frame, ...]:
         """The frames of one split, in recorded order."""

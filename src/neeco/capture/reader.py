@@ -35,7 +35,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
         report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
     report.raise_first(parsed.root)
     points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
-    return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered)
+    return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed)
 
 
 def parse_capture(

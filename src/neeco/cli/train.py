@@ -18,7 +18,8 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str = "kinematic"
-    """kinematic, neeco (the paper), 3dgs or nerfies."""
+    """kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
+    adjustment."""
     iterations: int | None = None
     """Optimisation steps; by default as the method has it."""
     minutes: float | None = None
@@ -36,15 +37,15 @@ class Arguments:
     instrument_budget: int | None = None
     """Most Gaussians of each instrument."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Any other field of the training config, as NAME=VALUE (e.g. schedule.density=inverse); repeatable."""
+    """Any other field of the training config, as NAME=VALUE (e.g. schedule.opacity_reset=inverse); repeatable."""
 
 
 def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
     from neeco.cli._training import train_with_progress
-    from neeco.training.options import training_config
+    from neeco.training.options import variant_config
 
-    config = training_config(
+    config = variant_config(
         args.method,
         {
             "iterations": args.iterations,

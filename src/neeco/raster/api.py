@@ -24,7 +24,8 @@ def rasterize(
 ) -> Rendering:
     """Draw Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
 
-    channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind, default black.
+    channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
+    the Gaussians' backdrop, or black.
     backend: "cpu" (native, float32), "reference" (plain torch, any float type, slow), "cuda" (gsplat), or "auto":
     cuda for tensors on a CUDA device, cpu otherwise.
 
@@ -42,6 +43,8 @@ def rasterize(
 
     Raises NeecoError where shapes do not fit, or the backend cannot be had.
     """
+    if background is None:
+        background = gaussians.backdrop
     _check(gaussians, camera, channels, background)
     if backend == "auto":
         backend = "cuda" if gaussians.means.is_cuda else "cpu"

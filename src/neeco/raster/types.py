@@ -29,6 +29,8 @@ class Gaussians:
 
     Colour is `max(0, sh . basis(direction) + 0.5)`, direction = from the camera centre to the mean, unit, turned into
     the Gaussian's SH frame when `sh_frames` is given; then the headlight. No gradient flows into `sh_frames`.
+    `backdrop` lies behind all of them where nothing else is asked for, e.g. the white of images cut out of their
+    surroundings.
     """
 
     means: Tensor  # [N, 3] mm
@@ -38,6 +40,7 @@ class Gaussians:
     sh: Tensor  # [N, K, 3], K = 1, 4, 9 or 16
     sh_frames: Tensor | None = None  # [N, 4] wxyz unit, world_from_sh
     headlight: Headlight | None = None
+    backdrop: Tensor | None = None  # [3] colour; None: black
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -85,4 +88,5 @@ def to_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
         sh=gaussians.sh.to(dtype),
         sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames.to(dtype),
         headlight=None if light is None else Headlight(light.falloff.to(dtype), light.vignette.to(dtype)),
+        backdrop=None if gaussians.backdrop is None else gaussians.backdrop.to(dtype),
     )

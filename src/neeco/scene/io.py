@@ -109,6 +109,7 @@ def pack_scene(scene: Scene | NerfScene) -> tuple[dict[str, Tensor], dict[str, A
         header["deformation"] = scene.deformation.config()
         header["counts"] = list(scene.canonical.counts)
         header["sh_degree"] = scene.sh_degree
+        header["backdrop"] = scene.backdrop
     return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, header
 
 
@@ -144,6 +145,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene | 
         deformation = make_deformation(header["method"], instruments, header["deformation"])
         scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
         scene.sh_degree = int(header["sh_degree"])
+        scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
     scene.diagnostics = header["diagnostics"]
     scene.load_state_dict(module)
     scene.requires_grad_(False)

@@ -1,24 +1,45 @@
-"""Method names and the deformation class behind each. A new method is one file in `deformations/` and one line here."""
+"""Method names and the deformation class behind each: whatever the files of `deformations/` define."""
 
 from __future__ import annotations
 
+import importlib
 import inspect
+import pkgutil
 import types
 import typing
 from typing import Any
 
-from neeco.capture.model import Instrument
+from neeco.capture.model import Capture, Instrument
 from neeco.errors import NeecoError
+from neeco.scene import deformations
 from neeco.scene.deformations.base import Deformation
-from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.deformations.nps import NPS
-from neeco.scene.deformations.static import Static
 from neeco.scene.nerfies.settings import Nerfies
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
-METHODS: dict[str, type[Deformation] | type[Nerfies]] = {"kinematic": Kinematic, "neeco": NPS, "3dgs": Static}
-METHODS["nerfies"] = Nerfies  # no deformation of Gaussians: a scene of its own (`scene/nerfies/`)
+
+def find_methods() -> dict[str, type[Deformation]]:
+    """Every class with a `method` name of its own that a public module of `deformations/` defines, by that name.
+
+    `kinematic`, the default, comes first, the others in the order of their names. Raises NeecoError when two share one.
+    """
+    found: dict[str, type[Deformation]] = {}
+    for entry in pkgutil.iter_modules(deformations.__path__):
+        if entry.name.startswith("_"):
+            continue
+        module = importlib.import_module(f"{deformations.__name__}.{entry.name}")
+        for kind in vars(module).values():
+            named = isinstance(kind, type) and issubclass(kind, Deformation) and "method" in vars(kind)
+            if not named or kind.__module__ != module.__name__:
+                continue
+            if kind.method in found:
+                other = found[kind.method].__module__
+                raise NeecoError(f"{module.__name__}: method {kind.method!r} is also in {other}; give it another name")
+            found[kind.method] = kind
+    return dict(sorted(found.items(), key=lambda item: (item[0] != "kinematic", item[0])))
+
+
+METHODS: dict[str, type[Deformation] | type[Nerfies]] = {**find_methods(), "nerfies": Nerfies}
 
 
 def method_class(method: str) -> type[Deformation] | type[Nerfies]:
@@ -34,6 +55,15 @@ def deformation_class(method: str) -> type[Deformation]:
     if not issubclass(kind, Deformation):
         raise NeecoError(f"method {method} deforms no Gaussians; it has a scene of its own")
     return kind
+
+
+def unmet_need(method: str, capture: Capture) -> str | None:
+    """What `method` needs and `capture` has not recorded, in words; None when it can be trained on it."""
+    kind = method_class(method)
+    if kind.needs_instruments and not capture.instruments:
+        return "instrument states"
+    times = {frame.state.time for frame in capture.split("train")} if capture.timed else set()
+    return "times of its frames" if kind.needs_times and len(times) < 2 else None
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Deformation:

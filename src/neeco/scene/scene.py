@@ -33,7 +33,7 @@ class Scene(nn.Module):
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
-    instruments) and `vignette` are the headlight (see `Headlight`).
+    instruments) and `vignette` are the headlight (see `Headlight`). `backdrop` in [0, 1] is the grey behind everything.
     """
 
     center: Tensor
@@ -55,6 +55,7 @@ class Scene(nn.Module):
         self.instruments = instruments
         self.recorded = recorded
         self.sh_degree = 0
+        self.backdrop = 0.0
         self.diagnostics: dict[str, Any] = {}
         self.register_buffer("center", center.float())  # [3] mm, middle of the tissue
         self.registration = nn.Parameter(torch.zeros(7))
@@ -77,6 +78,7 @@ class Scene(nn.Module):
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
             headlight=Headlight(falloff, self.vignette),
+            backdrop=torch.full((3,), self.backdrop) if self.backdrop else None,
         )
 
     def registered(self, state: State) -> State:

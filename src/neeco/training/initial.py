@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
@@ -50,6 +51,7 @@ def initial_scene(
     deformation = make_deformation(config.method, instruments, config.deformation)
     center = torch.from_numpy(np.median(positions, 0))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
+    scene.backdrop = _backdrop(frames)
     deformation.fit_ranges(list(recorded.states), tissue.means)
     if deformation.gate_volume is not None:
         close_gate(scene, deformation.gate_volume, frames, images, masks, config, report)
@@ -58,11 +60,19 @@ def initial_scene(
     return scene
 
 
+def _backdrop(frames: tuple[Frame, ...]) -> float:
+    """The grey [0, 1] that transparent images were laid on, so that it need not be learned; black where images fill
+    their frame. Raises NeecoError when an image cannot be read."""
+    return next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
+
+
 def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [P, 3] mm and colours [P, 3] of at most `config.tissue_budget` sparse points."""
+    """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, or the tissue's
+    budget."""
     positions, colors = capture.points.positions, capture.points.colors
-    if len(positions) > config.tissue_budget:
-        chosen = np.random.default_rng(config.seed).choice(len(positions), config.tissue_budget, replace=False)
+    most = min(config.tissue_budget, config.initial_points or config.tissue_budget)
+    if len(positions) > most:
+        chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
     return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
 

@@ -28,7 +28,7 @@ def begin_session(
     """The session of `config.method` before its first step, its scene begun from the capture."""
     scene: Scene | NerfScene
     if is_field(config.method):
-        scene = initial_field(capture, frames, config, report)
+        scene = initial_field(capture, frames, config)
     else:
         scene = initial_scene(capture, frames, images, masks, config, report)
     return session_around(scene, capture, frames, images, masks, config)

@@ -29,11 +29,9 @@ FAR_SHARE = 1.15  # of the farthest one's
 QUANTILES = (0.01, 0.99)  # of the points, against stray ones
 
 
-def initial_field(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> NerfScene:
-    """The untrained field, its box and depths taken from the sparse points and the training cameras.
-
-    Reports when all frames have one time, since nothing can move then. Raises NeecoError where a setting does not fit.
-    """
+def initial_field(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig) -> NerfScene:
+    """The untrained field, its box and depths taken from the sparse points and the training cameras. Raises NeecoError
+    where a setting does not fit."""
     recorded = Recording(
         tuple(frame.name for frame in frames),
         tuple(frame.split for frame in frames),
@@ -42,8 +40,6 @@ def initial_field(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     )
     settings = make_field(config.method, capture.instruments, config.deformation)
     scene = NerfScene(config.method, settings, capture.instruments, recorded)
-    if len(scene.times) == 1:
-        report(f"warning: {capture.root}: all training frames have one time, so {config.method} can move nothing")
     points = torch.from_numpy(capture.points.positions).float()
     near, far = depth_bounds(points, frames)
     eyes = torch.stack([frame.camera.world_from_camera[:3].float() for frame in frames])

@@ -4,15 +4,47 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.scene.methods import check_fields
-from neeco.training.config import TrainConfig, method_defaults
+from neeco.scene.methods import check_fields, is_field
+from neeco.training.config import TrainConfig, method_defaults, with_fields
 from neeco.training.run import config_from_dict, config_to_dict
+from neeco.training.schedule import Part, ScheduleConfig
+
+ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
+
+
+def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """`training_config` of a method or of a variant: METHOD+dta turns every part of the paper's dynamic training
+    adjustment on; `assignments` may turn single ones off again.
+
+    A part without an effect on the method (noise, where nothing is encoded) has none. Raises NeecoError for an unknown
+    variant, and for one that is the method itself.
+    """
+    method, plus, _ = name.partition("+")
+    if not plus:
+        return training_config(method, values, assignments)
+    if not name.endswith(ADJUSTED) or name.count("+") > 1:
+        raise NeecoError(f"--method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
+    if is_field(method):
+        raise NeecoError(
+            f"--method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
+        )
+    base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
+    adjusted = with_fields(base, on)
+    if adjusted == base:
+        raise NeecoError(f"--method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
+    return _configured(adjusted, values, assignments)
+
+
+def schedule_parts() -> tuple[str, ...]:
+    """Names of the schedule's fields that are parts of the dynamic training adjustment."""
+    return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
 def training_config(method: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
@@ -20,8 +52,13 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
 
     Raises NeecoError naming the option when a name is unknown or a value does not fit.
     """
+    return _configured(method_defaults(method), values, assignments)
+
+
+def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Sequence[str]) -> TrainConfig:
+    """`base` changed and checked as `training_config` says."""
     given = {name: value for name, value in values.items() if value is not None}
-    config = dataclasses.replace(method_defaults(method), **given)
+    config = dataclasses.replace(base, **given)
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
@@ -35,10 +72,27 @@ def training_config(method: str, values: Mapping[str, Any], assignments: Sequenc
         raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+    _check_published_steps(config)
+    if config.initial_points is not None and config.initial_points < 1:
+        raise NeecoError(f"--set initial_points: {config.initial_points} is too small; give at least 1")
     for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
     return config
+
+
+def _check_published_steps(config: TrainConfig) -> None:
+    """A schedule scales with the run's length, which has to be known."""
+    steps = config.schedule.published_steps
+    if steps is None:
+        return
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
+    if config.minutes is not None:
+        raise NeecoError(
+            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
+            "open; give --iterations alone"
+        )
 
 
 def _assign(plain: dict[str, Any], assignment: str) -> None:

@@ -14,7 +14,7 @@ from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.raster import Rendering, rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation
+from neeco.scene.deformations.base import UNPERTURBED, Perturbation, floored_decay
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig, decayed
 from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
@@ -34,7 +34,6 @@ GAUSSIAN_RATES = {
 }
 LIGHT_RATE = 3e-3
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
-MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
 
@@ -64,7 +63,7 @@ class Session:
     window: list[StepResult] = field(default_factory=list)  # steps since the last row of metrics.jsonl
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(self.config.schedule)
+        self.schedule = Schedule(self.config.schedule, self.config.iterations)
         self.statistics = GradientStatistics(len(self.scene.canonical))
         self.scene.requires_grad_(True)
         self.scene.registration.requires_grad_(self.config.refine.registration)
@@ -144,13 +143,14 @@ class Session:
             and self.rng.random() < self.config.shaft_roll
         ):
             roll = float(self.rng.uniform(-math.pi, math.pi))
-        return Perturbation(roll, noise) if roll or noise else UNPERTURBED
+        time_noise = self.scene.deformation.time_noise(progress)
+        return Perturbation(roll, noise, time_noise) if roll or noise or time_noise else UNPERTURBED
 
     def _sharpens(self) -> bool:
         return self.config.label_sharpness > 0 and self.iteration > 1000 and bool(self.scene.label_names)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor:
-        """Sparse instruments, sharp labels, small corrections."""
+        """Sparse instruments, sharp labels, small corrections, and what the method adds of its own."""
         total = torch.zeros(()) if penalty is None else penalty
         canonical, config = self.scene.canonical, self.config
         if config.opacity_penalty > 0 and len(canonical.counts) > 1:
@@ -159,30 +159,33 @@ class Session:
         if rendering.channels is not None:
             label = rendering.channels[..., 0]
             total = total + config.label_sharpness * (label * (1 - label)).mean()
-        return total
+        deformation = self.scene.deformation
+        own = None if deformation.resting else deformation.regularisation(canonical)
+        return total if own is None else total + own
 
     def _learn(self, rendering: Rendering, index: int, progress: float) -> None:
         """One optimiser step on everything that has a gradient."""
         gradient = rendering.center_offsets.grad
         assert gradient is not None
         self.statistics.record(gradient, self.frames[index].camera.width, self.frames[index].camera.height)
-        scene, fall = self.scene, decayed(1.0, progress)
-        gaussian_rates = self.gaussian_rates
+        scene, gaussian_rates = self.scene, self.gaussian_rates
+        position_rate = POSITION_RATE * self.extent * decayed(1.0, progress)
         for name, tensor in scene.canonical.tensors().items():
-            rate = POSITION_RATE * self.extent * fall if name == "means" else gaussian_rates.get(name)
+            rate = position_rate if name == "means" else gaussian_rates.get(name)
             if rate is not None:
                 self.adam.step(name, tensor, rate)
-        rates = scene.deformation.learning_rates(self.iteration)
+        still = scene.deformation.resting or self.iteration < scene.deformation.learns_from
+        rates = scene.deformation.learning_rates(progress)
         for name, parameter in scene.deformation.named_parameters():
-            if rates[name] > 0 and not scene.deformation.resting:
-                self.adam.step(f"deformation.{name}", parameter, rates[name] * max(fall, MODULE_FLOOR))
+            if rates[name] > 0 and not still:
+                self.adam.step(f"deformation.{name}", parameter, rates[name])
             parameter.grad = None
         self.adam.step("falloff", scene.falloff, LIGHT_RATE)
         self.adam.step("vignette", scene.vignette, LIGHT_RATE)
-        self._learn_registration(fall)
+        self._learn_registration(progress)
         self.refinement.step(index, progress)
 
-    def _learn_registration(self, fall: float) -> None:
+    def _learn_registration(self, progress: float) -> None:
         """Adam on unit-free coordinates, so that radians and millimetres each move at their own rate."""
         registration = self.scene.registration
         if registration.grad is None:
@@ -194,13 +197,13 @@ class Session:
             before = registration.detach().clone()
             self.adam.step("registration", registration, 1.0)
             change = registration.detach() - before
-            registration.copy_(before + change * REGISTRATION_RATES * max(fall, MODULE_FLOOR))
+            registration.copy_(before + change * REGISTRATION_RATES * floored_decay(progress))
 
     def _control_density(self, progress: float) -> None:
         settings, config, scene = self.schedule.density(), self.config, self.scene
         if self.iteration % SETTLE_INTERVAL == 0:
             self.refinement.center()
-        if self.iteration < config.density_start:
+        if self.iteration < self.schedule.scaled(config.density_start):
             return
         grows = self.iteration % settings.interval == 0 and progress < config.density_stop
         if grows or (self.iteration % SETTLE_INTERVAL == 0 and progress < 0.95):

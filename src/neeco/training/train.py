@@ -16,8 +16,8 @@ from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_text
-from neeco.scene.io import save_scene
-from neeco.scene.methods import method_class
+from neeco.scene.io import pack_scene, save_scene
+from neeco.scene.methods import method_class, unmet_need
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
 from neeco.training.interrupt import StopRequest, hearing_stops
@@ -88,6 +88,7 @@ def train(
             _run(session, output, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
+            _check_finite(session)
             session.finish(log.note)
             save_scene(session.scene, output / "scene.safetensors")
         except KeyboardInterrupt:
@@ -138,6 +139,11 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
+    if unmet_need(config.method, capture):
+        raise NeecoError(
+            f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
+            "each frame its `time` in seconds), 3dgs does not"
+        )
     return capture, frames
 
 
@@ -168,6 +174,15 @@ def _run(session: TrainingSession, output: Path, log: _Log, stop: StopRequest, g
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
+
+
+def _check_finite(session: TrainingSession) -> None:
+    """Raises NeecoError when a number of the scene is not finite."""
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in pack_scene(session.scene)[0].values()):
+        raise NeecoError(
+            f"training: the scene holds numbers that are not finite after {session.iteration} iterations: it diverged, "
+            "though its image did not tell; train anew with another --seed or a milder schedule"
+        )
 
 
 class _Log:

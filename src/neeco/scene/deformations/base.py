@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -19,11 +20,15 @@ from neeco.scene.swept import SweptVolume
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
 PLAIN_TRAINING: Mapping[str, Any] = {
-    "schedule.density": "off",
+    "schedule.density_interval": "off",
+    "schedule.opacity_reset": "off",
+    "schedule.gradient_threshold": "off",
     "schedule.sh_order": "off",
     "schedule.frame_order": "off",
     "schedule.compensation": "off",
 }
+
+MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 
 
 @dataclass(frozen=True)
@@ -41,11 +46,14 @@ class Perturbation:
     """What training may disturb on purpose; drawing never does.
 
     `shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
-    looks the same). `state_noise`: standard deviation added to the encoded state (the paper's compensation).
+    looks the same). `state_noise`: standard deviation added to the encoded state, or the encoded time of a method that
+    knows the state by its time (the paper's compensation). `time_noise`: standard deviation added to the time, in mean
+    intervals between training frames (Deformable-3DGS). Normal numbers come from torch's own generator.
     """
 
     shaft_roll: float = 0.0
     state_noise: float = 0.0
+    time_noise: float = 0.0
 
 
 UNPERTURBED = Perturbation()
@@ -62,7 +70,7 @@ class Deltas:
 
 
 class Deformation(nn.Module):
-    """Base class. A method is one subclass in one file, with its own small config, and one line in `scene/methods.py`.
+    """Base class. A method is one subclass in one file, with its own small config; `method` is its name.
 
     It is made as `Method(instruments, **config)`. What training must know of a method, it asks here:
     `label_names` lists (instrument, part) for each label column; a deformation that cannot tell parts returns one part,
@@ -71,13 +79,17 @@ class Deformation(nn.Module):
     the method adds (`CanonicalGaussians.extras`) by name; an extra without one is not learned.
 
     `warm_up` is the share of the training in [0, 1) over which the deformation rests: training then holds its
-    parameters still and sets `resting`, which lets `pose` leave out what would change nothing.
+    parameters still and sets `resting`, which lets `pose` leave out what would change nothing. Before iteration
+    `learns_from` it only holds them still.
     """
 
+    method: ClassVar[str]
     label_names: tuple[tuple[str, str], ...] = ()
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     extra_rates: ClassVar[Mapping[str, float]] = {}
     needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
+    needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
+    learns_from: ClassVar[int] = 0
     warm_up: float = 0.0
     resting: bool = False
     large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
@@ -126,9 +138,35 @@ class Deformation(nn.Module):
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
         return {}
 
-    def learning_rates(self, iteration: int) -> dict[str, float]:
-        """Adam learning rate of each of this module's parameters at `iteration`, by name; 0 holds one still."""
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
         return {}
+
+    def regularisation(self, canonical: CanonicalGaussians) -> Tensor | None:
+        """A term added to the loss of every step, a scalar, or None; not asked while the deformation rests."""
+        return None
+
+    def time_noise(self, progress: float) -> float:
+        """`Perturbation.time_noise` of a training step; `progress` in [0, 1]."""
+        return 0.0
+
+
+def log_linear(first: float, last: float, progress: float) -> float:
+    """From `first` to `last` along a straight line of their logarithms (3DGS's learning rates); `progress` in
+    [0, 1]."""
+    return first * math.exp(math.log(last / first) * min(1.0, progress))
+
+
+def floored_decay(progress: float) -> float:
+    """What is left of a learning rate that falls to 3 % as the positions' does, but not below MODULE_FLOOR."""
+    return max(math.exp(math.log(0.03) * min(1.0, progress)), MODULE_FLOOR)
+
+
+def checked_warm_up(share: float) -> float:
+    """`share` itself. Raises NeecoError when it is not one of the training in [0, 1)."""
+    if not 0 <= share < 1:
+        raise NeecoError(f"deformation.warm_up: {share} is not a share of the training in [0, 1)")
+    return share
 
 
 def state_of(instrument: Instrument, state: State) -> InstrumentState:

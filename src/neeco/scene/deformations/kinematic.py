@@ -22,16 +22,17 @@ from neeco.scene.deformations.base import (
     Deltas,
     Perturbation,
     Posed,
+    floored_decay,
     state_of,
 )
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
-
-HINGE_START = 600  # iteration
 
 
 class Kinematic(Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
+    method = "kinematic"
+    learns_from = 600  # hinges hold still until Gaussians have taken shape around them, or unformed ones drag them off
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
         "schedule.sh_interval": 500,
@@ -161,8 +162,7 @@ class Kinematic(Deformation):
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
 
-    def learning_rates(self, iteration: int) -> dict[str, float]:
-        """Hinges hold still until the Gaussians have taken shape around them, or unformed ones would drag them off."""
+    def learning_rates(self, progress: float) -> dict[str, float]:
         rates = {
             "shaft_tilt": 8e-3,
             "shaft_shift": 8e-2,
@@ -172,9 +172,8 @@ class Kinematic(Deformation):
             "share": 6e-3,
             "scale": 2e-4,
         }
-        if iteration < HINGE_START:
-            rates = dict.fromkeys(rates, 0.0)
-        return {name: rates[name.rsplit(".", 1)[-1]] for name, _ in self.named_parameters()}
+        fall = floored_decay(progress)
+        return {name: rates[name.rsplit(".", 1)[-1]] * fall for name, _ in self.named_parameters()}
 
 
 def part_names(joints: tuple[str, ...]) -> tuple[str, ...]:

@@ -18,12 +18,19 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed, state_of
+from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations.base import (
+    UNPERTURBED,
+    Deformation,
+    Perturbation,
+    Posed,
+    checked_warm_up,
+    floored_decay,
+    state_of,
+)
 from neeco.scene.rotations import matrix_to_quat
 from neeco.scene.swept import SweptVolume
 
-MEMBERSHIP = "membership"
-STILL = 1e-6  # mm; what moves less does not move
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
@@ -49,6 +56,7 @@ class NPS(Deformation):
     that the instruments were recorded to sweep stay canonical without being evaluated; `gate` is that volume.
     """
 
+    method = "neeco"
     training_defaults: ClassVar[Mapping[str, Any]] = {}  # the paper's
     needs_instruments = True
     large_operations = True
@@ -74,8 +82,6 @@ class NPS(Deformation):
         gate_mm: float | None = None,
     ) -> None:
         super().__init__()
-        if not 0 <= warm_up < 1:
-            raise NeecoError(f"deformation.warm_up: {warm_up} is not a share of the training in [0, 1)")
         if gate_mm is not None and not gate_mm > 0:
             raise NeecoError(
                 f"deformation.gate_mm: {gate_mm} is not a positive distance in mm; leave it out for no gate"
@@ -95,7 +101,7 @@ class NPS(Deformation):
         }
         self.gate = None if gate_mm is None else SweptVolume(gate_mm)
         self.L_mean, self.L_state, self.identity, self.state_kind = L_mean, L_state, identity, state
-        self.half_precision, self.chunk, self.warm_up = half, chunk, warm_up
+        self.half_precision, self.chunk, self.warm_up = half, chunk, checked_warm_up(warm_up)
         size = self.state_size()
         self.register_buffer("state_center", torch.zeros(size))
         self.register_buffer("state_halfwidth", torch.ones(size))
@@ -114,7 +120,7 @@ class NPS(Deformation):
             self.state_skip = nn.Linear(state_inputs, width, bias=False)
         self.head = nn.Linear(width, 10)
         self._initialise()
-        self.label_names = (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
+        self.label_names = instrument_label(instruments)
 
     def _initialise(self) -> None:
         """He initialisation throughout, so that twelve layers carry gradient; the head starts at zero."""
@@ -210,38 +216,10 @@ class NPS(Deformation):
         return nn.functional.linear(features.float(), self.head.weight, self.head.bias)
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        """The moving Gaussians as found by `mark_moving`; nothing before that."""
-        if MEMBERSHIP not in canonical.extras or not self.label_names:
-            return torch.zeros(len(canonical), len(self.label_names))
-        return canonical.extras[MEMBERSHIP][:, None]
+        return moving_labels(canonical, self.label_names)
 
     def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
         return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
 
-    def learning_rates(self, iteration: int) -> dict[str, float]:
-        return {name: 8e-4 for name, _ in self.named_parameters()}
-
-
-@torch.no_grad()
-def mark_moving(deformation: NPS, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its
-    logarithm."""
-    moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
-    spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
-    size = spread.clamp_min(STILL).log()
-    evaluated = spread > STILL  # those behind the gate would be a second cluster of their own
-    threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
-    return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
-
-
-def otsu(values: Tensor, bins: int = 256) -> float:
-    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979)."""
-    low, high = float(values.min()), float(values.max())
-    if not high > low:
-        return high
-    counts = torch.histc(values.float(), bins, low, high)
-    centers = low + (torch.arange(bins) + 0.5) * (high - low) / bins
-    weight = counts.cumsum(0) / counts.sum()
-    mean = (counts * centers).cumsum(0) / counts.sum()
-    between = (mean[-1] * weight - mean).square() / (weight * (1 - weight)).clamp_min(1e-9)
-    return float(centers[between[:-1].argmax()] + (high - low) / (2 * bins))
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        return dict.fromkeys((name for name, _ in self.named_parameters()), 8e-4 * floored_decay(progress))

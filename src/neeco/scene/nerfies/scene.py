@@ -107,8 +107,6 @@ class NerfScene(nn.Module):
 
     def codes_at(self, codes: Tensor, times: Tensor) -> Tensor:
         """Codes [R, C] at `times` [R] s: linear between the training moments' codes [T, C], the nearest outside."""
-        if len(self.times) == 1:
-            return codes[:1].expand(len(times), -1)
         after = torch.searchsorted(self.times, times.double()).clamp(1, len(self.times) - 1)
         start, end = self.times[after - 1], self.times[after]
         share = ((times.double() - start) / (end - start)).clamp(0, 1).to(codes.dtype)[:, None]

@@ -76,6 +76,7 @@ class Nerfies:
 
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     needs_instruments: ClassVar[bool] = False
+    needs_times: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         may_be_zero = {"fine_samples", "appearance", "elastic_rays", "elastic_weight", "background_weight"}

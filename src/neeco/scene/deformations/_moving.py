@@ -1,0 +1,52 @@
+"""Which Gaussians are the instrument, of a method that moves them without knowing: those whose place varies."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Instrument, State
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations.base import Deformation
+
+MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
+STILL = 1e-6  # mm; what moves less does not move
+
+
+def instrument_label(instruments: tuple[Instrument, ...]) -> tuple[tuple[str, str], ...]:
+    """One label column, "instrument", for all instruments together; none without any."""
+    return (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
+
+
+def moving_labels(canonical: CanonicalGaussians, label_names: tuple[tuple[str, str], ...]) -> Tensor:
+    """The moving Gaussians [N, len(label_names)] as found by `mark_moving`; nothing before that."""
+    if MEMBERSHIP not in canonical.extras or not label_names:
+        return torch.zeros(len(canonical), len(label_names))
+    return canonical.extras[MEMBERSHIP][:, None]
+
+
+@torch.no_grad()
+def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+    """Store which Gaussians move over the recorded states [N] in {0, 1}: spread of d_mu above Otsu's threshold of its
+    logarithm."""
+    moved = torch.stack([deformation.deltas(canonical, state).means for state in states])  # [F, N, 3]
+    spread = (moved - moved.mean(0)).square().sum(-1).mean(0).sqrt()
+    size = spread.clamp_min(STILL).log()
+    evaluated = spread > STILL  # those behind the gate would be a second cluster of their own
+    threshold = otsu(size[evaluated]) if evaluated.any() else math.inf
+    return canonical.with_extras(**{MEMBERSHIP: (size > threshold).float()})
+
+
+def otsu(values: Tensor, bins: int = 256) -> float:
+    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979)."""
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return high
+    counts = torch.histc(values.float(), bins, low, high)
+    centers = low + (torch.arange(bins) + 0.5) * (high - low) / bins
+    weight = counts.cumsum(0) / counts.sum()
+    mean = (counts * centers).cumsum(0) / counts.sum()
+    between = (mean[-1] * weight - mean).square() / (weight * (1 - weight)).clamp_min(1e-9)
+    return float(centers[between[:-1].argmax()] + (high - low) / (2 * bins))

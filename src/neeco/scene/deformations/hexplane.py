@@ -1,0 +1,185 @@
+"""Planes over pairs of place and time (Wu et al. 2024, "4D Gaussian Splatting"), method `4dgs`.
+
+Six planes, xy xz yz and xt yt zt, in several resolutions of space (64, 128, ...) and one of time. A Gaussian's features
+are, in each resolution, the product of what it meets in the six, and all resolutions side by side; a small network with
+a head for each attribute makes (d_mu, d_r, d_s) of them, added before activation. L1 alone is the image loss; planes
+are kept smooth in space and time, and those with time near 1, where they change nothing.
+
+Where it departs from its source:
+- Static Gaussians alone for 3,000 of 17,000 iterations (the source's coarse stage) are a share of the run here, which
+  is shorter; so are the falling learning rates, 1.6e-3 to 1.6e-4 for planes and a tenth of both for the network.
+- The heads end in zeros, so that waking them changes nothing. The source starts them at random.
+- The planes span a cube about the sparse points that is a fifth wider than they are along their longest side: an
+  instrument moves before the tissue, where no points lie. The source takes the box of the points. Its scenes' half
+  extent is about 1; here the points' half extent is the unit of d_mu.
+- The source multiplies these rates by how far its cameras are spread, 4 to 5 in the units of D-NeRF's scenes. Here the
+  factor is `rate_scale`, 5, as Deformable-3DGS has it.
+- Time runs over the whole of its axis, from the first to the last training frame.
+- 16 channels, the smaller of the source's settings, for speed on a processor.
+- With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
+  xt yt zt at that time, one normal number per plane and channel.
+- The number of Gaussians has a ceiling (`tissue_budget`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Instrument, State
+from neeco.errors import NeecoError
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations._times import RecordedTimes
+from neeco.scene.deformations.base import (
+    PLAIN_TRAINING,
+    UNPERTURBED,
+    Deformation,
+    Perturbation,
+    Posed,
+    checked_warm_up,
+    log_linear,
+)
+
+MARGIN = 1.2  # the cube's side, in those of the points' longest
+SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_L1 = 1e-4, 1e-2, 1e-4  # weights of the regularisation
+
+
+class HexPlane(Deformation):
+    """Fields: `channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
+    resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests;
+    `rate_scale` multiplies the learning rates.
+    """
+
+    method = "4dgs"
+    training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.0}
+    needs_times = True
+    large_operations = True
+
+    center: Tensor
+    half_extent: Tensor
+
+    def __init__(
+        self,
+        instruments: tuple[Instrument, ...],
+        channels: int = 16,
+        resolution: int = 64,
+        levels: int = 2,
+        moments: int = 25,
+        width: int = 64,
+        warm_up: float = 3 / 17,
+        rate_scale: float = 5.0,
+    ) -> None:
+        super().__init__()
+        for name, value, least in (("resolution", resolution, 3), ("moments", moments, 3), ("levels", levels, 1)):
+            if value < least:
+                raise NeecoError(f"deformation.{name}: {value} is too small; give at least {least}")
+        self.instruments, self.warm_up = instruments, checked_warm_up(warm_up)
+        self._config = {
+            "channels": channels,
+            "resolution": resolution,
+            "levels": levels,
+            "moments": moments,
+            "width": width,
+            "warm_up": warm_up,
+            "rate_scale": rate_scale,
+        }
+        self.rate_scale = rate_scale
+        self.times = RecordedTimes()
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("half_extent", torch.ones(()))
+        sides = [resolution * 2**level for level in range(levels)]
+        self.space = nn.ParameterList(torch.empty(3, channels, side, side).uniform_(0.1, 0.5) for side in sides)
+        self.time = nn.ParameterList(torch.ones(3, channels, moments, side) for side in sides)
+        self.trunk = nn.Linear(channels * levels, width)
+        self.heads = nn.ModuleList(_head(width, size) for size in (3, 4, 3))
+        nn.init.xavier_uniform_(self.trunk.weight)
+        self.label_names = instrument_label(instruments)
+
+    def config(self) -> dict[str, Any]:
+        return dict(self._config)
+
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Time from 0 to 1 over the recording; the cube about the points [P, 3]."""
+        self.times.fit(states)
+        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
+        self.center = (low + high) / 2
+        self.half_extent = (high - low).max() / 2
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        if self.resting:
+            return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
+        places = (canonical.means - self.center) / (MARGIN * self.half_extent)
+        rows = self.rows_at(self.times.share(state, perturbation), perturbation.state_noise)
+        hidden = self.trunk(self.features(places, rows))
+        d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
+        scales = (canonical.log_scales + d_scales).exp()
+        return Posed(canonical.means + self.half_extent * d_means, canonical.quats + d_quats, scales)
+
+    def rows_at(self, time: Tensor, noise: float = 0.0) -> list[Tensor]:
+        """The planes xt yt zt at `time`, a scalar in [0, 1]: [3, C, side] per resolution. `noise` is the standard
+        deviation of the compensation."""
+        rows = []
+        for plane in self.time:
+            last = plane.shape[2] - 1
+            place = time.to(plane.dtype).clamp(0, 1) * last
+            below = min(int(place), last - 1)
+            row = torch.lerp(plane[:, :, below], plane[:, :, below + 1], place - below)
+            rows.append(row + noise * torch.randn(*row.shape[:2], 1) if noise > 0 else row)
+        return rows
+
+    def features(self, places: Tensor, rows: list[Tensor]) -> Tensor:
+        """[N, levels * C] of places [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
+        pairs = torch.stack([places[:, [0, 1]], places[:, [0, 2]], places[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
+        across = places.T[:, None, :, None]
+        lines = torch.cat([across, torch.zeros_like(across)], -1)  # [3, 1, N, 2]
+        found = []
+        for plane, row in zip(self.space, rows, strict=True):
+            space, time = _sample(plane, pairs), _sample(row[:, :, None], lines)  # [3, C, N]
+            found.append(space[0] * space[1] * space[2] * time[0] * time[1] * time[2])
+        return torch.cat(found).T
+
+    def regularisation(self, canonical: CanonicalGaussians) -> Tensor:
+        """Second differences squared, of the planes of space and along time, and the distance of time's from 1."""
+        total = torch.zeros(())
+        for space, time in zip(self.space, self.time, strict=True):
+            smooth, steady = _curvature(space), _curvature(time)
+            near_one = 3 * (1 - time).abs().mean()
+            total = total + SPACE_SMOOTHNESS * smooth + TIME_SMOOTHNESS * steady + TIME_L1 * near_one
+        return total
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        return moving_labels(canonical, self.label_names)
+
+    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
+
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        network = self.rate_scale * log_linear(1.6e-4, 1.6e-5, progress)
+        planes = 10 * network
+        return {
+            name: planes if name.startswith(("space.", "time.")) else network for name, _ in self.named_parameters()
+        }
+
+
+def _head(width: int, size: int) -> nn.Sequential:
+    """Two layers from [N, width] to [N, size], the last one zero."""
+    inner, last = nn.Linear(width, width), nn.Linear(width, size)
+    nn.init.xavier_uniform_(inner.weight)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.ReLU(), inner, nn.ReLU(), last)
+
+
+def _sample(planes: Tensor, places: Tensor) -> Tensor:
+    """Bilinear: planes [3, C, H, W] at places [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
+    [3, C, N]."""
+    return nn.functional.grid_sample(planes, places, align_corners=True, padding_mode="border")[:, :, 0]
+
+
+def _curvature(planes: Tensor) -> Tensor:
+    """Mean squared second difference of planes [3, C, H, W] along H, summed over the three."""
+    return 3 * planes.diff(n=2, dim=2).square().mean()

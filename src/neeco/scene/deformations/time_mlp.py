@@ -1,0 +1,147 @@
+"""A network over place and time (Yang et al. 2024, "Deformable 3D Gaussians"), method `deformable-3dgs`.
+
+(d_mu, d_r, d_s) = F(gamma(mu), gamma(t)): 8 layers of 256, the input given again after the fifth (layer 4, counted from
+0), gamma(x) = (x, sin 2^k x, cos 2^k x) with 10 octaves for both; means detached; rotation added to the unit quaternion
+and scale to the scale itself, that is after activation; normal noise on the time of training frames, falling from a
+tenth of the frame interval to none at half of the run. `synthetic` is the source's variant for D-NeRF: 6 octaves of
+time through a small network 13 -> 256 -> 30, and no noise.
+
+Where it departs from its source:
+- What the source counts in iterations of its 40,000 are shares of the run here, which is shorter: rest over the first
+  3,000, density control until 15,000, noise until 20,000, and the learning rate's whole fall from 8e-4 to 1.6e-6.
+- The head starts at zero, so that waking the network changes nothing. The source starts it at small random numbers.
+- The source computes in the units of its scenes, whose half extent is about 1. Here the points' half extent is the
+  unit, for what goes in and for the changes of mean and scale.
+- A scale that its change would make negative is taken as positive; in the source, too, the covariance squares it.
+- The number of Gaussians has a ceiling (`tissue_budget`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Instrument, State
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations._times import RecordedTimes
+from neeco.scene.deformations.base import (
+    PLAIN_TRAINING,
+    UNPERTURBED,
+    Deformation,
+    Perturbation,
+    Posed,
+    checked_warm_up,
+    log_linear,
+)
+
+DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
+FIRST_NOISE, NOISE_SHARE = 0.1, 0.5  # of the frame interval; share of the run at which none is left
+
+
+def octaves(values: Tensor, count: int) -> Tensor:
+    """gamma: [..., D] to [..., D * (1 + 2 count)], (x, sin(2^k x), cos(2^k x)) for k < count."""
+    angles = (values[..., None] * 2.0 ** torch.arange(count, dtype=values.dtype)).flatten(-2)
+    return torch.cat([values, angles.sin(), angles.cos()], -1)
+
+
+class TimeMLP(Deformation):
+    """Fields: `width` and the octaves `L_mean`, `L_time` as published; `synthetic`: the variant for D-NeRF's data.
+
+    `warm_up`: share of the training over which the network rests.
+    """
+
+    method = "deformable-3dgs"
+    training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2, "density_stop": 0.375}
+    needs_times = True
+    large_operations = True
+
+    mean_center: Tensor
+    mean_halfwidth: Tensor
+
+    def __init__(
+        self,
+        instruments: tuple[Instrument, ...],
+        width: int = 256,
+        L_mean: int = 10,
+        L_time: int | None = None,
+        synthetic: bool = False,
+        warm_up: float = 0.075,
+    ) -> None:
+        super().__init__()
+        self.instruments = instruments
+        self.L_mean, self.L_time = L_mean, (6 if synthetic else 10) if L_time is None else L_time
+        self.synthetic, self.warm_up = synthetic, checked_warm_up(warm_up)
+        self._config = {"width": width, "L_mean": L_mean, "L_time": L_time, "synthetic": synthetic, "warm_up": warm_up}
+        self.times = RecordedTimes()
+        self.register_buffer("mean_center", torch.zeros(3))
+        self.register_buffer("mean_halfwidth", torch.ones(()))
+        self.mean_inputs, time_inputs = 3 * (1 + 2 * L_mean), 1 + 2 * self.L_time
+        if synthetic:
+            self.time_net = nn.Sequential(nn.Linear(time_inputs, 256), nn.ReLU(), nn.Linear(256, 30))
+            time_inputs = 30
+        inputs = self.mean_inputs + time_inputs
+        sizes = [inputs] + [width + inputs if index == SKIP + 1 else width for index in range(1, DEPTH)]
+        self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+        self.head = nn.Linear(width, 10)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+        self.label_names = instrument_label(instruments)
+
+    def config(self) -> dict[str, Any]:
+        return dict(self._config)
+
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Time from 0 to 1 over the recording, mu from -1 to 1 over the points."""
+        self.times.fit(states)
+        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
+        self.mean_center = (low + high) / 2
+        self.mean_halfwidth = (high - low).max() / 2
+
+    def time_noise(self, progress: float) -> float:
+        return 0.0 if self.synthetic else FIRST_NOISE * max(0.0, 1 - progress / NOISE_SHARE)
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        scales = canonical.log_scales.exp()
+        if self.resting:
+            return Posed(canonical.means, canonical.quats, scales)
+        places = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
+        change = self.network(places, self.encoded_time(state, perturbation))
+        means = canonical.means + self.mean_halfwidth * change[:, :3]
+        quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
+        return Posed(means, quats, (scales + self.mean_halfwidth * change[:, 7:]).abs())
+
+    def encoded_time(self, state: State, perturbation: Perturbation) -> Tensor:
+        """gamma(t) [E]; the compensation of the dynamic training adjustment is added to it."""
+        encoded = octaves(self.times.share(state, perturbation)[None], self.L_time)
+        if perturbation.state_noise > 0:
+            encoded = encoded + perturbation.state_noise * torch.randn_like(encoded)
+        return self.time_net(encoded) if self.synthetic else encoded
+
+    def network(self, places: Tensor, encoded_time: Tensor) -> Tensor:
+        """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
+        encoded = octaves(places, self.L_mean)
+        features = encoded
+        for index, layer in enumerate(self.layers):
+            assert isinstance(layer, nn.Linear)
+            if index == SKIP + 1:
+                features = torch.cat([encoded, features], 1)
+            weight: Tensor = layer.weight
+            bias: Tensor = layer.bias
+            if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
+                timeless = features.shape[1]
+                weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
+            features = torch.relu(nn.functional.linear(features, weight, bias))
+        return self.head(features)
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        return moving_labels(canonical, self.label_names)
+
+    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
+        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
+
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        return dict.fromkeys((name for name, _ in self.named_parameters()), log_linear(8e-4, 1.6e-6, progress))
