@@ -21,6 +21,7 @@ WITH_BAD_PATH = {
     "evaluate": [MISSING],
     "render": [MISSING, "--output", "drawn"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
+    "ablate": [MISSING, "--output", "ablated"],
     "demo": ["--output", "taken"],
 }
 
