@@ -21,6 +21,7 @@ WITH_BAD_PATH = {
     "evaluate": [MISSING],
     "render": [MISSING, "--output", "drawn"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
+    "score-masks": [MISSING, MISSING],
     "demo": ["--output", "taken"],
 }
 

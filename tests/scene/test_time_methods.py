@@ -32,12 +32,11 @@ def scene(request: pytest.FixtureRequest) -> Scene:
 
 
 def woken(deformation: Deformation) -> Deformation:
-    """The same with its zeroed layers at random, as after some training."""
+    """The same with random numbers added to all it learns, as after some training."""
     torch.manual_seed(1)
     with torch.no_grad():
         for parameter in deformation.parameters():
-            if not parameter.any():
-                parameter.normal_(0, 0.1)
+            parameter += 0.1 * torch.randn(parameter.shape)
     return deformation
 
 
@@ -106,11 +105,11 @@ def test_the_noise_on_the_time_is_the_published_share_of_an_interval() -> None:
 def test_the_networks_have_their_published_sizes_and_rates() -> None:
     real, synthetic = TimeMLP(()), TimeMLP((), synthetic=True)
     assert [layer.in_features for layer in real.layers] == [84, *(256,) * 4, 340, 256, 256]
-    assert [layer.in_features for layer in synthetic.layers][0] == 63 + 30
+    assert next(layer.in_features for layer in synthetic.layers) == 63 + 30
     assert [layer.in_features for layer in synthetic.time_net if hasattr(layer, "in_features")] == [13, 256]
     assert real.learning_rates(0.0)["head.weight"] == pytest.approx(8e-4)
     assert real.learning_rates(1.0)["head.weight"] == pytest.approx(1.6e-6)
-    planes = HexPlane(())
+    planes = HexPlane((), rate_scale=1.0)
     assert [tuple(plane.shape) for plane in planes.space] == [(3, 16, 64, 64), (3, 16, 128, 128)]
     assert [tuple(plane.shape) for plane in planes.time] == [(3, 16, 25, 64), (3, 16, 25, 128)]
     assert planes.learning_rates(0.0)["time.1"] == pytest.approx(1.6e-3)

@@ -257,8 +257,14 @@ def test_render_writes_image_part_ids_and_mask_for_every_view(run, tmp_path, sta
     rendered = render(run.scene, state_views(run.scene, given), tmp_path / "out")
     assert rendered.images == 2
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        f"00000{k}{end}" for k in (0, 1) for end in (".png", "_parts.png", "_mask.png")
+        "parts.json",
+        *(f"00000{k}{end}" for k in (0, 1) for end in (".png", "_parts.png", "_mask.png")),
     }
+    named = json.loads((tmp_path / "out/parts.json").read_text())["ids"]
+    assert [(entry["id"], entry["part"]) for entry in named] == [
+        (0, "tissue"),
+        *((index + 1, part) for index, (_, part) in enumerate(run.scene.label_names)),
+    ]
     parts, mask = pixels(tmp_path / "out/000000_parts.png"), pixels(tmp_path / "out/000000_mask.png")
     assert set(np.unique(parts)) == {0, 1, 2}
     assert ((parts > 0) * 255 == mask).all()

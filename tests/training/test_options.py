@@ -10,7 +10,8 @@ import yaml
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.scene.methods import METHODS, make_deformation
-from neeco.training.options import training_config
+from neeco.training.config import method_defaults
+from neeco.training.options import schedule_parts, training_config, variant_config
 from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
 
 ROD = (Instrument("rod"),)
@@ -19,11 +20,11 @@ ROD = (Instrument("rod"),)
 @pytest.mark.parametrize("method", list(METHODS))
 def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
-    config = training_config(method, values, ["schedule.density=inverse", "refine.cameras=true"])
+    config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
     assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
     write_config(tmp_path, tmp_path / "capture", config)
     assert config_from_dict(read_config(tmp_path)) == config
-    assert config.schedule.density == "inverse"
+    assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
 
 
@@ -41,8 +42,8 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("deformation.speed=2", "method kinematic has no such field"),
         ("method=3dgs", "use --method"),
         ("joints=jaw_angle", r"'jaw_angle' is not a list; write \[jaw_angle\]"),
-        ("schedule.density=true", "'true' is none of on, off, inverse"),
-        ("schedule.density=sometimes", "'sometimes' is none of on, off, inverse"),
+        ("schedule.opacity_reset=true", "'true' is none of on, off, inverse"),
+        ("schedule.opacity_reset=sometimes", "'sometimes' is none of on, off, inverse"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(assignment: str, named: str) -> None:
@@ -75,10 +76,21 @@ def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
     assert drafts.config()["state"] == "rotation_jaw"
 
 
+@pytest.mark.parametrize("steps", ["0", "many", "2.5", "true"])
+def test_a_schedule_is_stated_for_a_whole_number_of_steps(steps: str) -> None:
+    with pytest.raises(NeecoError, match=r"published_steps: .* is not a positive whole number"):
+        training_config("neeco", {}, [f"schedule.published_steps={steps}"])
+
+
+def test_a_schedule_cannot_scale_to_a_run_of_unknown_length() -> None:
+    with pytest.raises(NeecoError, match=r"published_steps: .*give --iterations alone"):
+        training_config("neeco", {"minutes": 1.0}, ["schedule.published_steps=20000"])
+
+
 @pytest.mark.parametrize("value", ["on", "off", "inverse"])
 @pytest.mark.parametrize("method", ["neeco", "kinematic"])
 def test_every_part_of_the_schedule_takes_the_words_the_manual_names(method: str, value: str) -> None:
-    assert training_config(method, {}, [f"schedule.density={value}"]).schedule.density == value
+    assert training_config(method, {}, [f"schedule.opacity_reset={value}"]).schedule.opacity_reset == value
 
 
 @pytest.mark.parametrize(
@@ -99,3 +111,39 @@ def test_a_run_of_no_length_is_refused(values: dict) -> None:
 def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: int) -> None:
     with pytest.raises(NeecoError, match=f"--{name.replace('_', '-')}: {value} is too small"):
         training_config("kinematic", {name: value})
+
+
+@pytest.mark.parametrize("method", ["3dgs", "deformable-3dgs", "4dgs", "kinematic"])
+def test_a_variant_turns_every_part_of_the_adjustment_on_and_nothing_else(method: str) -> None:
+    plain = config_to_dict(variant_config(method, {"seed": 3}))
+    adjusted = config_to_dict(variant_config(f"{method}+dta", {"seed": 3}))
+    assert plain == config_to_dict(training_config(method, {"seed": 3}))
+    assert {plain["schedule"].pop(part) for part in schedule_parts()} == {"off"}
+    assert {adjusted["schedule"].pop(part) for part in schedule_parts()} == {"on"}
+    assert adjusted == plain
+    assert adjusted["method"] == method
+
+
+def test_parts_of_the_adjustment_are_those_that_take_on_off_and_inverse() -> None:
+    plain = config_to_dict(method_defaults("neeco"))["schedule"]
+    assert schedule_parts() == tuple(name for name, value in plain.items() if value == "on")
+
+
+def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
+    config = variant_config("4dgs+dta", {}, ["schedule.compensation=off"])
+    assert (config.schedule.compensation, config.schedule.frame_order) == ("off", "on")
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("neeco+dta", "neeco trains with the dynamic adjustment by itself; leave out"),
+        ("4dgs+dat", r"'4dgs\+dat' is unknown; the one variant of a method is METHOD\+dta"),
+        ("4dgs+dta+dta", "is unknown"),
+        ("4dgs+", "is unknown"),
+        ("5dgs+dta", "'5dgs' is unknown; choose one of kinematic"),
+    ],
+)
+def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
+    with pytest.raises(NeecoError, match=f"--method: .*{named}"):
+        variant_config(name, {})

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from neeco.training.schedule import GAUSSIAN_SPLATTING, DensityPhase, Schedule, ScheduleConfig, order_by_pose
+from neeco.training.schedule import GAUSSIAN_SPLATTING, DensityPhase, Part, Schedule, ScheduleConfig, order_by_pose
 
 SPARSE, DENSE = DensityPhase(500, 10_000, 4e-4), DensityPhase(200, 3_000, 2e-4)
 
@@ -20,10 +22,33 @@ def in_phase_2(config: ScheduleConfig | None = None, began: int = 2000) -> Sched
     ("part", "first", "second"),
     [("on", SPARSE, DENSE), ("inverse", DENSE, SPARSE), ("off", GAUSSIAN_SPLATTING, GAUSSIAN_SPLATTING)],
 )
-def test_density_constants(part: str, first: DensityPhase, second: DensityPhase) -> None:
-    config = ScheduleConfig(density=part)
-    assert Schedule(config).density() == first
-    assert in_phase_2(config).density() == second
+@pytest.mark.parametrize(
+    ("name", "constant"),
+    [("density_interval", "interval"), ("opacity_reset", "opacity_reset"), ("gradient_threshold", "threshold")],
+)
+def test_each_part_of_density_control_switches_alone(
+    name: str, constant: str, part: Part, first: DensityPhase, second: DensityPhase
+) -> None:
+    config = ScheduleConfig(**{name: part})
+    assert Schedule(config).density() == replace(SPARSE, **{constant: getattr(first, constant)})
+    assert in_phase_2(config).density() == replace(DENSE, **{constant: getattr(second, constant)})
+
+
+def test_a_schedule_stated_for_more_steps_scales_with_the_run() -> None:
+    config = ScheduleConfig(published_steps=20_000)
+    schedule = Schedule(config, 2_000)
+    assert schedule.density() == DensityPhase(50, 1_000, 4e-4)
+    assert settle(schedule, 2_000) == 100  # `earliest`, a tenth; the moving averages are 20 steps long
+    degrees = [schedule.sh_degree(i) for i in (199, 200, 300, 1_000)]
+    assert degrees == [0, 1, 2, 3]
+    assert Schedule(config, 20_000).density() == SPARSE
+    assert Schedule(config, 20).density().interval == 1
+
+
+def test_no_opacity_reset_stays_none_however_short_the_run() -> None:
+    plain = DensityPhase(200, 0, 2e-4)
+    config = ScheduleConfig(opacity_reset="off", plain_density=plain, published_steps=20_000)
+    assert Schedule(config, 100).density().opacity_reset == 0
 
 
 def test_colour_is_flat_in_phase_1_and_gains_an_order_every_thousand_in_phase_2() -> None:

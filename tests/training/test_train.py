@@ -10,19 +10,26 @@ import pytest
 
 import neeco.training.session
 from neeco.errors import NeecoError
-from neeco.training.options import training_config
+from neeco.training.options import training_config, variant_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
 pytestmark = pytest.mark.usefixtures("short_intervals")
 
 
+SMALL = {
+    "neeco": ["deformation.width=16", "deformation.depth=2"],
+    "deformable-3dgs+dta": ["deformation.width=16"],
+    "4dgs": ["deformation.resolution=8", "deformation.width=8"],
+    "4dgs+dta": ["deformation.resolution=8", "deformation.width=8"],
+}
+
+
 def config_of(method: str):
-    small = ["deformation.width=16", "deformation.depth=2"] if method == "neeco" else []
-    return training_config(method, {"iterations": 60}, [*small, "density_start=10", "density_stop=0.9"])
+    return variant_config(method, {"iterations": 60}, [*SMALL.get(method, []), "density_start=10", "density_stop=0.9"])
 
 
-@pytest.mark.parametrize("method", ["3dgs", "neeco"])
+@pytest.mark.parametrize("method", ["3dgs", "neeco", "deformable-3dgs+dta", "4dgs"])
 def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path) -> None:
     scenes = [train(capture, tmp_path / name, config_of(method)) / "scene.safetensors" for name in ("a", "b")]
     assert scenes[0].read_bytes() == scenes[1].read_bytes()
@@ -31,8 +38,11 @@ def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path
     assert rows[-1]["psnr"] > rows[0]["psnr"]
 
 
-@pytest.mark.parametrize("method", ["3dgs", "neeco"])
-@pytest.mark.parametrize("stop", [10, 35, 55])
+@pytest.mark.parametrize(
+    ("method", "stop"),
+    [(method, stop) for method in ("3dgs", "neeco") for stop in (10, 35, 55)]
+    + [("deformable-3dgs+dta", 35), ("4dgs+dta", 35)],
+)
 def test_an_interrupted_run_ends_in_the_same_bytes(method: str, stop: int, capture: Path, tmp_path: Path) -> None:
     def interrupt(row: ProgressRow) -> None:
         if row.iteration == stop and not row.note:

@@ -21,21 +21,36 @@ def read_image(path: Path, size: tuple[int, int] | None = None, background: floa
     Grey, 16-bit and palette images become RGB; transparent pixels show `background` (0 black, 1 white).
     `size`: (width, height) the image must have. Raises NeecoError when unreadable, damaged or of another size.
     """
-    return torch.from_numpy(_to_rgb(_decode(Path(path), size), background))
+    return torch.from_numpy(_to_rgb(open_image(path, size), background))
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """A loss mask as bool [H, W]: False where the stored image is black (darker than half). Raises NeecoError."""
-    grey = _to_rgb(_decode(Path(path), size), background=0.0).mean(axis=2)
+    grey = _to_rgb(open_image(path, size), background=0.0).mean(axis=2)
     return torch.from_numpy(grey >= 0.5)
 
 
 def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """Part ids as uint8 [H, W] from an 8-bit grey or palette PNG. Raises NeecoError."""
-    image = _decode(Path(path), size)
+    image = open_image(path, size)
     if image.mode not in ("L", "P"):
         raise NeecoError(f"{path}: expected an 8-bit image of part ids, found mode {image.mode}; save it as grey PNG")
     return torch.from_numpy(np.array(image, dtype=np.uint8))
+
+
+def open_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
+    """An image file, decoded, in its own mode. `size`: (width, height) it must have. Raises NeecoError."""
+    path = Path(path)
+    try:
+        with Image.open(path) as image:
+            image.load()
+    # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    if size is not None and image.size != tuple(size):
+        found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
+        raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
+    return image
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -68,19 +83,6 @@ def write_labels(path: Path, labels: Tensor) -> None:
         raise ValueError(f"labels must be uint8 [H, W], got {labels.dtype} {tuple(labels.shape)}")
     pixels = labels.detach().cpu().numpy()
     write_atomically(Path(path), lambda temporary: Image.fromarray(pixels, "L").save(temporary, format="PNG"))
-
-
-def _decode(path: Path, size: tuple[int, int] | None) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            image.load()
-    # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    if size is not None and image.size != tuple(size):
-        found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
-        raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
-    return image
 
 
 def _unreadable(path: Path, error: Exception) -> NeecoError:

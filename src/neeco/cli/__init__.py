@@ -25,7 +25,9 @@ VERBS = {
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
+    "score-masks": "Score a folder of masks, whoever made them, against the truth.",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
+    "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
@@ -92,10 +94,10 @@ def _dispatch(words: list[str]) -> int:
 
 def _verb(name: str) -> tuple[Callable[[Any], int], Callable[..., Any]]:
     """A verb's `run` and the dataclass of its arguments, which is what `run` takes."""
-    run = importlib.import_module(f"{__name__}.{name}").run
+    run = importlib.import_module(f"{__name__}.{name.replace('-', '_')}").run
     return run, next(iter(get_type_hints(run).values()))
 
 
 def _named_only(name: str, line: str) -> Callable[..., Any]:
     """Stands for a verb in the overview without importing it."""
-    return make_dataclass(name, [], namespace={"__doc__": line})
+    return make_dataclass(name.replace("-", "_"), [], namespace={"__doc__": line})

@@ -36,7 +36,7 @@ class Arguments:
     instrument_budget: int | None = None
     """Most Gaussians of each instrument."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Any other field of the training config, as NAME=VALUE (e.g. schedule.density=inverse); repeatable."""
+    """Any other field of the training config, as NAME=VALUE (e.g. schedule.opacity_reset=inverse); repeatable."""
 
 
 def run(args: Arguments) -> int:

@@ -15,6 +15,8 @@ from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.evaluation.labels import composited_parts
+from neeco.evaluation.mask_folders import PARTS_FILE
+from neeco.files import write_json
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.synthesis.samplers import make_sampler
@@ -71,7 +73,8 @@ def state_views(scene: Scene, path: Path) -> list[View]:
 def render(
     scene: Scene, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
 ) -> Rendered:
-    """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view. Raises NeecoError."""
+    """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
+    mean. Raises NeecoError."""
     channels = scene.label_channels() if scene.label_names else None
     done = 0
     with scene.deformation.torch_threads():
@@ -84,6 +87,11 @@ def render(
                 write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
             done += 1
             on_progress(done)
+    if channels is not None:
+        names = [
+            {"id": index + 1, "instrument": name, "part": part} for index, (name, part) in enumerate(scene.label_names)
+        ]
+        write_json(folder / PARTS_FILE, {"ids": [{"id": 0, "part": "tissue"}, *names]})
     return Rendered(folder, done, channels is not None)
 
 

@@ -32,6 +32,7 @@ class TrainConfig:
     seed: int = 0
     transforms: str = "transforms.json"
     tissue_budget: int = 20_000  # most Gaussians of the tissue
+    initial_points: int | None = None  # most sparse points to begin with; None: as many as the tissue may have
     instrument_budget: int = 4_000  # most Gaussians of each instrument
     ssim_weight: float = 0.1  # lambda of the paper
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)

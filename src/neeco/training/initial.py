@@ -67,10 +67,12 @@ def _backdrop(frames: tuple[Frame, ...]) -> float:
 
 
 def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [P, 3] mm and colours [P, 3] of at most `config.tissue_budget` sparse points."""
+    """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, or the tissue's
+    budget."""
     positions, colors = capture.points.positions, capture.points.colors
-    if len(positions) > config.tissue_budget:
-        chosen = np.random.default_rng(config.seed).choice(len(positions), config.tissue_budget, replace=False)
+    most = min(config.tissue_budget, config.initial_points or config.tissue_budget)
+    if len(positions) > most:
+        chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
     return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
 

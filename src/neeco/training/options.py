@@ -68,10 +68,27 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
         raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+    _check_published_steps(config)
+    if config.initial_points is not None and config.initial_points < 1:
+        raise NeecoError(f"--set initial_points: {config.initial_points} is too small; give at least 1")
     for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
     return config
+
+
+def _check_published_steps(config: TrainConfig) -> None:
+    """A schedule scales with the run's length, which has to be known."""
+    steps = config.schedule.published_steps
+    if steps is None:
+        return
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
+    if config.minutes is not None:
+        raise NeecoError(
+            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
+            "open; give --iterations alone"
+        )
 
 
 def _assign(plain: dict[str, Any], assignment: str) -> None:

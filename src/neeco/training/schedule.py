@@ -1,8 +1,8 @@
 """The paper's dynamic training adjustment: four settings that switch together when the scene has settled.
 
 Phase 1 looks for the coarse motion: sparse densification, low SH order, frames sorted by instrument pose, noise on the
-encoded state. Phase 2 refines. Each of the four parts can be turned off (3DGS's behaviour) or inverted (phases
-swapped), as the paper's ablations do.
+encoded state. Phase 2 refines. Each part can be turned off (3DGS's behaviour) or inverted (phases swapped), as the
+paper's ablations do; density control has three parts of its own, its interval, opacity reset and gradient threshold.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ GAUSSIAN_SPLATTING = DensityPhase(100, 3_000, 2e-4)
 class ScheduleConfig:
     """Which parts of the adjustment act, and the choices where the paper is silent."""
 
-    density: Part = "on"
+    density_interval: Part = "on"  # the paper's P_di
+    opacity_reset: Part = "on"  # P_oi
+    gradient_threshold: Part = "on"  # tau
     sh_order: Part = "on"
     frame_order: Part = "on"
     compensation: Part = "on"
@@ -45,32 +47,43 @@ class ScheduleConfig:
     latest_fraction: float = 0.4  # of the run; then phase 2 is forced
     sh_interval: int = 1_000  # iterations between SH orders in phase 2
     max_sh_degree: int = 3
-    plain_density: DensityPhase = GAUSSIAN_SPLATTING  # in force when `density` is off
+    plain_density: DensityPhase = GAUSSIAN_SPLATTING  # what the three parts of density control are when off
+    # Numbers of iterations here, in NEECO_PHASES and in TrainConfig.density_start are stated for a run of so many
+    # steps and scale with the run's length; None: they stand as they are, however short the run.
+    published_steps: int | None = None
 
 
 class Schedule:
-    """What to do at each iteration. `observe` after every step; everything else asks."""
+    """What to do at each iteration of a run of `iterations` steps. `observe` after every step; everything else asks."""
 
-    def __init__(self, config: ScheduleConfig) -> None:
+    def __init__(self, config: ScheduleConfig, iterations: int | None = None) -> None:
+        if config.published_steps is not None and iterations is None:
+            raise ValueError("a schedule stated for another number of steps needs the run's own")
         self.config = config
+        self.scale = 1.0 if config.published_steps is None else (iterations or 0) / config.published_steps
+        self.window = self.scaled(config.window)
         self.phase = 1
         self.phase_started = 0
         self.forced = False
-        self.history: deque[tuple[float, float]] = deque(maxlen=2 * config.window)
+        self.history: deque[tuple[float, float]] = deque(maxlen=2 * self.window)
+
+    def scaled(self, iterations: int) -> int:
+        """A number of iterations of the published run as one of this run; at least 1, but none (0) stays none."""
+        return max(1, round(iterations * self.scale)) if iterations else 0
 
     def observe(self, iteration: int, loss: float, psnr: float, progress: float) -> None:
         """Note one step's loss and PSNR; `progress` in [0, 1] is how much of the run is done. May begin phase 2."""
         self.history.append((loss, psnr))
         if self.phase == 2:
             return
-        ready = iteration >= self.config.earliest and self._settled()
+        ready = iteration >= self.scaled(self.config.earliest) and self._settled()
         late = progress >= self.config.latest_fraction
         if ready or late:
             self.phase, self.phase_started, self.forced = 2, iteration, not ready
 
     def _settled(self) -> bool:
         """PSNR's moving average is above the threshold and the loss fell from one window to the next."""
-        window = self.config.window
+        window = self.window
         if len(self.history) < 2 * window:
             return False
         values = np.array(self.history)
@@ -81,10 +94,16 @@ class Schedule:
         return self.phase if part == "on" else 3 - self.phase
 
     def density(self) -> DensityPhase:
-        """The density settings in force."""
-        if self.config.density == "off":
-            return self.config.plain_density
-        return NEECO_PHASES[self._acting_phase(self.config.density)]
+        """The density settings in force, in iterations of this run."""
+        config = self.config
+        return DensityPhase(
+            self.scaled(self._density_of(config.density_interval).interval),
+            self.scaled(self._density_of(config.opacity_reset).opacity_reset),
+            self._density_of(config.gradient_threshold).threshold,
+        )
+
+    def _density_of(self, part: Part) -> DensityPhase:
+        return self.config.plain_density if part == "off" else NEECO_PHASES[self._acting_phase(part)]
 
     def sh_degree(self, iteration: int) -> int:
         """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
@@ -93,7 +112,7 @@ class Schedule:
         if config.sh_order != "off" and self._acting_phase(config.sh_order) == 1:
             return 0
         since = 0 if config.sh_order == "off" else self.phase_started
-        return min(config.max_sh_degree, (iteration - since) // config.sh_interval)
+        return min(config.max_sh_degree, (iteration - since) // self.scaled(config.sh_interval))
 
     def state_noise(self, progress: float) -> float:
         """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in
@@ -122,7 +141,7 @@ class Schedule:
     def load_state_dict(self, state: dict) -> None:
         """The inverse of `state_dict`."""
         self.phase, self.phase_started, self.forced = state["phase"], state["phase_started"], state["forced"]
-        self.history = deque((tuple(pair) for pair in state["history"]), maxlen=2 * self.config.window)
+        self.history = deque((tuple(pair) for pair in state["history"]), maxlen=2 * self.window)
 
 
 def order_by_pose(states: np.ndarray) -> np.ndarray:

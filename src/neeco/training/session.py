@@ -67,7 +67,7 @@ class Session:
     window: list[StepResult] = field(default_factory=list)  # steps since the last row of metrics.jsonl
 
     def __post_init__(self) -> None:
-        self.schedule = Schedule(self.config.schedule)
+        self.schedule = Schedule(self.config.schedule, self.config.iterations)
         self.statistics = GradientStatistics(len(self.scene.canonical))
         self.scene.requires_grad_(True)
         self.scene.registration.requires_grad_(self.config.refine.registration)
@@ -200,7 +200,7 @@ class Session:
         settings, config, scene = self.schedule.density(), self.config, self.scene
         if self.iteration % SETTLE_INTERVAL == 0:
             self.refinement.center()
-        if self.iteration < config.density_start:
+        if self.iteration < self.schedule.scaled(config.density_start):
             return
         grows = self.iteration % settings.interval == 0 and progress < config.density_stop
         if grows or (self.iteration % SETTLE_INTERVAL == 0 and progress < 0.95):

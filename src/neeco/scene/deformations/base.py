@@ -20,7 +20,9 @@ from neeco.scene.swept import SweptVolume
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
 PLAIN_TRAINING: Mapping[str, Any] = {
-    "schedule.density": "off",
+    "schedule.density_interval": "off",
+    "schedule.opacity_reset": "off",
+    "schedule.gradient_threshold": "off",
     "schedule.sh_order": "off",
     "schedule.frame_order": "off",
     "schedule.compensation": "off",

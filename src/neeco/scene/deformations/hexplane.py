@@ -12,6 +12,8 @@ Where it departs from its source:
 - The planes span a cube about the sparse points that is a fifth wider than they are along their longest side: an
   instrument moves before the tissue, where no points lie. The source takes the box of the points. Its scenes' half
   extent is about 1; here the points' half extent is the unit of d_mu.
+- The source multiplies these rates by how far its cameras are spread, 4 to 5 in the units of D-NeRF's scenes. Here the
+  factor is `rate_scale`, 5, as Deformable-3DGS has it.
 - Time runs over the whole of its axis, from the first to the last training frame.
 - 16 channels, the smaller of the source's settings, for speed on a processor.
 - With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
@@ -48,7 +50,8 @@ SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_L1 = 1e-4, 1e-2, 1e-4  # weights of the 
 
 class HexPlane(Deformation):
     """Fields: `channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
-    resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests.
+    resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests;
+    `rate_scale` multiplies the learning rates.
     """
 
     method = "4dgs"
@@ -68,6 +71,7 @@ class HexPlane(Deformation):
         moments: int = 25,
         width: int = 64,
         warm_up: float = 3 / 17,
+        rate_scale: float = 5.0,
     ) -> None:
         super().__init__()
         for name, value, least in (("resolution", resolution, 3), ("moments", moments, 3), ("levels", levels, 1)):
@@ -81,7 +85,9 @@ class HexPlane(Deformation):
             "moments": moments,
             "width": width,
             "warm_up": warm_up,
+            "rate_scale": rate_scale,
         }
+        self.rate_scale = rate_scale
         self.times = RecordedTimes()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("half_extent", torch.ones(()))
@@ -152,7 +158,8 @@ class HexPlane(Deformation):
         return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        planes, network = log_linear(1.6e-3, 1.6e-4, progress), log_linear(1.6e-4, 1.6e-5, progress)
+        network = self.rate_scale * log_linear(1.6e-4, 1.6e-5, progress)
+        planes = 10 * network
         return {
             name: planes if name.startswith(("space.", "time.")) else network for name, _ in self.named_parameters()
         }

@@ -1,0 +1,103 @@
+"""`neeco ablate`: what each part of the methods is good for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from neeco.evaluation.experiments.jobs import JobNews
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Take parts of the methods away one by one, as the paper does and beyond; tables, figures and a page of both.
+
+    The same command again goes on where it was interrupted.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    """Capture folder."""
+    output: Path
+    """Folder for tables, report.html and the runs."""
+    tables: tuple[str, ...] = ("paper", "ours")
+    """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, labels,
+    frames, tracker-noise), or tables by name."""
+    iterations: int = 1_000
+    """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
+    kinematic_iterations: int | None = None
+    """Steps of every kinematic run, which cost less; by default as many, but at least 1,000."""
+    seed: int = 0
+    """Of every run, and of the noise put on tracker poses."""
+    workers: int = 1
+    """Runs at once (more than one needs neeco[cluster])."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Any other field of the training config, as NAME=VALUE (e.g. tissue_budget=4000), in every run; repeatable."""
+
+
+def run(args: Arguments) -> int:
+    """Run the ablations with a progress bar, write all files, print the verdicts."""
+    from neeco.evaluation.experiments.ablation_run import AblationPlan, run_ablations
+    from neeco.evaluation.experiments.ablation_tables import write_tables
+    from neeco.report.ablation_page import write_ablation_report
+    from neeco.synthesis.label_ways import score_label_ways
+
+    plan = AblationPlan(
+        args.capture,
+        args.output,
+        args.tables,
+        args.iterations,
+        args.kinematic_iterations,
+        args.seed,
+        args.transforms,
+        args.set,
+    )
+    with _Bar() as bar:
+        ablation = run_ablations(plan, score_label_ways, args.workers, bar.show)
+    write_tables(args.output, ablation)
+    page = write_ablation_report(args.output, ablation)
+    _print_verdicts(ablation)
+    print(f"report: {page}")
+    return 1 if ablation["failures"] else 0
+
+
+class _Bar:
+    """All runs as one bar on stderr; it appears with the first news, so that bad input ends in its one line alone."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = [BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()]
+        self.bar = Progress(*columns, console=Console(stderr=True))
+        self.task = self.bar.add_task("starting", total=None)
+        self.shares: dict[int, float] = {}
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar.live.is_started:
+            self.bar.stop()
+
+    def show(self, news: JobNews) -> None:
+        """One piece of news from the jobs; training counts as nine tenths of a run."""
+        self.bar.start()
+        share = {"training": 0.9 * news.share, "evaluating": 0.9 + 0.1 * news.share}.get(news.stage, 1.0)
+        self.shares[news.index] = share
+        text = f"run {news.index + 1} of {news.total}: {news.job.name}  {news.stage}  {news.text}"
+        self.bar.update(self.task, total=news.total, completed=sum(self.shares.values()), description=text)
+        if news.stage == "failed":
+            self.bar.console.print(f"failed: {news.job.name}: {news.text}", style="red", markup=False)
+
+
+def _print_verdicts(ablation: dict[str, Any]) -> None:
+    from neeco.evaluation.experiments.ablation_tables import agreement
+
+    for table in ablation["tables"]:
+        print(f"{table['title']}: {agreement(table) or 'our own, nothing published to compare with'}")

@@ -1,0 +1,101 @@
+"""`neeco score-masks`: how good a folder of masks is, whoever made it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Column, Table
+
+COLUMNS = (
+    ("IoU", "iou"),
+    ("Dice", "dice"),
+    ("boundary F", "boundary_f"),
+    ("box AP", "box_ap"),
+    ("box AP50", "box_ap50"),
+)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Score a folder of masks against the truth: IoU, Challenge IoU, Dice, boundary F and box AP, per part."""
+
+    predicted: Annotated[Path, tyro.conf.Positional]
+    """Folder of masks: PNG with part ids or 0/255, or what `neeco render` wrote."""
+    truth: Annotated[Path, tyro.conf.Positional]
+    """A capture (its truth/masks or reference_masks), or a folder of masks. Files are matched by name."""
+    splits: tuple[str, ...] | None = None
+    """Splits of the capture; default: those of which PREDICTED has an image."""
+    classes: tuple[str, ...] = ()
+    """What PREDICTED's ids mean, such as shaft=10 wrist=20; default: 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right."""
+    truth_classes: tuple[str, ...] = ()
+    """The same for TRUTH."""
+    components: bool = False
+    """Boxes about each connected group of pixels, not one per part."""
+    json: Path | None = None
+    """Also write the numbers to this file."""
+
+
+def run(arguments: Arguments) -> int:
+    """Score, print a table."""
+    from neeco.errors import NeecoError
+    from neeco.evaluation.mask_folders import parse_classes
+    from neeco.evaluation.mask_scores import score_masks
+    from neeco.files import new_folder, write_json
+    from neeco.synthesis.progress import counting
+
+    with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
+        if arguments.json is not None:
+            if arguments.json.is_dir():
+                raise NeecoError(f"--json: {arguments.json} is a folder; name a file")
+            checked.enter_context(new_folder(arguments.json.parent))
+        advance = checked.enter_context(counting("score masks"))
+        scores = score_masks(
+            arguments.predicted,
+            arguments.truth,
+            splits=arguments.splits,
+            classes=parse_classes(arguments.classes, "--classes"),
+            truth_classes=parse_classes(arguments.truth_classes, "--truth-classes"),
+            components=arguments.components,
+            progress=advance,
+        )
+        if arguments.json is not None:
+            write_json(arguments.json, scores)
+    console = Console()
+    console.print(_table(scores))
+    for line in _lines(scores):
+        console.print(line, markup=False, highlight=False)
+    for note in scores["notes"]:
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    return 0
+
+
+def _table(scores: dict[str, Any]) -> Table:
+    table = Table("part", *(Column(title, justify="right") for title, _ in COLUMNS), Column("images", justify="right"))
+    for part, numbers in {"instrument": scores["instrument"], **(scores["parts"] or {})}.items():
+        values = (numbers[key] for _, key in COLUMNS)
+        images = "-" if numbers["images"] is None else str(numbers["images"])
+        table.add_row(part, *("-" if value is None else f"{value:.3f}" for value in values), images)
+    return table
+
+
+def _lines(scores: dict[str, Any]) -> list[str]:
+    """The numbers that belong to no part."""
+
+    def shown(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    splits = f" of {', '.join(scores['splits'])}" if scores["splits"] else ""
+    challenge = shown(scores["instrument"]["challenge_iou"])
+    lines = [f"{scores['images']} images{splits}; Challenge IoU of the instrument {challenge}"]
+    if scores["classes"] is not None:
+        classes = scores["classes"]
+        lines[0] += f", of its parts {shown(classes['challenge_iou'])}"
+        lines.append(f"parts: IoU {shown(classes['isinet_iou'])}, mean class IoU {shown(classes['mean_class_iou'])}")
+    if scores["jaw_assignment"] == "swapped":
+        lines.append("left and right jaw are taken the other way round, which fits this folder better")
+    return lines

@@ -1,0 +1,232 @@
+"""`compare`: several methods on the same frames under the same budget, over several seeds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neeco import __version__
+from neeco.capture import Capture, read_capture
+from neeco.capture.check import check_capture, errors_only
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import EVALUATION_FILE
+from neeco.evaluation.experiments.cluster import threads_per_worker
+from neeco.evaluation.experiments.distance import distances_to_training
+from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, held_out_splits, run_jobs
+from neeco.evaluation.experiments.machine import machine
+from neeco.evaluation.experiments.speed import measure_speed
+from neeco.evaluation.experiments.summary import summarise
+from neeco.evaluation.experiments.tables import write_tables
+from neeco.evaluation.experiments.watching import CURVE_FILE, TOTALS
+from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
+from neeco.files import new_folder, read_json, write_json
+from neeco.scene.methods import deformation_class
+from neeco.training.config import TrainConfig
+from neeco.training.options import training_config
+from neeco.training.run import load_run
+
+COMPARISON_SCHEMA = "neeco-comparison/1"
+COMPARISON_FILE = "comparison.json"
+TRANSFORMS = "transforms.json"
+
+Progress = Callable[[JobNews], None]
+Stage = Callable[[str, int, int], None]  # what is done after the jobs, how many done, of how many
+
+
+@dataclass(frozen=True)
+class ComparisonSpec:
+    """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name."""
+
+    capture: Path
+    output: Path
+    methods: tuple[str, ...]
+    budget: Budget
+    seeds: int = 1
+    splits: tuple[str, ...] | None = None
+    lpips_weights: Path | None = None
+    workers: int = 1
+    masks: Mapping[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A checked specification, ready to work on."""
+
+    spec: ComparisonSpec
+    capture: Capture
+    jobs: tuple[Job, ...]
+    splits: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage | None = None) -> dict[str, Any]:
+    """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
+
+    Given again after an interruption, it goes on where it stopped; given again with more methods or seeds, it adds
+    them. A method that fails is told in its place. comparison.json is complete at every moment; `complete` says whether
+    all is in it. Raises NeecoError before any work for whatever cannot be compared.
+    """
+    plan = _plan(spec)
+    report = stage or (lambda what, done, total: None)
+    with new_folder(spec.output):
+        write_json(spec.output / COMPARISON_FILE, _document(plan, []))
+        results = run_jobs(plan.jobs, spec.workers, progress)
+        result = _document(plan, results)
+        result["speed"] = _speed(plan, results, report)
+        result["summary"] = summarise(_names(plan), plan.splits, results, result["speed"]["rows"])
+        result["complete"] = True
+        write_json(spec.output / COMPARISON_FILE, result)
+        write_tables(spec.output, result)
+    return result
+
+
+def job_folder(output: Path, name: str, seed: int) -> Path:
+    """The run folder of one job of a comparison."""
+    return output / "runs" / f"{name}-seed{seed}"
+
+
+def failures(comparison: Mapping[str, Any]) -> list[str]:
+    """`name, seed k: why` of every job that failed."""
+    return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
+
+
+def _plan(spec: ComparisonSpec) -> _Plan:
+    """Check everything that can be known before the work. Raises NeecoError."""
+    spec.budget.check()
+    if spec.seeds < 1:
+        raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
+    if spec.workers < 1:
+        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
+    configs = {name: _config(name) for name in spec.methods}
+    if not configs:
+        raise NeecoError("--methods: none is given; name at least one")
+    capture = _open_capture(spec.capture, configs)
+    networks = find_lpips(spec.lpips_weights)
+    _check_output(spec)
+    jobs = tuple(
+        Job(
+            name,
+            seed,
+            spec.capture,
+            job_folder(spec.output, name, seed),
+            config,
+            spec.budget,
+            spec.splits,
+            spec.lpips_weights,
+        )
+        for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
+        for name, config in configs.items()
+    )
+    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
+    return _Plan(spec, capture, jobs, held_out_splits(jobs[0]), tuple(notes))
+
+
+def _config(name: str) -> TrainConfig:
+    return training_config(name, {})
+
+
+def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:
+    problems = errors_only(check_capture(path, TRANSFORMS))
+    if problems:
+        raise NeecoError(f"{problems[0]}; `neeco check {path}` tells all")
+    capture = read_capture(path, TRANSFORMS)
+    if not capture.split("train"):
+        raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
+    for name, config in configs.items():
+        if deformation_class(config.method).needs_instruments and not capture.instruments:
+            raise NeecoError(f"--methods: {name} needs instrument states, which {path} has not; leave it out")
+    return capture
+
+
+def _check_output(spec: ComparisonSpec) -> None:
+    """Raises NeecoError when `output` holds something else, or the comparison of another capture or budget."""
+    output = spec.output
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give another --output")
+    if not output.is_dir() or not any(output.iterdir()):
+        return
+    file = output / COMPARISON_FILE
+    if not file.exists():
+        raise NeecoError(f"{output}: not empty, and no comparison; give another --output")
+    stored = read_json(file)
+    if not isinstance(stored, dict) or stored.get("schema") != COMPARISON_SCHEMA:
+        raise NeecoError(f"{file}: schema: is not {COMPARISON_SCHEMA}; give another --output")
+    if stored["capture"] != str(spec.capture.absolute()):
+        raise NeecoError(f"{file}: capture: compares methods on {stored['capture']}; give another --output")
+    if stored["budget"] != asdict(spec.budget):
+        before = Budget(**stored["budget"])
+        raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; give another --output")
+
+
+def _names(plan: _Plan) -> list[str]:
+    return list(dict.fromkeys([*plan.spec.methods, *plan.spec.masks]))
+
+
+def _document(plan: _Plan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """comparison.json as far as the jobs alone tell it."""
+    spec = plan.spec
+    threads = threads_per_worker(spec.workers) if spec.workers > 1 else None
+    methods: list[dict[str, Any]] = [
+        {"name": name, "method": config, "source": "train", "folder": "runs"}
+        for name, config in dict.fromkeys((job.name, job.config.method) for job in plan.jobs)
+    ]
+    methods += [
+        {"name": name, "method": None, "source": "masks", "folder": str(path.absolute())}
+        for name, path in spec.masks.items()
+    ]
+    return {
+        "schema": COMPARISON_SCHEMA,
+        "version": __version__,
+        "complete": False,
+        "capture": str(spec.capture.absolute()),
+        "machine": machine() | {"workers": spec.workers, "threads_per_worker": threads},
+        "budget": asdict(spec.budget),
+        "seeds": list(range(spec.seeds)),
+        "splits": list(plan.splits),
+        "methods": methods,
+        "jobs": list(results),
+        "summary": summarise(_names(plan), plan.splits, results),
+        "curves": _curves(plan.spec, results),
+        "distance": _distance(plan, results),
+        "speed": {"rows": []},
+        "notes": list(plan.notes)
+        + [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job],
+    }
+
+
+def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Held-out PSNR of every finished job at about ten moments; seconds on the budget's clock."""
+    rows = []
+    for job in (job for job in results if "error" not in job):
+        path = job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE
+        for line in path.read_text(encoding="utf-8").splitlines():
+            entry = json.loads(line)
+            row = {"name": job["name"], "seed": job["seed"], "seconds": entry[TOTALS[spec.budget.clock]]}
+            rows.append(row | {key: entry[key] for key in ("iteration", "split", "psnr")})
+    return rows
+
+
+def _distance(plan: _Plan, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Every held-out frame's scores beside its distance from the training states."""
+    distances = distances_to_training(plan.capture)
+    rows = []
+    for job in (job for job in results if "error" not in job):
+        folder = job_folder(plan.spec.output, job["name"], job["seed"])
+        frames = read_json(folder / EVALUATION_FILE)["per_frame"]["given"]
+        for split in (split for split in plan.splits if split != "train"):
+            for entry in frames[split]:
+                row = {"name": job["name"], "seed": job["seed"], "split": split, "frame": entry["frame"]}
+                row["distance"] = distances.get(entry["frame"])
+                rows.append(row | {key: entry[key] for key in ("psnr", "psnr_instrument", "mask_iou")})
+    return rows
+
+
+def _speed(plan: _Plan, results: Sequence[Mapping[str, Any]], report: Stage) -> dict[str, Any]:
+    finished = [(job["name"], job["seed"]) for job in results if "error" not in job]
+    runs = [(name, seed, load_run(job_folder(plan.spec.output, name, seed))) for name, seed in finished]
+    if not runs:
+        return {"rows": []}
+    return measure_speed(runs, plan.capture, lambda done, total: report("measuring speed", done, total))

@@ -1,0 +1,201 @@
+"""Folders of masks, whoever made them: which file is which image's, and what its numbers mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from neeco.capture import read_capture
+from neeco.capture.images import open_image, read_labels, read_mask
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_metrics import TRUTH_PARTS
+from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.files import read_json
+
+PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
+PARTS_FILE = "parts.json"  # what the ids of a folder that `neeco render` wrote mean
+TRUTH_NAMES = {number: part for part, number in TRUTH_PARTS.items()}
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Masks of images by name. `names`: part by id, or None where the masks tell instrument from tissue only."""
+
+    path: Path
+    files: Mapping[str, Path]
+    names: Mapping[int, str] | None
+    notes: tuple[str, ...] = ()
+    frames: Mapping[str, Frame] = field(default_factory=dict)  # of a capture's truth: whose pixels may be ignored
+
+    def load(self, name: str) -> np.ndarray:
+        """Ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
+        file = self.files[name]
+        if name not in self.frames:
+            return read_ids(file)
+        size = self.frames[name].camera.width, self.frames[name].camera.height
+        if file.parent.name == REFERENCE_FOLDER:
+            return read_mask(file, size).numpy().astype(np.uint8)
+        return read_labels(file, size).numpy()
+
+    def counted(self, name: str) -> np.ndarray | None:
+        """bool [H, W], False where the image's pixels are to be ignored; None when all count. Raises NeecoError."""
+        mask = self.frames[name].load_mask() if name in self.frames else None
+        return None if mask is None else mask.numpy()
+
+
+def parse_classes(words: Sequence[str], option: str) -> dict[int, str] | None:
+    """`shaft=1 wrist=2` as {1: "shaft", 2: "wrist"}; None when there are no words. Raises NeecoError."""
+    names: dict[int, str] = {}
+    for word in words:
+        part, _, number = word.partition("=")
+        if not part or not number.isdecimal() or not 1 <= int(number) <= 255:
+            raise NeecoError(f"{option}: {word!r}: expected PART=ID with an id from 1 to 255, such as shaft=1")
+        if int(number) in names:
+            raise NeecoError(f"{option}: {word!r}: id {number} is named twice; give each id one part")
+        names[int(number)] = part
+    return names or None
+
+
+def read_ids(path: Path) -> np.ndarray:
+    """A mask as uint8 [H, W]: grey values, or a palette's indices (black and white palettes: 0 and 255).
+
+    Raises NeecoError for what cannot be read plainly: colours, transparency, more than 8 bits, other files than PNG.
+    """
+    image = open_image(path)
+    if image.format != "PNG":
+        raise NeecoError(f"{path}: a mask must be PNG, this is {image.format}, which alters values; save it as PNG")
+    if image.mode == "1":
+        return np.asarray(image).astype(np.uint8) * 255
+    if image.mode == "L":
+        return np.array(image, np.uint8)
+    if image.mode == "P":
+        return _palette_ids(image)
+    if image.mode in ("LA", "RGB", "RGBA"):
+        pixels = np.asarray(image)
+        colours = pixels[..., :-1] if image.mode.endswith("A") else pixels
+        if image.mode.endswith("A") and pixels[..., -1].min(initial=255) < 255:
+            raise NeecoError(f"{path}: a mask must not be transparent; save it as grey PNG")
+        if (colours == colours[..., :1]).all():
+            return np.ascontiguousarray(colours[..., 0])
+        raise NeecoError(f"{path}: a colour image: which part is which colour? save ids as grey or palette PNG")
+    raise NeecoError(f"{path}: image mode {image.mode} is no mask; save 8-bit grey or palette PNG")
+
+
+def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str = "--classes") -> Masks:
+    """A folder of masks: `NAME_parts.png` where there are such files, else `NAME_mask.png`, else `NAME.png`.
+
+    classes: part by id; else what the folder's `parts.json` says; else ids 1 to 4 are shaft, wrist, jaw_left and
+    jaw_right, and only 0 and 255 (or 1) a mask of the instrument. option: what the user sets `classes` with.
+    Raises NeecoError.
+    """
+    if not path.is_dir():
+        raise NeecoError(f"{path}: no such folder; give a folder of masks")
+    pictures = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() == ".png" and file.is_file()}
+    if not pictures:
+        raise NeecoError(f"{path}: has no PNG file; give the folder that holds the masks themselves")
+    for suffix in (PARTS_SUFFIX, MASK_SUFFIX, ""):
+        files = {name.removesuffix(suffix): file for name, file in pictures.items() if name.endswith(suffix)}
+        if files:
+            break
+    if suffix == MASK_SUFFIX and classes is None:
+        _check_ids(files, {255}, "0 and 255", option)
+        return Masks(path, files, None)
+    names = classes if classes is not None else _stated_names(path)
+    if names is not None:
+        _check_ids(files, set(names), ", ".join(f"{number} {part}" for number, part in names.items()), option)
+        return Masks(path, files, names)
+    return _guessed(path, files, suffix == "", option)
+
+
+def open_truth(path: Path, classes: Mapping[int, str] | None = None, splits: Sequence[str] | None = None) -> Masks:
+    """The truth: a capture (`truth/masks`, else `reference_masks`, and its ignored pixels) or a folder of masks.
+
+    splits: which frames of a capture; all that have a mask when None. Raises NeecoError.
+    """
+    if not path.is_dir():
+        raise NeecoError(f"{path}: no such folder; give a capture or a folder of masks")
+    if not any((path / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER)):
+        if splits is not None:
+            raise NeecoError(f"--splits: {path} is a folder of masks and has no splits; give the capture instead")
+        return open_masks(path, classes, "--truth-classes")
+    capture = read_capture(path)
+    for split in splits or ():
+        if split not in capture.splits:
+            raise NeecoError(f"--splits: {path} has no split {split!r}; it has {', '.join(capture.splits)}")
+    frames = capture.frames if splits is None else [frame for split in splits for frame in capture.split(split)]
+    return _capture_masks(path, frames, classes)
+
+
+def _capture_masks(path: Path, frames: Sequence[Frame], classes: Mapping[int, str] | None) -> Masks:
+    files: dict[str, Path] = {}
+    masked: dict[str, Frame] = {}
+    for frame in frames:
+        places = path / "truth" / "masks", path / REFERENCE_FOLDER
+        file = next((file for place in places if (file := place / f"{frame.name}.png").is_file()), None)
+        if file is None:
+            continue
+        if frame.name in files:
+            raise NeecoError(f"{path}: two frames are named {frame.name!r}, and masks go by name; give mask folders")
+        masked[frame.name], files[frame.name] = frame, file
+    if not files:
+        raise NeecoError(f"{path}: its frames have no truth/masks and no {REFERENCE_FOLDER}; give a folder of masks")
+    parts = all(file.parent.name != REFERENCE_FOLDER for file in files.values())
+    return Masks(path, files, (classes or TRUTH_NAMES) if parts else None, frames=masked)
+
+
+def _palette_ids(image: Image.Image) -> np.ndarray:
+    ids = np.array(image, np.uint8)
+    palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
+    used = np.unique(ids)
+    if used.max() >= len(palette):
+        return ids
+    colours = palette[used]
+    black_and_white = np.isin(colours, (0, 255)).all() and (colours == colours[:, :1]).all()
+    return palette[ids][..., 0] if black_and_white else ids
+
+
+def _stated_names(path: Path) -> dict[int, str] | None:
+    """What `parts.json` in the folder says of its ids, or None without one."""
+    file = path / PARTS_FILE
+    if not file.is_file():
+        return None
+    stated = read_json(file)
+    try:
+        return {int(entry["id"]): str(entry["part"]) for entry in stated["ids"] if entry["id"]}
+    except (KeyError, TypeError, ValueError):
+        raise NeecoError(
+            f'{file}: ids: expected [{{"id": 1, "part": "shaft"}}, …]; mend it or give --classes'
+        ) from None
+
+
+def _found_ids(file: Path) -> set[int]:
+    return set(np.flatnonzero(np.bincount(read_ids(file).reshape(-1), minlength=256)).tolist()) - {0}
+
+
+def _check_ids(files: Mapping[str, Path], known: set[int], meaning: str, option: str) -> None:
+    for file in files.values():
+        if unknown := sorted(_found_ids(file) - known):
+            raise NeecoError(
+                f"{file}: id {unknown[0]} is not among {meaning}; name it with --classes PART={unknown[0]}"
+            )
+
+
+def _guessed(path: Path, files: Mapping[str, Path], plain: bool, option: str) -> Masks:
+    """What unnamed ids mean, by the values that occur in the whole folder."""
+    found = {name: _found_ids(file) for name, file in files.items()}
+    ids = set().union(*found.values())
+    if plain and ids == {255}:
+        return Masks(path, files, None)
+    if plain and ids == {1}:
+        note = f"{path}: its ids are 0 and 1: read as a mask of the instrument; name parts with {option}"
+        return Masks(path, files, None, (note,))
+    if strange := sorted(ids - set(TRUTH_NAMES)):
+        name = next(name for name, values in found.items() if strange[0] in values)
+        what = f"id {strange[0]} is neither a mask's 255 nor a part's 1 to 4"
+        raise NeecoError(f"{files[name]}: {what}; say what ids mean, {option} PART={strange[0]} …")
+    return Masks(path, files, TRUTH_NAMES)

@@ -1,0 +1,244 @@
+"""Any folder of masks against the truth: overlap, contours and boxes, of the instrument and of each part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco import __version__
+from neeco.errors import NeecoError
+from neeco.evaluation.boundary import boundary_f
+from neeco.evaluation.boxes import average_precision, boxes_of
+from neeco.evaluation.mask_folders import Masks, open_masks, open_truth
+from neeco.evaluation.mask_metrics import TRUTH_PARTS, mean_of
+
+SCHEMA = "neeco-mask-scores/1"
+SCORES = ("iou", "dice", "boundary_f", "box_ap", "box_ap50")
+LEFT, RIGHT, JAWS = "jaw_left", "jaw_right", "jaws"
+INSTRUMENT = "instrument"
+SWAP = {LEFT: RIGHT, RIGHT: LEFT}
+
+
+@dataclass(frozen=True)
+class Regions:
+    """What is compared: the instrument, the classes both sides tell apart, and both jaws as one."""
+
+    classes: tuple[str, ...]  # without overlap; Challenge IoU is over these
+    missing: tuple[str, ...]  # of `classes`, those that the prediction does not name
+    predicted: Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to it
+    truth: Mapping[str, np.ndarray]
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """(predicted region, true region): each with its like, and each jaw with the other."""
+        swapped = [(LEFT, RIGHT), (RIGHT, LEFT)] if {LEFT, RIGHT} <= set(self.classes) else []
+        return [(name, name) for name in self.truth] + swapped
+
+
+@dataclass(frozen=True)
+class _Image:
+    """One image: scores by (predicted region, true region), boxes by region, and which regions the truth shows."""
+
+    name: str
+    scores: dict[tuple[str, str], dict[str, float]]
+    predicted_boxes: dict[str, np.ndarray]
+    true_boxes: dict[str, np.ndarray]
+
+    def iou(self, region: str, swap: Mapping[str, str]) -> float:
+        return self.scores[swap.get(region, region), region]["iou"]
+
+    def shows(self, region: str) -> bool:
+        return len(self.true_boxes[region]) > 0
+
+
+def score_masks(
+    predicted: Path,
+    truth: Path,
+    *,
+    splits: Sequence[str] | None = None,
+    classes: Mapping[int, str] | None = None,
+    truth_classes: Mapping[int, str] | None = None,
+    components: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Score a folder of masks against a capture's or another folder's, matched by file stem.
+
+    splits: of a capture; None: those of which `predicted` has an image. classes, truth_classes: part by id, where ids
+    differ from ours. components: a box per connected group instead of one per id. progress: told (done, of).
+    An image without a prediction counts as predicted empty. Per region the mean over the images where either side
+    shows it: `iou`, `dice`, `boundary_f` (`boundary.boundary_f`); over the whole folder `box_ap`, `box_ap50`
+    (`boxes.average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
+    2020, github.com/BCV-Uniandes/ISINet): per image the mean IoU of the classes its truth shows, mean over the images
+    that show any; `isinet_iou` counts classes that either shows, `mean_class_iou` is the mean over classes of each
+    one's mean over images. None is "not known", never zero. Raises NeecoError for what cannot be read or compared.
+    """
+    given = open_masks(predicted, classes)
+    wanted = open_truth(truth, truth_classes)
+    everything = set(wanted.files)
+    if wanted.frames:
+        wanted = open_truth(truth, truth_classes, splits or _drawn_splits(given, wanted))
+    elif splits is not None:
+        raise NeecoError(f"--splits: {truth} is a folder of masks and has no splits; give the capture instead")
+    if not set(given.files) & set(wanted.files):
+        names = f"{next(iter(given.files))!r} and {next(iter(wanted.files))!r}"
+        raise NeecoError(f"{predicted}: no mask is named like one of {truth} (such as {names}); rename the files")
+    regions, reason = shared_regions(given, wanted)
+    images = []
+    for index, name in enumerate(sorted(wanted.files)):
+        images.append(_score_image(name, given, wanted, regions, components))
+        if progress is not None:
+            progress(index + 1, len(wanted.files))
+    result = _summary(images, regions, reason)
+    notes = [*result.pop("notes"), *given.notes, *wanted.notes]
+    missing = sorted(set(wanted.files) - set(given.files))
+    if missing:
+        notes.append(f"{len(missing)} of {len(images)} images have no prediction and count as empty")
+    extra = sorted(set(given.files) - everything)
+    if extra:
+        notes.append(f"{len(extra)} predictions have no truth and were left out")
+    return {
+        "schema": SCHEMA,
+        "version": __version__,
+        "predicted": str(predicted),
+        "truth": str(truth),
+        "splits": list(dict.fromkeys(frame.split for frame in wanted.frames.values())) or None,
+        "images": len(images),
+        **result,
+        "boxes": f"one per {'connected group of pixels' if components else 'id'}, without confidence",
+        "missing": missing,
+        "extra": extra,
+        "notes": notes,
+    }
+
+
+def shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
+    """The regions two folders can be compared in, and why there are no parts among them, if so.
+
+    Where either side names its jaws `jaws`, the other's two become one.
+    """
+    if predicted.names is None or truth.names is None:
+        sides = [str(masks.path) for masks in (predicted, truth) if masks.names is None]
+        return _regions({}, {}, ()), f"parts: null, {' and '.join(sides)} tell instrument from tissue only"
+    ours, theirs = dict(predicted.names), dict(truth.names)
+    if JAWS in {*ours.values(), *theirs.values()}:
+        ours, theirs = (
+            {number: JAWS if part in SWAP else part for number, part in names.items()} for names in (ours, theirs)
+        )
+    order = [*TRUTH_PARTS, JAWS]
+    classes = sorted(set(theirs.values()), key=lambda part: (order.index(part) if part in order else len(order), part))
+    if not set(classes) & set(ours.values()):
+        return _regions({}, {}, ()), (
+            f"parts: null, the prediction names {', '.join(sorted(set(ours.values())))}, the truth {', '.join(classes)}"
+        )
+    return _regions(ours, theirs, tuple(classes)), None
+
+
+def _regions(ours: Mapping[int, str], theirs: Mapping[int, str], classes: tuple[str, ...]) -> Regions:
+    def tables(names: Mapping[int, str]) -> dict[str, np.ndarray]:
+        result = {INSTRUMENT: np.arange(256) > 0}
+        for part in classes:
+            result[part] = np.isin(np.arange(256), [number for number, name in names.items() if name == part])
+        if {LEFT, RIGHT} <= set(classes):
+            result[JAWS] = result[LEFT] | result[RIGHT]
+        return result
+
+    missing = tuple(part for part in classes if part not in ours.values())
+    return Regions(classes, missing, tables(ours), tables(theirs))
+
+
+def _drawn_splits(predicted: Masks, truth: Masks) -> list[str]:
+    return list(dict.fromkeys(frame.split for name, frame in truth.frames.items() if name in predicted.files)) or list(
+        dict.fromkeys(frame.split for frame in truth.frames.values())
+    )
+
+
+def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, components: bool) -> _Image:
+    ids, counted = truth.load(name), truth.counted(name)
+    guess = predicted.load(name) if name in predicted.files else np.zeros_like(ids)
+    if guess.shape != ids.shape:
+        found, wanted = (f"{image.shape[1]}x{image.shape[0]}" for image in (guess, ids))
+        raise NeecoError(f"{predicted.files[name]}: size: mask is {found}, its truth is {wanted}; resize it (nearest)")
+    guesses = {region: table[guess] for region, table in regions.predicted.items()}
+    truths = {region: table[ids] for region, table in regions.truth.items()}
+    scores = {pair: _overlap(guesses[pair[0]], truths[pair[1]], counted) for pair in regions.pairs}
+    everywhere = True if counted is None else counted
+    return _Image(
+        name,
+        scores,
+        {region: boxes_of(mask & everywhere, components) for region, mask in guesses.items()},
+        {region: boxes_of(mask & everywhere, components) for region, mask in truths.items()},
+    )
+
+
+def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) -> dict[str, float]:
+    """IoU, Dice and boundary F; NaN where neither mask has a pixel that counts."""
+    seen, shown = (mask, truth) if counted is None else (mask & counted, truth & counted)
+    both, either = int((seen & shown).sum()), int((seen | shown).sum())
+    if not either:
+        return {"iou": math.nan, "dice": math.nan, "boundary_f": math.nan}
+    return {"iou": both / either, "dice": 2 * both / (both + either), "boundary_f": boundary_f(mask, truth, counted)}
+
+
+def _summary(images: Sequence[_Image], regions: Regions, reason: str | None) -> dict[str, Any]:
+    """Numbers per region, and the jaws' names that fit the whole folder better (as `mask_metrics.PartTally`)."""
+    jaws_told = {LEFT, RIGHT} <= set(regions.classes)
+    swap: Mapping[str, str] = {}
+    if jaws_told and _jaw_sum(images, SWAP) > _jaw_sum(images, {}):
+        swap = SWAP
+    numbers = {region: _region_numbers(images, region, swap) for region in regions.truth}
+    notes = [reason] if reason else []
+    for part in regions.missing:
+        numbers[part] = dict.fromkeys((*SCORES, "images"))
+        notes.append(f"{part}: null, the prediction has no such part; it counts as not found in Challenge IoU")
+    if unnamed := [part for part, value in numbers.items() if value["images"] == 0]:
+        notes.append(f"{', '.join(unnamed)}: null, no image shows it")
+    instrument = numbers.pop(INSTRUMENT)
+    instrument["challenge_iou"] = _number(_challenge(images, (INSTRUMENT,), {})[0])
+    overall = None
+    if regions.classes:
+        challenge, isinet = _challenge(images, regions.classes, swap)
+        class_iou = mean_of([mean_of([image.iou(part, swap) for image in images]) for part in regions.classes])
+        overall = {"challenge_iou": _number(challenge), "isinet_iou": _number(isinet)}
+        overall["mean_class_iou"] = _number(class_iou)
+    return {
+        INSTRUMENT: instrument,
+        "parts": numbers if regions.classes else None,
+        "classes": overall,
+        "jaw_assignment": ("swapped" if swap else "as named") if jaws_told else None,
+        "per_image": [
+            {"name": image.name} | {key: _number(value) for key, value in image.scores[INSTRUMENT, INSTRUMENT].items()}
+            for image in images
+        ],
+        "notes": notes,
+    }
+
+
+def _region_numbers(images: Sequence[_Image], region: str, swap: Mapping[str, str]) -> dict[str, Any]:
+    source = swap.get(region, region)
+    rows = [image.scores[source, region] for image in images]
+    numbers: dict[str, Any] = {key: _number(mean_of([row[key] for row in rows])) for key in SCORES[:3]}
+    boxes = [image.predicted_boxes[source] for image in images], [image.true_boxes[region] for image in images]
+    numbers["box_ap"] = _number(average_precision(*boxes))
+    numbers["box_ap50"] = _number(average_precision(*boxes, thresholds=(0.5,)))
+    return numbers | {"images": sum(not math.isnan(row["iou"]) for row in rows)}
+
+
+def _jaw_sum(images: Sequence[_Image], swap: Mapping[str, str]) -> float:
+    means = [mean_of([image.iou(jaw, swap) for image in images]) for jaw in (LEFT, RIGHT)]
+    return sum(value for value in means if not math.isnan(value))
+
+
+def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[str, str]) -> tuple[float, float]:
+    """Challenge IoU, and the IoU that also counts classes only predicted (see `score_masks`)."""
+    in_truth = [mean_of([image.iou(part, swap) for part in classes if image.shows(part)]) for image in images]
+    in_either = [mean_of([image.iou(part, swap) for part in classes]) for image in images]
+    return mean_of(in_truth), mean_of(in_either)
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value

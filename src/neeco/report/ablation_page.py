@@ -1,0 +1,176 @@
+"""The page of `neeco ablate`: every table and figure in one file that opens offline."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from datetime import datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import neeco
+from neeco.evaluation.experiments.ablation_results import EVEN_DB, primary_split
+from neeco.evaluation.experiments.ablation_tables import agreement, csv_text, grid
+from neeco.evaluation.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.files import write_text
+from neeco.report.charts import CHART_STYLE, Series, download, line_chart
+from neeco.report.style import STYLE
+
+PAGE_STYLE = """
+td:nth-child(2), th:nth-child(2) { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
+tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margin: 14px 0;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)); }
+.figures svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--edge); border-radius: 10px; }
+.key { margin: 2px 0; } th { white-space: normal; min-width: 5em; }
+"""
+
+
+def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
+    """Write DIR/report.html from what `run_ablations` returned; its path."""
+    name = Path(ablation["capture"]).name
+    sections = [_header(name, ablation), _failures(ablation["failures"]), _summary(ablation["tables"])]
+    sections += [_section(table, ablation) for table in ablation["tables"]]
+    sections.append(_runs(ablation))
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(name)}: ablations</title><style>{STYLE}{CHART_STYLE}{PAGE_STYLE}</style></head><body>\n"
+        + "\n".join(section for section in sections if section)
+        + "\n</body></html>\n"
+    )
+    path = output / "report.html"
+    write_text(path, page)
+    return path
+
+
+def _header(name: str, ablation: dict[str, Any]) -> str:
+    steps = " and ".join(f"{count:,} steps of {method}" for method, count in ablation["iterations"].items())
+    extra = f", with {escape(', '.join(ablation['settings']))}" if ablation["settings"] else ""
+    scaled = (
+        f"The paper's schedule, stated for {PUBLISHED_STEPS:,} steps, is scaled to these runs, and phase 2 begins at "
+        f"{PHASE_1_SHARE:.0%} of each; learning rates are not scaled. "
+        if "neeco" in ablation["iterations"]
+        else ""
+    )
+    return (
+        f"<header><h1>{escape(name)} <span class='soft'>ablations</span></h1>"
+        f"<p>What becomes of the result when one part is taken away or turned round. Every run has {steps}, "
+        f"seed {ablation['seed']}{extra}. {scaled}In brackets: the difference to the line in bold.</p>"
+        f"<p>One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. "
+        "The paper's numbers come from other recordings and longer runs; only directions are compared.</p>"
+        f"<p class='soft'>{datetime.now().astimezone():%Y-%m-%d %H:%M %Z} · neeco {escape(neeco.__version__)}</p>"
+        "</header>"
+    )
+
+
+def _failures(failures: Sequence[dict[str, str]]) -> str:
+    if not failures:
+        return ""
+    rows = "".join(f"<li><b>{escape(item['run'])}</b>: {escape(item['error'])}</li>" for item in failures)
+    return f"<h2>Not measured</h2><ul>{rows}</ul>"
+
+
+def _summary(tables: Sequence[dict[str, Any]]) -> str:
+    """Do the paper's directions hold?"""
+    judged = [table for table in tables if table["judged"]]
+    rows = "".join(
+        f"<tr><td><a href='#{table['name']}'>{escape(table['title'])}</a></td><td>{escape(agreement(table))}</td></tr>"
+        for table in judged
+    )
+    if not rows:
+        return ""
+    head = "<tr><th>table</th><th>directions</th></tr>"
+    return f"<h2>Do the paper's directions hold?</h2><div class='scroll'><table>{head}{rows}</table></div>"
+
+
+def _section(table: dict[str, Any], ablation: dict[str, Any]) -> str:
+    told = agreement(table)
+    numbers = download(csv_text(table), f"{table['name']}.csv", "numbers of this table (CSV)")
+    return (
+        f"<section id='{table['name']}'><h2>{escape(table['title'])}</h2><p>{escape(table['question'])}</p>"
+        f"{_table(table)}<p class='soft'>{numbers}{' · ' + escape(told) if told else ''}</p>"
+        f"{_figures(table, ablation)}</section>"
+    )
+
+
+def _table(table: dict[str, Any]) -> str:
+    headings, rows = grid(table)
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
+    body = []
+    for row, cells in zip(table["rows"], rows, strict=True):
+        marks = [f" class='{cell}'" if cell in ("yes", "no") else "" for cell in cells]
+        told = "".join(f"<td{mark}>{escape(cell)}</td>" for mark, cell in zip(marks, cells, strict=True))
+        opening = "<tr class='reference'>" if row["reference"] else "<tr>"
+        body.append(f"{opening}{told}</tr>")
+    return f"<div class='scroll'><table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+
+
+def _figures(table: dict[str, Any], ablation: dict[str, Any]) -> str:
+    """Learning curves of the paper's tables; numbers over levels where a table has levels."""
+    figures = [*_learning_curves(table, ablation), *_levels(table, ablation["splits"])]
+    return f"<div class='figures'>{''.join(figures)}</div>" if figures else ""
+
+
+def _learning_curves(table: dict[str, Any], ablation: dict[str, Any]) -> list[str]:
+    """Held-out PSNR over steps, a figure for every comparison."""
+    split = primary_split(tuple(ablation["splits"]))
+    figures = []
+    for comparison in dict.fromkeys(row["comparison"] for row in table["curves"]):
+        rows = [row for row in table["curves"] if row["comparison"] == comparison]
+        labels = dict.fromkeys(row["label"] for row in rows)
+        series = [
+            Series(label, [(r["iteration"], r["psnr"]) for r in rows if r["label"] == label and r["psnr"] is not None])
+            for label in labels
+        ]
+        phase_2 = (PHASE_1_SHARE * ablation["iterations"]["neeco"], "phase 2")
+        chart = line_chart(series, f"{comparison}: PSNR on {split}, dB", "steps", marks=[phase_2])
+        data = [(r["label"], r["iteration"], r["psnr"]) for r in rows]
+        words = "".join(letter if letter.isalnum() else "-" for letter in comparison)
+        name = f"{table['name']}-{words}-curves.csv"
+        figures.append(_figure(chart, _csv(("setting", "iteration", f"psnr_{split}"), data), name))
+    return figures
+
+
+def _levels(table: dict[str, Any], splits: Sequence[str]) -> list[str]:
+    """PSNR and IoU over the entries of a table whose entries are amounts."""
+    levels = ABLATIONS[table["name"]].levels
+    if not levels:
+        return []
+    figures = []
+    for score, title in (("psnr", "PSNR, dB"), ("psnr_instrument", "PSNR in the instrument, dB"), ("mask_iou", "IoU")):
+        rows = [
+            (split, level, row["values"].get(f"{score}.{split}"))
+            for split in splits
+            for level, row in zip(levels, table["rows"], strict=True)
+        ]
+        known = [row for row in rows if row[2] is not None]
+        series = [Series(split, [(x, y) for name, x, y in known if name == split]) for split in splits]
+        chart = line_chart(series, title, ABLATIONS[table["name"]].level_name)
+        if chart:
+            figures.append(_figure(chart, _csv(("split", "level", score), rows), f"{table['name']}-{score}.csv"))
+    return figures
+
+
+def _figure(chart: str, data: str, name: str) -> str:
+    return f"<figure>{chart}<figcaption>{download(data, name, 'data (CSV)')}</figcaption></figure>"
+
+
+def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([head, *rows])
+    return stream.getvalue()
+
+
+def _runs(ablation: dict[str, Any]) -> str:
+    """How long every run took."""
+    rows = [
+        (run["name"], str(run["iterations"]), f"{run['seconds']:.0f}", f"{run['processor_seconds']:.0f}",
+         f"{run['num_gaussians']:,}")
+        for run in ablation["runs"]
+    ]  # fmt: skip
+    head = "".join(f"<th>{cell}</th>" for cell in ("run", "steps", "training s", "processor s", "Gaussians"))
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<h2>Runs</h2><div class='scroll'><table><tr>{head}</tr>{body}</table></div>"
