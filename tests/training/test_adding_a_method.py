@@ -75,23 +75,23 @@ def test_it_beats_a_still_scene_where_tissue_breathes(tmp_path: Path) -> None:
         config = training_config(name, {"iterations": 150}, assignments)
         run = load_run(train(capture, tmp_path / name, config))
         scores[name] = evaluate_run(run, ["test"])["given"]["test"]["psnr"]
-    assert scores["breathing"] > scores["3dgs"] + 2
+    assert scores["breathing"] > scores["3dgs"] + 3
     learned = load_scene(tmp_path / "breathing" / "scene.safetensors").deformation
     assert float(learned.log_period.exp()) == pytest.approx(PERIOD, rel=0.05)
 
 
 def write_breathing(root: Path) -> Path:
-    """24 frames of 64x48, every fourth of them test: blobs that sway by 5 mm, seen by a camera that goes about."""
+    """16 frames of 48x36, every fourth of them test: blobs that sway by 5 mm, seen by a camera that goes about."""
     rng = np.random.default_rng(3)
     points = torch.from_numpy(rng.uniform([-30, -22, -4], [30, 22, 4], (250, 3))).float()
     colors = torch.from_numpy(rng.uniform(0, 1, (250, 3))).float()
     share = torch.exp(-points.square().sum(1) / (2 * 20.0**2))[:, None]
     (root / "raw").mkdir(parents=True)
     frames = []
-    for k in range(24):
+    for k in range(16):
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.tensor([5 * math.sin(2.1 * k), 4 * math.cos(1.3 * k), -80.0])
-        camera = Camera(pose, 75.0, 75.0, 32.0, 24.0, 64, 48)
+        camera = Camera(pose, 56.0, 56.0, 24.0, 18.0, 48, 36)
         time = 0.17 * k
         sway = torch.tensor([5.0, -3.0, 0.0]) * math.sin(2 * math.pi * time / PERIOD + 0.6)
         gaussians = Gaussians(
