@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import nice_ticks
 
 WIDTH, HEIGHT = 460, 260  # view box units; the page scales it
 LEFT, RIGHT, TOP, BOTTOM = 46, 14, 30, 40
