@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import shlex
 import statistics
 from collections.abc import Mapping, Sequence
@@ -30,7 +29,7 @@ from neeco.evaluation.experiments.tables import (
 )
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import write_text
-from neeco.report.charts import Series, binned, chart, legend
+from neeco.report.charts import Series, binned, chart, download, legend
 from neeco.report.comparison_shots import FrameRow, frame_rows, shots_html
 from neeco.report.page import REPORT_FILE, SPLITS
 from neeco.report.standings import standings
@@ -68,16 +67,10 @@ def write_comparison_report(output: Path, comparison: dict[str, Any], capture: C
     return path
 
 
-def download(name: str, text: str) -> str:
-    """A link that saves `text` as file `name`, from inside the page."""
-    content = base64.b64encode(text.encode("utf-8")).decode("ascii")
-    return f"<a class='download' download='{escape(name)}' href='data:text/csv;base64,{content}'>{escape(name)}</a>"
-
-
 def _with_data(section: str, data: Mapping[str, str], *names: str) -> str:
     if not section:
         return ""
-    return section + f"<p class='soft'>{''.join(download(name, data[name]) for name in names)}</p>"
+    return section + f"<p class='soft'>{''.join(download(data[name], name) for name in names)}</p>"
 
 
 def _trained(comparison: Mapping[str, Any]) -> list[str]:
@@ -111,9 +104,7 @@ def _bold_split(sentence: str, splits: Sequence[str]) -> str:
 
 
 def _tables(comparison: Mapping[str, Any], data: Mapping[str, str]) -> str:
-    parts = [
-        "<h2>Numbers</h2><p class='soft'>Mean ± standard deviation over seeds; the best of a column stands out.</p>"
-    ]
+    parts = ["<h2>Numbers</h2><p class='soft'>Mean ± standard deviation over seeds; the best is bold.</p>"]
     for table in tables_of(comparison):
         split = table.title.removeprefix("split ")
         meaning = f" <span class='soft'>{escape(SPLITS[split])}</span>" if split in SPLITS else ""
@@ -122,10 +113,9 @@ def _tables(comparison: Mapping[str, Any], data: Mapping[str, str]) -> str:
             if part.columns:
                 parts.append(f"<h3>{escape(title)}{meaning}</h3>{_table(part)}")
     notes = "".join(f"<li>{escape(note)}</li>" for note in absent_notes(comparison))
-    parts.append(
-        f"<p class='soft'>{download('summary.csv', data['summary.csv'])}{download('jobs.csv', data['jobs.csv'])}</p>"
+    return _with_data("".join(parts), data, "summary.csv", "jobs.csv") + (
+        f"<ul class='note'>{notes}</ul>" if notes else ""
     )
-    return "".join(parts) + (f"<ul class='note'>{notes}</ul>" if notes else "")
 
 
 def _parted(table: Table) -> tuple[Table, Table]:

@@ -71,11 +71,11 @@ CHART_STYLE = """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap: 14px; }
 .charts svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--edge); border-radius: 10px;
   break-inside: avoid; }
-.charts .main { fill: none; stroke-width: 2; } .charts .faint { fill: none; stroke-width: .7; opacity: .55; }
-.charts .dot { fill: none; stroke-width: 1; opacity: .45; } svg text.name { font-size: 11px; }
+svg .main { fill: none; stroke-width: 2; } svg .faint { fill: none; stroke-width: .7; opacity: .55; }
+svg .dot { fill: none; stroke-width: 1; opacity: .45; } svg text.name { font-size: 11px; }
 .legend { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 6px 0; font-size: .9rem; padding: 0; }
 .legend svg { width: 46px; height: 14px; vertical-align: -2px; margin-right: 6px; }
-.legend .main { fill: none; stroke-width: 2; } .legend .dot { fill: none; stroke-width: 1.2; }
+.legend svg .dot { stroke-width: 1.2; opacity: 1; }
 .best { font-weight: 700; color: var(--good); } td small { color: var(--soft); font-size: .82em; }
 td.failed { text-align: left; color: var(--bad); white-space: normal; }
 .shots { display: grid; grid-template-columns: repeat(auto-fill, minmax(215px, 1fr)); gap: 12px 10px; margin: 6px 0; }

@@ -25,7 +25,7 @@ from neeco.evaluation.experiments.tables import write_tables
 from neeco.evaluation.experiments.watching import CURVE_FILE, TOTALS
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.files import new_folder, read_json, write_json
-from neeco.scene.methods import deformation_class
+from neeco.scene.methods import unmet_need
 from neeco.training.config import TrainConfig
 from neeco.training.options import variant_config
 from neeco.training.run import load_run
@@ -164,8 +164,8 @@ def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:
     if not capture.split("train"):
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
     for name, config in configs.items():
-        if deformation_class(config.method).needs_instruments and not capture.instruments:
-            raise NeecoError(f"--methods: {name} needs instrument states, which {path} has not; leave it out")
+        if need := unmet_need(config.method, capture):
+            raise NeecoError(f"--methods: {name} needs {need}, which {path} has not; leave it out")
     return capture
 
 
