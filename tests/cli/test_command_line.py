@@ -19,9 +19,11 @@ WITH_BAD_PATH = {
     "ingest": [MISSING, "--output", "capture"],
     "train": [MISSING, "--output", "run"],
     "evaluate": [MISSING],
+    "compare": [MISSING, "--methods", "3dgs", "--iterations", "5", "--output", "compared"],
     "render": [MISSING, "--output", "drawn"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
     "score-masks": [MISSING, MISSING],
+    "ablate": [MISSING, "--output", "ablated"],
     "demo": ["--output", "taken"],
 }
 

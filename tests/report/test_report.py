@@ -8,7 +8,8 @@ from html_page import Page
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.report import write_report
-from neeco.report.curves import curve, nice_ticks, phase_starts, read_metrics
+from neeco.report.axes import nice_ticks
+from neeco.report.curves import curve, phase_starts, read_metrics
 from neeco.report.figures import chosen_rows
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}

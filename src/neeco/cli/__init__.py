@@ -25,6 +25,7 @@ VERBS = {
     "train": "Learn a scene from a capture.",
     "evaluate": "Score a run: images, masks, parts, speed; writes a report.",
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
+    "compare": "Train and score several methods under the same budget; tables and a report.",
     "score-masks": "Score a folder of masks, whoever made them, against the truth.",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",

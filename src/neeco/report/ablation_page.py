@@ -15,10 +15,11 @@ from neeco.evaluation.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.evaluation.experiments.ablation_tables import agreement, csv_text, grid
 from neeco.evaluation.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.files import write_text
-from neeco.report.charts import CHART_STYLE, Series, download, line_chart
-from neeco.report.style import STYLE
+from neeco.report.charts import Series, chart, download, legend
+from neeco.report.style import CHART_STYLE, STYLE, html_page
 
 PAGE_STYLE = """
+a { color: var(--accent); }
 td:nth-child(2), th:nth-child(2) { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
 tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margin: 14px 0;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)); }
@@ -30,18 +31,16 @@ tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margi
 def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
     """Write DIR/report.html from what `run_ablations` returned; its path."""
     name = Path(ablation["capture"]).name
-    sections = [_header(name, ablation), _failures(ablation["failures"]), _summary(ablation["tables"])]
+    sections = [
+        _header(name, ablation),
+        _failures(ablation["failures"]),
+        _notes(ablation["notes"]),
+        _summary(ablation["tables"]),
+    ]
     sections += [_section(table, ablation) for table in ablation["tables"]]
     sections.append(_runs(ablation))
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(name)}: ablations</title><style>{STYLE}{CHART_STYLE}{PAGE_STYLE}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n"
-    )
     path = output / "report.html"
-    write_text(path, page)
+    write_text(path, html_page(f"{name}: ablations", STYLE + CHART_STYLE + PAGE_STYLE, sections))
     return path
 
 
@@ -56,7 +55,7 @@ def _header(name: str, ablation: dict[str, Any]) -> str:
     )
     return (
         f"<header><h1>{escape(name)} <span class='soft'>ablations</span></h1>"
-        f"<p>What becomes of the result when one part is taken away or turned round. Every run has {steps}, "
+        f"<p>What becomes of the result when one part is taken away or turned round. Runs have {steps}, "
         f"seed {ablation['seed']}{extra}. {scaled}In brackets: the difference to the line in bold.</p>"
         f"<p>One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. "
         "The paper's numbers come from other recordings and longer runs; only directions are compared.</p>"
@@ -70,6 +69,10 @@ def _failures(failures: Sequence[dict[str, str]]) -> str:
         return ""
     rows = "".join(f"<li><b>{escape(item['run'])}</b>: {escape(item['error'])}</li>" for item in failures)
     return f"<h2>Not measured</h2><ul>{rows}</ul>"
+
+
+def _notes(notes: Sequence[str]) -> str:
+    return f"<ul class='note'>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>" if notes else ""
 
 
 def _summary(tables: Sequence[dict[str, Any]]) -> str:
@@ -119,17 +122,15 @@ def _learning_curves(table: dict[str, Any], ablation: dict[str, Any]) -> list[st
     figures = []
     for comparison in dict.fromkeys(row["comparison"] for row in table["curves"]):
         rows = [row for row in table["curves"] if row["comparison"] == comparison]
-        labels = dict.fromkeys(row["label"] for row in rows)
-        series = [
-            Series(label, [(r["iteration"], r["psnr"]) for r in rows if r["label"] == label and r["psnr"] is not None])
-            for label in labels
-        ]
+        labels = list(dict.fromkeys(row["label"] for row in rows))
+        known = [row for row in rows if row["psnr"] is not None]
+        series = _series(labels, [(row["label"], row["iteration"], row["psnr"]) for row in known])
         phase_2 = (PHASE_1_SHARE * ablation["iterations"]["neeco"], "phase 2")
-        chart = line_chart(series, f"{comparison}: PSNR on {split}, dB", "steps", marks=[phase_2])
+        drawn = chart(f"{comparison}: PSNR on {split}, dB", "steps", series, lines=[phase_2])
         data = [(r["label"], r["iteration"], r["psnr"]) for r in rows]
         words = "".join(letter if letter.isalnum() else "-" for letter in comparison)
         name = f"{table['name']}-{words}-curves.csv"
-        figures.append(_figure(chart, _csv(("setting", "iteration", f"psnr_{split}"), data), name))
+        figures.append(_figure(drawn, labels, series, _csv(("setting", "iteration", f"psnr_{split}"), data), name))
     return figures
 
 
@@ -145,16 +146,27 @@ def _levels(table: dict[str, Any], splits: Sequence[str]) -> list[str]:
             for split in splits
             for level, row in zip(levels, table["rows"], strict=True)
         ]
-        known = [row for row in rows if row[2] is not None]
-        series = [Series(split, [(x, y) for name, x, y in known if name == split]) for split in splits]
-        chart = line_chart(series, title, ABLATIONS[table["name"]].level_name)
-        if chart:
-            figures.append(_figure(chart, _csv(("split", "level", score), rows), f"{table['name']}-{score}.csv"))
+        series = _series(splits, [(split, x, y) for split, x, y in rows if y is not None])
+        drawn = chart(title, ABLATIONS[table["name"]].level_name, series)
+        if drawn:
+            data = _csv(("split", "level", score), rows)
+            figures.append(_figure(drawn, splits, series, data, f"{table['name']}-{score}.csv"))
     return figures
 
 
-def _figure(chart: str, data: str, name: str) -> str:
-    return f"<figure>{chart}<figcaption>{download(data, name, 'data (CSV)')}</figcaption></figure>"
+def _series(names: Sequence[str], rows: Sequence[tuple[str, float, float]]) -> list[Series]:
+    """A line with marks for each of `names` that has rows (name, x, y)."""
+    found = []
+    for order, name in enumerate(names):
+        points = tuple((x, y) for label, x, y in rows if label == name)
+        if points:
+            found.append(Series(name, order, points, dots=points))
+    return found
+
+
+def _figure(drawn: str, names: Sequence[str], series: Sequence[Series], data: str, name: str) -> str:
+    key = legend(names, [item.name for item in series])
+    return f"<figure>{drawn}{key}<figcaption>{download(data, name, 'data (CSV)')}</figcaption></figure>"
 
 
 def _csv(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

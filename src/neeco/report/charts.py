@@ -1,4 +1,4 @@
-"""Line charts of several series as inline SVG, and their numbers as a download."""
+"""Charts of several series as inline SVG, told apart by colour, dashes and marks, and their numbers as a download."""
 
 from __future__ import annotations
 
@@ -6,84 +6,131 @@ import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import Axes, short, widened
 
-WIDTH, HEIGHT = 460, 260  # view box units; the page scales it
-LEFT, RIGHT, TOP, BOTTOM = 46, 14, 30, 40
-TONES = 6  # classes tone-0 .. tone-5 of CHART_STYLE
+WIDTH, HEIGHT = 460, 270  # view box units; the page scales it
+MARGINS = (46, 104, 28, 42)  # left, right, top, bottom
+LABEL_STEP = 13  # units between two names
+LABEL_CHARACTERS = 16
+COLORS = 7
+DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
 
-CHART_STYLE = """
-:root { --tone-0: #0b6e99; --tone-1: #b3541e; --tone-2: #1a7f4b; --tone-3: #7a3ea1; --tone-4: #8a6d00;
-  --tone-5: #5c656e; }
-@media (prefers-color-scheme: dark) { :root { --tone-0: #5bb8e0; --tone-1: #eb9a5f; --tone-2: #6ccf98;
-  --tone-3: #c9a0ea; --tone-4: #dcc25a; --tone-5: #9aa4ae; } }
-svg .series { fill: none; stroke-width: 1.9; } svg .dot { stroke: none; }
-""" + "".join(
-    f"svg .series.tone-{k} {{ stroke: var(--tone-{k}); }} svg .dot.tone-{k} {{ fill: var(--tone-{k}); }}\n"
-    f".key i.tone-{k} {{ background: var(--tone-{k}); }}\n"
-    for k in range(TONES)
-)
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line: its name and points (x, y)."""
+    """One method (or level) in a chart. `order`: its place among all, which gives it colour, dashes and mark."""
 
     name: str
-    points: Sequence[tuple[float, float]]
+    order: int
+    main: tuple[Point, ...] = ()  # the line to read
+    faint: tuple[tuple[Point, ...], ...] = ()  # thin lines, one per seed
+    dots: tuple[Point, ...] = ()  # faint marks
 
 
-def line_chart(series: Sequence[Series], title: str, x_label: str, *, marks: Sequence[tuple[float, str]] = ()) -> str:
-    """A chart of all series on common axes with its key below; "" when no series has a point.
-
-    `marks`: (x, words) of dashed vertical lines.
-    """
-    drawn = [(index, item) for index, item in enumerate(series) if item.points]
-    if not drawn:
+def chart(title: str, x_title: str, series: Sequence[Series], *, lines: Sequence[tuple[float, str]] = ()) -> str:
+    """Lines and marks over a shared frame; "" when nothing has two points. `lines`: (x, words) of vertical lines."""
+    points = [point for item in series for line in (item.main, *item.faint, item.dots) for point in line]
+    if len({x for x, _ in points}) < 2:
         return ""
-    xs = [x for _, item in drawn for x, _ in item.points]
-    ys = [y for _, item in drawn for _, y in item.points]
-    first, last = min(xs), max(xs)
-    margin = (max(ys) - min(ys)) * 0.08 or 0.5
-    low, high = min(ys) - margin, max(ys) + margin
-    span = (last - first) or 1.0
-
-    def across(x: float) -> float:
-        return LEFT + (x - first) / span * (WIDTH - LEFT - RIGHT)
-
-    def down(y: float) -> float:
-        return TOP + (high - y) / (high - low) * (HEIGHT - TOP - BOTTOM)
-
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">']
-    parts.append(f'<text class="title" x="{LEFT}" y="17">{escape(title)}</text>')
-    for tick in nice_ticks(low, high, 5):
-        parts.append(f'<path class="grid" d="M{LEFT} {down(tick):.1f}H{WIDTH - RIGHT}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{down(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    for tick in nice_ticks(first, last, 5):
-        anchor = "end" if across(tick) > WIDTH - RIGHT - 18 else "middle"
-        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - 22}" text-anchor="{anchor}">{tick:g}</text>')
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>')
-    for x, words in marks:
-        parts.append(f'<path class="phase" d="M{across(x):.1f} {TOP}V{HEIGHT - BOTTOM}"/>')
-        parts.append(f'<text class="phase-name" x="{across(x) + 4:.1f}" y="{TOP + 10}">{escape(words)}</text>')
-    for index, item in drawn:
-        places = [f"{across(x):.1f} {down(y):.1f}" for x, y in item.points]
-        tone = f"tone-{index % TONES}"
-        parts.append(f'<path class="series {tone}" d="M{"L".join(places)}"/>')
-        parts += [
-            f'<circle class="dot {tone}" cx="{place.split()[0]}" cy="{place.split()[1]}" r="2.6"/>' for place in places
-        ]
-    return "".join(parts) + "</svg>" + _key(drawn)
+    xs, ys = [x for x, _ in points], [y for _, y in points]
+    axes = Axes(min(0.0, *xs), max(xs), *widened(min(ys), max(ys)), WIDTH, HEIGHT, MARGINS)
+    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)} over {escape(x_title)}">']
+    parts.append(f'<text class="title" x="{MARGINS[0]}" y="17">{escape(title)}</text>')
+    parts += axes.grid(short)
+    middle = (MARGINS[0] + WIDTH - MARGINS[1]) / 2
+    parts[-1] += f'<text x="{middle:.0f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_title)}</text>'
+    for x, words in lines:
+        place = f"M{axes.across(x):.1f} {MARGINS[2]}V{HEIGHT - MARGINS[3]}"
+        text = f'<text class="phase-name" x="{axes.across(x) + 4:.1f}" y="{MARGINS[2] + 10}">{escape(words)}</text>'
+        parts.append(f'<path class="phase" d="{place}"/>{text}')
+    for item in series:
+        parts += [mark(item.order, axes.across(x), axes.down(y)) for x, y in item.dots]
+        parts += [_line(item.order, axes, line, "faint") for line in item.faint]
+    for item in series:  # above all that is faint
+        parts.append(_line(item.order, axes, item.main, "main"))
+    return "".join([*parts, *_names(series, axes), "</svg>"])
 
 
-def _key(drawn: Sequence[tuple[int, Series]]) -> str:
-    names = "".join(f'<i class="tone-{index % TONES}"></i>{escape(item.name)}' for index, item in drawn)
-    return f'<p class="key soft">{names}</p>'
+def legend(names: Sequence[str], shown: Sequence[str]) -> str:
+    """What line and mark each method has that is shown; `names`: all methods, whose order gives them these."""
+    items = []
+    for order, name in enumerate(names):
+        if name not in shown:
+            continue
+        sample = (
+            f'<svg viewBox="0 0 46 14"><path class="main" stroke="{color(order)}" '
+            f'stroke-dasharray="{_dashes(order)}" d="M1 7H45"/>{mark(order, 23, 7)}</svg>'
+        )
+        items.append(f"<span>{sample}{escape(name)}</span>")
+    return f"<p class='legend'>{''.join(items)}</p>"
 
 
-def download(text: str, name: str, words: str) -> str:
+def color(order: int) -> str:
+    """A method's colour, as the style sheet has it."""
+    return f"var(--m{order % COLORS})"
+
+
+def mark(order: int, x: float, y: float, size: float = 3.2) -> str:
+    """A method's mark about a place in view box units."""
+    a = size
+    shapes = (
+        f"M{x - a:.1f} {y:.1f}a{a} {a} 0 1 0 {2 * a} 0a{a} {a} 0 1 0 {-2 * a} 0",
+        f"M{x - a:.1f} {y - a:.1f}h{2 * a}v{2 * a}h{-2 * a}z",
+        f"M{x:.1f} {y - a:.1f}l{a} {2 * a}h{-2 * a}z",
+        f"M{x - a:.1f} {y - a:.1f}l{2 * a} {2 * a}m0 {-2 * a}l{-2 * a} {2 * a}",
+        f"M{x:.1f} {y - a * 1.3:.1f}l{a} {a * 1.3:.1f}l{-a} {a * 1.3:.1f}l{-a} {-a * 1.3:.1f}z",
+        f"M{x - a:.1f} {y:.1f}h{2 * a}M{x:.1f} {y - a:.1f}v{2 * a}",
+        f"M{x - a:.1f} {y - a:.1f}h{2 * a}l{-a} {2 * a}z",
+    )
+    return f'<path class="dot" stroke="{color(order)}" d="{shapes[order % len(shapes)]}"/>'
+
+
+def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]:
+    """Mean of the points between every two `edges` (the last bin takes its upper edge too); empty bins are left out."""
+    means = []
+    for index, (low, high) in enumerate(pairwise(edges)):
+        last = index == len(edges) - 2
+        inside = [(x, y) for x, y in points if low <= x < high or (last and x == high)]
+        if inside:
+            means.append((sum(x for x, _ in inside) / len(inside), sum(y for _, y in inside) / len(inside)))
+    return tuple(means)
+
+
+def _dashes(order: int) -> str:
+    return DASHES[order % len(DASHES)] or "none"
+
+
+def _line(order: int, axes: Axes, points: Sequence[Point], kind: str) -> str:
+    if len(points) < 2:
+        return "".join(mark(order, axes.across(x), axes.down(y), 4.0) for x, y in points)
+    dashes = f' stroke-dasharray="{_dashes(order)}"' if kind == "main" else ""
+    return f'<path class="{kind}" stroke="{color(order)}"{dashes} d="{axes.path(list(points))}"/>'
+
+
+def _names(series: Sequence[Series], axes: Axes) -> list[str]:
+    """Each method's name at the end of its line, moved apart where they would cover one another."""
+    drawn = [item for item in series if item.main]
+    ends = sorted(((axes.down(item.main[-1][1]), item) for item in drawn), key=lambda end: (end[0], end[1].order))
+    places: list[float] = []
+    for y, _ in ends:
+        places.append(max(y + 4, places[-1] + LABEL_STEP) if places else y + 4)
+    beyond = max(0.0, places[-1] - (HEIGHT - MARGINS[3])) if places else 0.0
+    texts = []
+    for (_, item), y in zip(ends, places, strict=True):
+        name = item.name if len(item.name) <= LABEL_CHARACTERS else item.name[: LABEL_CHARACTERS - 1] + "…"
+        texts.append(
+            f'<text class="name" x="{WIDTH - MARGINS[1] + 8}" y="{y - beyond:.1f}" style="fill:{color(item.order)}">'
+            f"{escape(name)}</text>"
+        )
+    return texts
+
+
+def download(text: str, name: str, words: str | None = None) -> str:
     """A link that saves `text` as file `name`, without any server: the text is inside the link."""
     data = base64.b64encode(text.encode("utf-8")).decode("ascii")
-    return f'<a download="{escape(name)}" href="data:text/csv;base64,{data}">{escape(words)}</a>'
+    title = escape(name if words is None else words)
+    return f"<a class='download' download='{escape(name)}' href='data:text/csv;base64,{data}'>{title}</a>"

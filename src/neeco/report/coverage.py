@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import nice_ticks
 
 WIDTH, HEIGHT = 340, 150  # view box units
 LEFT, RIGHT, TOP, BOTTOM = 12, 12, 26, 22

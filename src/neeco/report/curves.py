@@ -10,6 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from neeco.report.axes import Axes, short, widened
+
 WIDTH, HEIGHT = 420, 190  # view box units; the page scales it
 LEFT, RIGHT, TOP, BOTTOM = 52, 10, 26, 26
 MAX_POINTS = 300
@@ -48,54 +50,26 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     if len(points) < 2:
         return ""
     xs, ys = [x for x, _ in points], [y for _, y in points]
-    low, high = min(ys), max(ys)
-    margin = (high - low) * 0.05 or abs(high) * 0.05 or 1.0
-    low, high = low - margin, high + margin
-    first, last = min(xs), max(xs) or 1.0
-    span = (last - first) or 1.0
-
-    def across(x: float) -> float:
-        return LEFT + (x - first) / span * (WIDTH - LEFT - RIGHT)
-
-    def down(y: float) -> float:
-        return TOP + (high - y) / (high - low) * (HEIGHT - TOP - BOTTOM)
-
+    axes = Axes(min(xs), max(xs), *widened(min(ys), max(ys)), WIDTH, HEIGHT, (LEFT, RIGHT, TOP, BOTTOM))
+    first, last = axes.left, axes.right
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)} over iterations">']
     parts.append(f'<text class="title" x="{LEFT}" y="15">{escape(title)}</text>')
-    for tick in nice_ticks(low, high, 4):
-        label = _short(10**tick if logarithmic else tick)
-        parts.append(f'<path class="grid" d="M{LEFT} {down(tick):.1f}H{WIDTH - RIGHT}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{down(tick) + 4:.1f}" text-anchor="end">{label}</text>')
-    for tick in nice_ticks(first, last, 5):
-        anchor = "end" if across(tick) > WIDTH - RIGHT - 18 else "middle"
-        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - 8}" text-anchor="{anchor}">{_short(tick)}</text>')
+    parts += axes.grid(lambda tick: short(10**tick if logarithmic else tick))
     for iteration, phase in phase_starts(rows):
-        x = across(min(max(iteration, first), last))
+        x = axes.across(min(max(iteration, first), last))
         parts.append(f'<path class="phase" d="M{x:.1f} {TOP}V{HEIGHT - BOTTOM}"/>')
         side, anchor = (-4, "end") if x > WIDTH * 0.75 else (4, "start")
         parts.append(
             f'<text class="phase-name" x="{x + side:.1f}" y="{HEIGHT - BOTTOM - 6}" text-anchor="{anchor}">'
             f"phase {escape(phase)}</text>"
         )
-    path = "".join(f"{'L' if index else 'M'}{across(x):.1f} {down(y):.1f}" for index, (x, y) in enumerate(points))
     end = 10 ** ys[-1] if logarithmic else ys[-1]
-    parts.append(f'<path class="line" d="{path}"/>')
-    parts.append(f'<circle class="end" cx="{across(xs[-1]):.1f}" cy="{down(ys[-1]):.1f}" r="3"/>')
+    parts.append(f'<path class="line" d="{axes.path(points)}"/>')
+    parts.append(f'<circle class="end" cx="{axes.across(xs[-1]):.1f}" cy="{axes.down(ys[-1]):.1f}" r="3"/>')
     parts.append(
-        f'<text class="title" x="{WIDTH - RIGHT}" y="15" text-anchor="end">{_short(end)} at the end</text></svg>'
+        f'<text class="title" x="{WIDTH - RIGHT}" y="15" text-anchor="end">{short(end)} at the end</text></svg>'
     )
     return "".join(parts)
-
-
-def nice_ticks(low: float, high: float, count: int) -> list[float]:
-    """About `count` round numbers from `low` to `high`."""
-    span = high - low
-    if span <= 0:
-        return [low]
-    power = 10 ** math.floor(math.log10(span / count))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= span / count * 0.999)
-    start = math.ceil(low / step - 1e-9)
-    return [index * step for index in range(start, math.floor(high / step + 1e-9) + 1)]
 
 
 def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -109,9 +83,3 @@ def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _short(value: float) -> str:
-    if abs(value) >= 10_000:
-        return f"{value / 1000:.3g}k"
-    return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"

@@ -83,8 +83,8 @@ def _figure(
         why=why,
         poses=kind,
         numbers=row,
-        photograph=jpeg(_bytes(photograph)),
-        drawn=jpeg(_bytes(image)),
+        photograph=jpeg(to_bytes(photograph)),
+        drawn=jpeg(to_bytes(image)),
         difference=png(difference_map(compared, photograph)),
         mask=mask,
     )
@@ -134,5 +134,6 @@ def _uri(image: Image.Image, form: str, mime: str, max_width: int = MAX_WIDTH, *
     return f"data:{mime};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] of an image in [0, 1]."""
     return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)

@@ -19,7 +19,7 @@ from neeco.report.coverage import Degree, degrees_of_freedom, extrapolations, hi
 from neeco.report.ingest_figures import MainAxis, axis_length, in_view, main_axes, sample_figures
 from neeco.report.ingest_style import INGEST_STYLE
 from neeco.report.residuals import scatter
-from neeco.report.style import STYLE
+from neeco.report.style import STYLE, html_page
 from neeco.report.tracks import read_tracks, turning_view, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
@@ -47,15 +47,7 @@ def write_ingest_page(result: IngestResult, path: Path) -> None:
         _notes(result),
         _made(result, capture),
     ]
-    title = f"{capture.root.name}: ingest"
-    write_text(
-        path,
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}{INGEST_STYLE}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n",
-    )
+    write_text(path, html_page(f"{capture.root.name}: ingest", STYLE + INGEST_STYLE, sections))
 
 
 def _header(result: IngestResult, capture: Capture) -> str:

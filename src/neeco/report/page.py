@@ -15,7 +15,7 @@ from neeco.evaluation.difference import FULL_SCALE, PART_COLORS
 from neeco.files import write_text
 from neeco.report.curves import curve, read_metrics
 from neeco.report.figures import FrameFigure, file_uri, frame_figures
-from neeco.report.style import STYLE
+from neeco.report.style import STYLE, html_page
 from neeco.scene import Scene
 
 REPORT_FILE = "report.html"
@@ -73,13 +73,7 @@ def write_report(
         _made(run_path, capture, scene, rows),
     ]
     title = f"{capture.root.name}: {scene.method}"
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n"
-    )
+    page = html_page(title, STYLE, sections)
     path = run_path / REPORT_FILE
     write_text(path, page)
     return path

@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import nice_ticks
 
 WIDTH, HEIGHT = 420, 190  # view box units
 LEFT, RIGHT, TOP, BOTTOM = 46, 12, 26, 26

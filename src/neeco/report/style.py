@@ -1,4 +1,9 @@
-"""The report's style sheet: light and dark, phone to print, nothing fetched."""
+"""The reports' style sheets and the page about them: light and dark, phone to print, nothing fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2024; --soft: #5c656e; --paper: #ffffff; --card: #f5f6f8; --edge: #dde1e6;
@@ -56,3 +61,40 @@ pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px
   table { font-size: 8.5pt; } th, td { padding: 3px 5px; } .curves { grid-template-columns: repeat(3, 1fr); }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
+
+CHART_STYLE = """
+:root { --m0: #0072b2; --m1: #c24e00; --m2: #00805c; --m3: #a83f82; --m4: #6f6300; --m5: #5a4fcf; --m6: #4d4d4d; }
+@media (prefers-color-scheme: dark) { :root { --m0: #5ab4e8; --m1: #ff9a57; --m2: #4cd3a5; --m3: #ef9fcb;
+  --m4: #e3cf55; --m5: #aaa3ff; --m6: #c8c8c8; } }
+@media print { :root { --m0: #005b8e; --m1: #a34000; --m2: #006a4c; --m3: #8a2f69; --m4: #574d00; --m5: #453ab0;
+  --m6: #333; } }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap: 14px; }
+.charts svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--edge); border-radius: 10px;
+  break-inside: avoid; }
+svg .main { fill: none; stroke-width: 2; } svg .faint { fill: none; stroke-width: .7; opacity: .55; }
+svg .dot { fill: none; stroke-width: 1; opacity: .45; } svg text.name { font-size: 11px; }
+.legend { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 6px 0; font-size: .9rem; padding: 0; }
+.legend svg { width: 46px; height: 14px; vertical-align: -2px; margin-right: 6px; }
+.legend svg .dot { stroke-width: 1.2; opacity: 1; }
+.best { font-weight: 700; color: var(--good); } td small { color: var(--soft); font-size: .82em; }
+td.failed { text-align: left; color: var(--bad); white-space: normal; }
+.shots { display: grid; grid-template-columns: repeat(auto-fill, minmax(215px, 1fr)); gap: 12px 10px; margin: 6px 0; }
+.shots img + img { margin-top: 4px; }
+.download { font-size: .85rem; color: var(--accent); margin-right: 14px; }
+.verdicts li { margin: 4px 0; max-width: 80ch; }
+@media (max-width: 640px) { .shots { grid-template-columns: repeat(2, 1fr); } }
+@media print { .download { display: none; } .best { color: #000; } .shots { grid-template-columns: repeat(4, 1fr); }
+  .charts { grid-template-columns: repeat(2, 1fr); } h3, h2 + p, h2 + p + p { break-after: avoid; }
+  .scroll, figure { break-inside: avoid; } }
+"""
+
+
+def html_page(title: str, style: str, sections: Sequence[str]) -> str:
+    """A whole page of the sections that are not empty."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body>\n"
+        + "\n".join(section for section in sections if section)
+        + "\n</body></html>\n"
+    )

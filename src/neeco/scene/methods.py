@@ -9,7 +9,7 @@ import types
 import typing
 from typing import Any
 
-from neeco.capture.model import Instrument
+from neeco.capture.model import Capture, Instrument
 from neeco.errors import NeecoError
 from neeco.scene import deformations
 from neeco.scene.deformations.base import Deformation
@@ -46,6 +46,15 @@ def deformation_class(method: str) -> type[Deformation]:
     if method not in METHODS:
         raise NeecoError(f"--method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
     return METHODS[method]
+
+
+def unmet_need(method: str, capture: Capture) -> str | None:
+    """What `method` needs and `capture` has not recorded, in words; None when it can be trained on it."""
+    kind = deformation_class(method)
+    if kind.needs_instruments and not capture.instruments:
+        return "instrument states"
+    times = {frame.state.time for frame in capture.split("train")} if capture.timed else set()
+    return "times of its frames" if kind.needs_times and len(times) < 2 else None
 
 
 def make_deformation(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Deformation:

@@ -16,8 +16,8 @@ from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_text
-from neeco.scene.io import save_scene
-from neeco.scene.methods import deformation_class
+from neeco.scene.io import pack_scene, save_scene
+from neeco.scene.methods import deformation_class, unmet_need
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import new_session
@@ -142,8 +142,7 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
-    times = {frame.state.time for frame in frames} if capture.timed else set()
-    if deformation_class(config.method).needs_times and len(times) < 2:
+    if unmet_need(config.method, capture):
         raise NeecoError(
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
             "each frame its `time` in seconds), 3dgs does not"
@@ -184,6 +183,11 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
 def _finish(session: Session, report: Callable[[str], None]) -> None:
     """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
     scene = session.scene
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in pack_scene(scene)[0].values()):
+        raise NeecoError(
+            f"training: the scene holds numbers that are not finite after {session.iteration} iterations: it diverged, "
+            "though its image did not tell; train anew with another --seed or a milder schedule"
+        )
     scene.requires_grad_(False)
     for tensor in scene.canonical.tensors().values():
         tensor.requires_grad_(False)

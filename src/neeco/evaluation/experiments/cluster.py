@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from neeco.errors import NeecoError
-from neeco.evaluation.experiments.jobs import Job, JobNews, attempt_job
+from neeco.evaluation.experiments.jobs import Job, JobNews, attempt_job, ended
 
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
@@ -65,8 +65,7 @@ def _run(
             for reference in ray.wait(list(running), timeout=1.0)[0]:
                 index = running.pop(reference)
                 results[index] = result = _result(ray, reference, jobs[index])
-                error = result.get("error", "")
-                report(JobNews(index, len(jobs), jobs[index], "failed" if error else "done", 1.0, error))
+                report(ended(index, len(jobs), jobs[index], result))
     except KeyboardInterrupt:
         with contextlib.suppress(KeyboardInterrupt):  # a second one ends the waiting
             for reference in running:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,18 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.experiments.cluster import threads_per_worker
 from neeco.evaluation.experiments.distance import distances_to_training
-from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, held_out_splits, run_jobs
+from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.evaluation.experiments.machine import machine
+from neeco.evaluation.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
 from neeco.evaluation.experiments.speed import measure_speed
 from neeco.evaluation.experiments.summary import summarise
 from neeco.evaluation.experiments.tables import write_tables
 from neeco.evaluation.experiments.watching import CURVE_FILE, TOTALS
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.files import new_folder, read_json, write_json
-from neeco.scene.methods import deformation_class
+from neeco.scene.methods import unmet_need
 from neeco.training.config import TrainConfig
-from neeco.training.options import training_config
+from neeco.training.options import variant_config
 from neeco.training.run import load_run
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
@@ -60,6 +62,7 @@ class _Plan:
     jobs: tuple[Job, ...]
     splits: tuple[str, ...]
     notes: tuple[str, ...]
+    given_masks: tuple[dict[str, Any], ...]  # scores of the folders of masks
 
 
 def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage | None = None) -> dict[str, Any]:
@@ -72,12 +75,21 @@ def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage
     plan = _plan(spec)
     report = stage or (lambda what, done, total: None)
     with new_folder(spec.output):
-        write_json(spec.output / COMPARISON_FILE, _document(plan, []))
-        results = run_jobs(plan.jobs, spec.workers, progress)
-        result = _document(plan, results)
-        result["speed"] = _speed(plan, results, report)
-        result["summary"] = summarise(_names(plan), plan.splits, results, result["speed"]["rows"])
-        result["complete"] = True
+        finished = _finished_before(plan)
+
+        def write() -> None:  # what is known is on disk at every moment
+            write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
+
+        def keep(news: JobNews) -> None:
+            if news.result is not None:
+                finished[news.index] = news.result
+                write()
+            if progress:
+                progress(news)
+
+        write()
+        result = _document(plan, run_jobs(plan.jobs, spec.workers, keep)) | {"complete": True}
+        _measure(plan, result, report)
         write_json(spec.output / COMPARISON_FILE, result)
         write_tables(spec.output, result)
     return result
@@ -93,6 +105,13 @@ def failures(comparison: Mapping[str, Any]) -> list[str]:
     return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
 
 
+def _finished_before(plan: _Plan) -> dict[int, dict[str, Any]]:
+    """What earlier starts left of these jobs, by the job's place."""
+    files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
+    found = {index: read_json(file) for index, file in files.items() if file.exists()}
+    return {index: job for index, job in found.items() if list(job["splits"]) == list(plan.splits)}
+
+
 def _plan(spec: ComparisonSpec) -> _Plan:
     """Check everything that can be known before the work. Raises NeecoError."""
     spec.budget.check()
@@ -100,13 +119,28 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
         raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    configs = {name: _config(name) for name in spec.methods}
+    configs = {name: variant_config(name, {}) for name in spec.methods}
     if not configs:
         raise NeecoError("--methods: none is given; name at least one")
     capture = _open_capture(spec.capture, configs)
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
-    jobs = tuple(
+    jobs = _jobs(spec, configs)
+    for job in jobs:
+        check_folder(job)
+    splits = held_out_splits(jobs[0])
+    check_masks(spec.masks, capture, splits, spec.methods)
+    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
+    scored: list[dict[str, Any]] = []
+    for name, folder in spec.masks.items():
+        rows, told = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
+        scored += rows
+        notes += told
+    return _Plan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
+
+
+def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job, ...]:
+    return tuple(
         Job(
             name,
             seed,
@@ -120,12 +154,6 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
         for name, config in configs.items()
     )
-    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
-    return _Plan(spec, capture, jobs, held_out_splits(jobs[0]), tuple(notes))
-
-
-def _config(name: str) -> TrainConfig:
-    return training_config(name, {})
 
 
 def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:
@@ -136,8 +164,8 @@ def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:
     if not capture.split("train"):
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
     for name, config in configs.items():
-        if deformation_class(config.method).needs_instruments and not capture.instruments:
-            raise NeecoError(f"--methods: {name} needs instrument states, which {path} has not; leave it out")
+        if need := unmet_need(config.method, capture):
+            raise NeecoError(f"--methods: {name} needs {need}, which {path} has not; leave it out")
     return capture
 
 
@@ -188,10 +216,11 @@ def _document(plan: _Plan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "splits": list(plan.splits),
         "methods": methods,
         "jobs": list(results),
-        "summary": summarise(_names(plan), plan.splits, results),
+        "summary": summarise(_names(plan), plan.splits, results, (), plan.given_masks),
         "curves": _curves(plan.spec, results),
         "distance": _distance(plan, results),
         "speed": {"rows": []},
+        "masks": list(plan.given_masks),
         "notes": list(plan.notes)
         + [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job],
     }
@@ -224,9 +253,14 @@ def _distance(plan: _Plan, results: Sequence[Mapping[str, Any]]) -> list[dict[st
     return rows
 
 
-def _speed(plan: _Plan, results: Sequence[Mapping[str, Any]], report: Stage) -> dict[str, Any]:
-    finished = [(job["name"], job["seed"]) for job in results if "error" not in job]
-    runs = [(name, seed, load_run(job_folder(plan.spec.output, name, seed))) for name, seed in finished]
-    if not runs:
-        return {"rows": []}
-    return measure_speed(runs, plan.capture, lambda done, total: report("measuring speed", done, total))
+def _measure(plan: _Plan, result: dict[str, Any], report: Stage) -> None:
+    """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
+    folder = plan.spec.output
+    done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
+    runs = [(name, seed, load_run(job_folder(folder, name, seed))) for name, seed in done]
+    if runs:
+        told = splits_with_truth(plan.capture, plan.splits)
+        scored = score_runs(runs, folder, plan.capture, told, partial(report, "scoring masks"))
+        result["masks"] = [*plan.given_masks, *scored]
+        result["speed"] = measure_speed(runs, plan.capture, partial(report, "measuring speed"))
+    result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])

@@ -101,7 +101,8 @@ class Job:
 
 @dataclass(frozen=True)
 class JobNews:
-    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage."""
+    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage; `result`
+    is there once the job is done or has failed."""
 
     index: int
     total: int
@@ -109,6 +110,7 @@ class JobNews:
     stage: str
     share: float = 0.0
     text: str = ""
+    result: dict[str, Any] | None = None
 
 
 def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
@@ -179,7 +181,10 @@ def check_folder(job: Job) -> None:
             )
         for key in (key for key in identity if values[key] != identity[key]):
             raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
-    old, new = vars(config_from_dict(stored)), vars(job.train_config)
+    try:
+        old, new = vars(config_from_dict(stored)), vars(job.train_config)
+    except NeecoError as error:  # of another version
+        raise NeecoError(f"{folder / error.args[0].removesuffix('; train again')}; {differs}") from None
     for field in (name for name in new if old[name] != new[name]):
         raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 
@@ -250,9 +255,14 @@ def _run_here(index: int, total: int, job: Job, report: Callable[[JobNews], None
         result = attempt_job(job, tell)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(stopped_line(f"job {index + 1} of {total} ({job.title})", interrupt)) from None
-    failure = result.get("error", "")
-    tell("failed" if failure else "done", 1.0, failure)
+    report(ended(index, total, job, result))
     return result
+
+
+def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
+    """The news that a job is done or has failed."""
+    failure = result.get("error", "")
+    return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
 
 
 def stopped_line(where: str, interrupt: KeyboardInterrupt) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 SPLIT_METRICS = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou")
 RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")
-MASK_METRICS = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")
+MASK_METRICS = ("iou", "challenge_iou", "challenge_iou_parts", "dice", "boundary_f", "box_ap")
 
 Spread = dict[str, Any]  # {"mean", "std", "n"}
 

@@ -35,8 +35,9 @@ SPLIT_COLUMNS = (
     Column("mask_iou", "label IoU", 3, "high"),
 )
 MASK_COLUMNS = (
-    Column("iou", "IoU", 3, "high"),
+    Column("iou", "label IoU", 3, "high"),
     Column("challenge_iou", "Challenge IoU", 3, "high"),
+    Column("challenge_iou_parts", "of parts", 3, "high"),
     Column("dice", "Dice", 3, "high"),
     Column("boundary_f", "boundary F", 3, "high"),
     Column("box_ap", "box AP", 3, "high"),
@@ -76,7 +77,9 @@ def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
     tables = []
     for split in comparison["splits"]:
         rows = [row for row in comparison["summary"] if row["split"] == split]
-        tables.append(_table(f"split {split}", SPLIT_COLUMNS + MASK_COLUMNS, rows, failed))
+        scored = any(row["iou"]["n"] for row in rows)  # the same number, for other people's masks too
+        ours = [column for column in SPLIT_COLUMNS if not (scored and column.key == "mask_iou")]
+        tables.append(_table(f"split {split}", (*ours, *MASK_COLUMNS), rows, failed))
     trained = {entry["name"] for entry in comparison["methods"] if entry["source"] == "train"}
     first = comparison["splits"][0]
     rows = [row for row in comparison["summary"] if row["split"] == first and row["name"] in trained]
@@ -180,7 +183,7 @@ def markdown_text(comparison: Mapping[str, Any]) -> str:
         parts.append("| method | " + " | ".join(_md(_arrow(column)) for column in table.columns) + " |")
         parts.append("|---|" + "---:|" * len(table.columns))
         for method, cells in table.rows:
-            shown = [f"failed: {_md(table.failed[method])}"] + [""] * (len(cells) - 1)
+            shown = [f"failed: {_md(table.failed.get(method, ''))}"] + [""] * (len(cells) - 1)
             if method not in table.failed:
                 shown = [_md_cell(cell) for cell in cells]
             parts.append(f"| {_md(method)} | " + " | ".join(shown) + " |")
@@ -260,18 +263,23 @@ def write_tables(output: Path, comparison: Mapping[str, Any]) -> None:
     write_text(output / "comparison.csv", csv_text(comparison))
     write_text(output / "comparison.md", markdown_text(comparison))
     write_text(output / "comparison.tex", latex_text(comparison))
-    data = output / "data"
+    for name, text in data_files(comparison).items():
+        write_text(output / "data" / name, text)
+
+
+def data_files(comparison: Mapping[str, Any]) -> dict[str, str]:
+    """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
     job_header = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
     jobs = [
         {**job, **numbers, "split": split}
         for job in comparison["jobs"]
         for split, numbers in (job["splits"] or {"": {}}).items()
     ]
-    write_text(data / "jobs.csv", rows_as_csv(jobs, job_header))
-    for key, header in (
-        ("curves", ["name", "seed", "seconds", "iteration", "split", "psnr"]),
-        ("distance", ["name", "seed", "split", "frame", "distance", "psnr", "psnr_instrument", "mask_iou"]),
-    ):
-        write_text(data / f"{key}.csv", rows_as_csv(comparison[key], header))
+    distance_header = ["name", "seed", "split", "frame", "distance", "psnr", "psnr_instrument", "mask_iou"]
     speed_header = ["name", "seed", "method", "backend", "fps", "milliseconds", "draws", "num_gaussians"]
-    write_text(data / "speed.csv", rows_as_csv(comparison["speed"]["rows"], speed_header))
+    return {
+        "jobs.csv": rows_as_csv(jobs, job_header),
+        "curves.csv": rows_as_csv(comparison["curves"], ["name", "seed", "seconds", "iteration", "split", "psnr"]),
+        "distance.csv": rows_as_csv(comparison["distance"], distance_header),
+        "speed.csv": rows_as_csv(comparison["speed"]["rows"], speed_header),
+    }

@@ -1,0 +1,136 @@
+"""`neeco compare`: methods beside each other on the same frames, under the same budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Column, Table
+
+if TYPE_CHECKING:
+    from neeco.evaluation.experiments.comparison import ComparisonSpec
+    from neeco.evaluation.experiments.jobs import Budget
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train and score methods on the same frames under the same budget; writes tables and a report.
+
+    Give one of --minutes, --processor-minutes and --iterations. Interrupted, the same command goes on where it stopped;
+    with more methods or seeds it adds them to what is there.
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Capture folder."""
+    methods: tuple[str, ...]
+    """Names as in `neeco train --method`; METHOD+dta trains METHOD with the paper's dynamic training adjustment."""
+    output: Path
+    """Folder to write; absent, empty, or of this comparison begun earlier."""
+    seeds: int = 1
+    """How many seeds of each method, from 0; with 2 or more the tables tell mean and standard deviation."""
+    minutes: float | None = None
+    """Each run trains so long by the clock on the wall."""
+    processor_minutes: float | None = None
+    """Each run trains so long in time of the processor, all threads together: fair on a machine that others use."""
+    iterations: int | None = None
+    """Each run trains so many steps."""
+    splits: tuple[str, ...] | None = None
+    """Splits to score; default: all but train."""
+    masks: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """NAME=FOLDER: masks that something else made of the same frames, scored in the same table; repeatable."""
+    workers: int = 1
+    """Runs at once, by Ray (install neeco[cluster]); each gets its share of the cores. RAY_ADDRESS names a cluster."""
+    lpips_weights: Path | None = None
+    """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
+
+
+def run(args: Compare) -> int:
+    """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
+    from neeco.cli._jobs import JobBars
+    from neeco.evaluation.experiments.comparison import compare, failures
+    from neeco.evaluation.experiments.tables import absent_notes, budget_words, tables_of
+
+    with JobBars() as bars:
+        comparison = compare(_spec(args), bars.show, bars.stage)
+    console = Console()
+    console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
+    for table in tables_of(comparison):
+        console.print(_shown(table))
+    for note in absent_notes(comparison):
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    for what, name in (("tables", "comparison.md, .csv, .tex"), ("all numbers", "comparison.json, data/")):
+        console.print(f"{what}: {args.output}/: {name}", markup=False, highlight=False, soft_wrap=True)
+    failed = failures(comparison)
+    if failed:
+        more = f" (and {len(failed) - 1} more, told above)" if len(failed) > 1 else ""
+        Console(stderr=True).print(
+            f"neeco: error: {len(failed)} of {len(comparison['jobs'])} runs failed: {failed[0]}{more}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+        return 1
+    return 0
+
+
+def _spec(args: Compare) -> ComparisonSpec:
+    """What the words mean. Raises NeecoError for a budget or masks that cannot be understood."""
+    from neeco.errors import NeecoError
+    from neeco.evaluation.experiments.comparison import ComparisonSpec
+
+    masks: dict[str, Path] = {}
+    for word in args.masks:
+        name, equals, folder = word.partition("=")
+        if not (name and equals and folder):
+            raise NeecoError(f"--masks: {word!r} is not NAME=FOLDER; write such as sam2=masks/sam2")
+        if name in masks:
+            raise NeecoError(f"--masks: {name!r} is given twice; name each folder differently")
+        masks[name] = Path(folder)
+    return ComparisonSpec(
+        args.capture,
+        args.output,
+        tuple(dict.fromkeys(args.methods)),
+        _budget(args),
+        args.seeds,
+        args.splits,
+        args.lpips_weights,
+        args.workers,
+        masks,
+    )
+
+
+def _budget(args: Compare) -> Budget:
+    from neeco.errors import NeecoError
+    from neeco.evaluation.experiments.jobs import Budget
+
+    options = {
+        "--minutes": args.minutes,
+        "--processor-minutes": args.processor_minutes,
+        "--iterations": args.iterations,
+    }
+    given = [option for option, value in options.items() if value is not None]
+    if len(given) != 1:
+        told = f"{' and '.join(given)} are given" if given else "no budget is given"
+        raise NeecoError(
+            f"{told}; every method trains equally long: give one of {', '.join(options)} (try --minutes 5)"
+        )
+    if args.processor_minutes is not None:
+        return Budget(args.processor_minutes, None, "processor")
+    return Budget(args.minutes, args.iterations)
+
+
+def _shown(table: Any) -> Table:
+    """A table of the comparison for the terminal; the best of a column is bold."""
+    shown = Table(Column("method", no_wrap=True), title=table.title, title_justify="left")
+    for column in table.columns:
+        shown.add_column(column.title, justify="right")
+    for name, cells in table.rows:
+        if name in table.failed:
+            shown.add_row(name, "[red]failed[/red]")
+            continue
+        texts = [f"{cell.mean} ± {cell.std}" if cell.std else cell.mean for cell in cells]
+        shown.add_row(name, *(f"[bold]{t}[/bold]" if c.best else t for t, c in zip(texts, cells, strict=True)))
+    return shown

@@ -1,0 +1,103 @@
+"""The masks of a comparison: those of our runs and those that others made, scored by the same function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neeco.capture import Capture
+from neeco.capture.images import write_labels
+from neeco.capture.model import Frame
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
+from neeco.evaluation.mask_scores import score_masks
+from neeco.evaluation.scoring import draw
+from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.files import write_json
+from neeco.training.run import Run
+
+NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument
+Row = dict[str, Any]
+
+
+def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:
+    """Those of `splits` in which at least one frame has a true or reference mask."""
+    places = (capture.root / "truth" / "masks", capture.root / REFERENCE_FOLDER)
+
+    def told(split: str) -> bool:
+        return any((place / f"{frame.name}.png").is_file() for frame in capture.split(split) for place in places)
+
+    return tuple(split for split in splits if told(split))
+
+
+def check_masks(masks: Mapping[str, Path], capture: Capture, splits: Sequence[str], taken: Sequence[str]) -> None:
+    """Raises NeecoError for a name that a method has, a folder that holds no masks, or a capture without truth."""
+    for name, folder in masks.items():
+        if not name or name in taken:
+            raise NeecoError(f"--masks: {name!r} is the name of a method, or none; give another NAME=FOLDER")
+        open_masks(folder)
+    if masks and not splits_with_truth(capture, splits):
+        raise NeecoError(f"--masks: {capture.root} has no truth/masks to score them against; leave --masks out")
+
+
+def score_folder(
+    name: str, seed: int | None, folder: Path, capture: Capture, splits: Sequence[str]
+) -> tuple[list[Row], list[str]]:
+    """Rows {name, seed, split, images, and MASK_METRICS} of a folder of masks, one per split, and notes.
+
+    A split of which the folder has no mask gets no row but a note. Raises NeecoError for masks that cannot be compared.
+    """
+    given = open_masks(folder)
+    rows, notes = [], []
+    for split in splits:
+        if not any(frame.name in given.files for frame in capture.split(split)):
+            notes.append(f"{name}: no mask of split {split} in {folder}")
+            continue
+        scores = score_masks(folder, capture.root, splits=[split])
+        row = {"name": name, "seed": seed, "split": split, "images": scores["images"]}
+        row |= {key: scores["instrument"][key] for key in NAMED_SCORES}
+        row["challenge_iou_parts"] = scores["classes"]["challenge_iou"] if scores["classes"] else None
+        rows.append(row)
+        if scores["missing"]:
+            missing = len(scores["missing"])
+            notes.append(f"{name}: {missing} of {scores['images']} masks of {split} are missing and count as empty")
+    return rows, notes
+
+
+@torch.no_grad()
+def draw_masks(run: Run, folder: Path, frames: Sequence[Frame]) -> bool:
+    """Write the run's part ids of `frames` as `folder`/<stem>_parts.png, and parts.json, which names them; False, and
+    nothing written, when its scene carries no labels."""
+    scene = run.scene
+    if not scene.label_names:
+        return False
+    ids = [{"id": index + 1, "part": part} for index, (_, part) in enumerate(scene.label_names)]
+    write_json(folder / PARTS_FILE, {"ids": ids})
+    with scene.deformation.torch_threads():
+        for frame in frames:
+            parts = draw(scene, frame.state, frame.camera).parts
+            assert parts is not None, "a scene with label names draws parts"
+            write_labels(folder / f"{frame.name}{PARTS_SUFFIX}.png", parts)
+    return True
+
+
+def score_runs(
+    runs: Sequence[tuple[str, int, Run]],
+    output: Path,
+    capture: Capture,
+    splits: Sequence[str],
+    report: Callable[[int, int], None],
+) -> list[Row]:
+    """Draw the masks of every (name, seed, run) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
+    rows: list[Row] = []
+    for index, (name, seed, run) in enumerate(runs):
+        report(index, len(runs))
+        for split in splits:
+            folder = output / "masks" / f"{name}-seed{seed}" / split
+            if draw_masks(run, folder, capture.split(split)):
+                rows += score_folder(name, seed, folder, capture, [split])[0]
+    report(len(runs), len(runs))
+    return rows
