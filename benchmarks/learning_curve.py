@@ -28,7 +28,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_text
 from neeco.raster.threads import set_threads
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import nice_ticks
 from neeco.scene import Drawable
 from neeco.training.options import training_config
 from neeco.training.protocol import TrainingSession

@@ -45,6 +45,11 @@ def test_a_schedule_stated_for_more_steps_scales_with_the_run() -> None:
     assert Schedule(config, 20).density().interval == 1
 
 
+def test_opacity_has_time_to_come_back_between_resets_however_short_the_run() -> None:
+    config = ScheduleConfig(opacity_reset="off", published_steps=20_000)
+    assert [Schedule(config, n).density().opacity_reset for n in (20_000, 4_000, 1_000, 100)] == [3_000, 600, 300, 300]
+
+
 def test_no_opacity_reset_stays_none_however_short_the_run() -> None:
     plain = DensityPhase(200, 0, 2e-4)
     config = ScheduleConfig(opacity_reset="off", plain_density=plain, published_steps=20_000)

@@ -115,3 +115,13 @@ def test_a_loss_that_is_no_number_ends_the_run(capture: Path, tmp_path: Path, mo
     with pytest.raises(NeecoError, match="the loss became nan at iteration 1, frame 0000"):
         train(capture, tmp_path / "run", config_of("3dgs"))
     assert not (tmp_path / "run" / "scene.safetensors").exists()
+
+
+def test_a_scene_that_diverged_behind_a_finite_image_ends_the_run(capture: Path, tmp_path: Path) -> None:
+    def watch(session) -> None:
+        if session.iteration == 60:
+            session.scene.canonical.log_scales.data[3] = float("nan")
+
+    with pytest.raises(NeecoError, match="not finite after 60 iterations: it diverged"):
+        train(capture, tmp_path / "run", config_of("3dgs"), watch=watch)
+    assert not (tmp_path / "run" / "scene.safetensors").exists()

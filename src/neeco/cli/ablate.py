@@ -100,4 +100,7 @@ def _print_verdicts(ablation: dict[str, Any]) -> None:
     from neeco.evaluation.experiments.ablation_tables import agreement
 
     for table in ablation["tables"]:
-        print(f"{table['title']}: {agreement(table) or 'our own, nothing published to compare with'}")
+        if table["judged"]:
+            print(f"{table['title']}: {agreement(table)}")
+    for note in ablation["notes"]:
+        print(f"note: {note}")

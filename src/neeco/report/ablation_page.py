@@ -19,6 +19,7 @@ from neeco.report.charts import Series, chart, download, legend
 from neeco.report.style import CHART_STYLE, STYLE, html_page
 
 PAGE_STYLE = """
+a { color: var(--accent); }
 td:nth-child(2), th:nth-child(2) { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
 tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margin: 14px 0;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)); }
@@ -30,7 +31,12 @@ tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margi
 def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
     """Write DIR/report.html from what `run_ablations` returned; its path."""
     name = Path(ablation["capture"]).name
-    sections = [_header(name, ablation), _failures(ablation["failures"]), _summary(ablation["tables"])]
+    sections = [
+        _header(name, ablation),
+        _failures(ablation["failures"]),
+        _notes(ablation["notes"]),
+        _summary(ablation["tables"]),
+    ]
     sections += [_section(table, ablation) for table in ablation["tables"]]
     sections.append(_runs(ablation))
     path = output / "report.html"
@@ -49,7 +55,7 @@ def _header(name: str, ablation: dict[str, Any]) -> str:
     )
     return (
         f"<header><h1>{escape(name)} <span class='soft'>ablations</span></h1>"
-        f"<p>What becomes of the result when one part is taken away or turned round. Every run has {steps}, "
+        f"<p>What becomes of the result when one part is taken away or turned round. Runs have {steps}, "
         f"seed {ablation['seed']}{extra}. {scaled}In brackets: the difference to the line in bold.</p>"
         f"<p>One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. "
         "The paper's numbers come from other recordings and longer runs; only directions are compared.</p>"
@@ -63,6 +69,10 @@ def _failures(failures: Sequence[dict[str, str]]) -> str:
         return ""
     rows = "".join(f"<li><b>{escape(item['run'])}</b>: {escape(item['error'])}</li>" for item in failures)
     return f"<h2>Not measured</h2><ul>{rows}</ul>"
+
+
+def _notes(notes: Sequence[str]) -> str:
+    return f"<ul class='note'>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>" if notes else ""
 
 
 def _summary(tables: Sequence[dict[str, Any]]) -> str:

@@ -27,6 +27,9 @@ class DensityPhase:
 
 NEECO_PHASES = {1: DensityPhase(500, 10_000, 4e-4), 2: DensityPhase(200, 3_000, 2e-4)}
 GAUSSIAN_SPLATTING = DensityPhase(100, 3_000, 2e-4)
+# Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's length, so
+# neither does that: with resets closer than twice this, the scene would stay transparent and never show the instrument.
+CLOSEST_RESETS = 300
 
 
 @dataclass(frozen=True)
@@ -98,9 +101,13 @@ class Schedule:
         config = self.config
         return DensityPhase(
             self.scaled(self._density_of(config.density_interval).interval),
-            self.scaled(self._density_of(config.opacity_reset).opacity_reset),
+            self._reset_interval(self._density_of(config.opacity_reset).opacity_reset),
             self._density_of(config.gradient_threshold).threshold,
         )
+
+    def _reset_interval(self, published: int) -> int:
+        """Scaled, but not below CLOSEST_RESETS, or what was published where that is less."""
+        return max(self.scaled(published), min(published, CLOSEST_RESETS))
 
     def _density_of(self, part: Part) -> DensityPhase:
         return self.config.plain_density if part == "off" else NEECO_PHASES[self._acting_phase(part)]

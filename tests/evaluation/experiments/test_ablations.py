@@ -45,6 +45,7 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
     configs = {name: read_config(plan.output / "runs" / name) for name in names}
     for config in configs.values():
         assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
+        assert config["deformation"]["warm_up"] == 0.25
         assert (config["iterations"], config["initial_points"], config["tissue_budget"]) == (12, 30, 120)
     changed = {key for key, value in configs["neeco-no-uniform-motion"].items() if value != configs["neeco"][key]}
     assert changed == {"schedule"}

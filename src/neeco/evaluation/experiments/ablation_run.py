@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,17 +16,24 @@ from neeco.evaluation.experiments.ablation_results import LabelScores, table_of
 from neeco.evaluation.experiments.ablations import (
     ABLATIONS,
     INITIAL_SHARE,
+    LONGEST_REST,
     OURS,
     PAPER,
     PAPER_SETTINGS,
+    PHASE_1_SHARE,
+    REST_STEPS,
     Ablation,
     Variant,
 )
 from neeco.evaluation.experiments.derived import derive_capture
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.files import new_folder, read_json, write_json
+from neeco.scene.deformations.nps import WARM_UP
 from neeco.scene.methods import method_class
+from neeco.training.config import TrainConfig
 from neeco.training.options import training_config
+from neeco.training.schedule import CLOSEST_RESETS
+from neeco.training.train import ROW_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
@@ -95,9 +103,32 @@ def run_ablations(
         "tables": [table_of(table, folders, finished, labels, splits) for table in chosen],
         "runs": [finished[name] for name in finished],
         "failures": failures + untold,
+        "notes": notes(plan, {variant.method for variant in variants}),
     }
     write_json(plan.output / "ablation.json", ablation)
     return ablation
+
+
+def notes(plan: AblationPlan, methods: set[str]) -> list[str]:
+    """What runs of this length are too short to show, in words."""
+    steps, kinematic = plan.budget("neeco").iterations or 0, plan.budget("kinematic").iterations or 0
+    told = []
+    if "neeco" in methods and PHASE_1_SHARE * steps < ROW_INTERVAL:
+        told.append(
+            f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
+            f"({ROW_INTERVAL} steps); give --iterations {math.ceil(ROW_INTERVAL / PHASE_1_SHARE)} or more"
+        )
+    if "neeco" in methods and TrainConfig().density_stop * steps <= CLOSEST_RESETS:
+        told.append(
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {CLOSEST_RESETS}, and density "
+            "control ends half-way), so P_oi changes nothing here"
+        )
+    if "kinematic" in methods and kinematic < KINEMATIC_LEAST:
+        told.append(
+            f"kinematic: {kinematic} steps are few: hinges begin to learn and the shaft to spin after 600, labels to "
+            f"sharpen after 1,000; give --kinematic-iterations {KINEMATIC_LEAST} or more"
+        )
+    return told
 
 
 def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
@@ -143,23 +174,33 @@ def _takes(method: str, name: str) -> bool:
 
 
 def _job(plan: AblationPlan, variant: Variant) -> Job:
-    """The job of one variant. Settings: the paper's schedule, then the user's, then what the variant is about.
-
-    Runs of `neeco` begin with INITIAL_SHARE of the tissue's budget unless `initial_points` is given: with the budget
-    full of sparse points density control could do nothing.
-    """
+    """The job of one variant. Settings: the paper's schedule, then the user's, then what the variant is about."""
     budget = plan.budget(variant.method)
     given = [item for item in plan.settings if _takes(variant.method, item.partition("=")[0])]
     common = PAPER_SETTINGS if variant.method == "neeco" else ()
     values = {"iterations": budget.iterations, "seed": plan.seed, "transforms": plan.transforms}
     config = training_config(variant.method, values, [*common, *given, *variant.settings])
-    if variant.method == "neeco" and config.initial_points is None:
-        config = replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+    if variant.method == "neeco":
+        config = _started(config, budget.iterations or 1)
     capture = plan.capture
     if variant.derived is not None:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
     return Job(variant.name, plan.seed, capture, plan.output / "runs" / variant.name, config, budget)
+
+
+def _started(config: TrainConfig, iterations: int) -> TrainConfig:
+    """How all runs of `neeco` begin, unless the user set it.
+
+    With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing. The
+    network rests for its usual share of the run or REST_STEPS, whichever is longer.
+    """
+    if config.initial_points is None:
+        config = replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+    if "warm_up" not in config.deformation:
+        rest = max(WARM_UP, min(LONGEST_REST, REST_STEPS / iterations))
+        config = replace(config, deformation=config.deformation | {"warm_up": round(rest, 4)})
+    return config
 
 
 def _label_scores(

@@ -17,6 +17,8 @@ PHASE_1_STEPS = 8_000
 PHASE_1_SHARE = PHASE_1_STEPS / PUBLISHED_STEPS
 CHECKPOINTS = (20, 40, 60, 100)  # per cent of the run: the paper's 4k, 8k, 12k and 20k steps
 NOISE_DEGREES_PER_MM = 0.2
+REST_STEPS = 100  # of the network, where its usual share of a short run is less: an empty image throws it out of sight
+LONGEST_REST = 0.25  # of the run
 INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
 
 PHASE_1_PSNR = "phase_1_psnr"  # training frames, as in the paper
