@@ -153,9 +153,9 @@ def test_masks_of_others_stand_in_the_same_table(spec: ComparisonSpec, tmp_path:
         assert rows["perfect", "test"][key]["mean"] == 1.0
     assert rows["perfect", "test"]["psnr"]["n"] == 0
     ours = rows["kinematic", "test"]
-    if ours["mask_iou"]["mean"] is not None:
-        assert ours["iou"]["mean"] == pytest.approx(ours["mask_iou"]["mean"])
-    assert ours["iou"]["n"] == 1
+    assert ours["failed"] == 0
+    assert ours["iou"]["n"] == ours["mask_iou"]["n"] == 1
+    assert ours["iou"]["mean"] == pytest.approx(ours["mask_iou"]["mean"])
     assert "| perfect |" in (spec.output / "comparison.md").read_text()
     assert {"name": "perfect", "method": None, "source": "masks", "folder": str(tmp_path / "perfect")} in result[
         "methods"
