@@ -1,14 +1,14 @@
 """D-NeRF-format folders to check `3dgs` and `deformable-3dgs` against published numbers.
 
     python benchmarks/blender_format.py reduce SOURCE OUTPUT --size 200 [--test-every 4]
-    python benchmarks/blender_format.py generate OUTPUT --size 200 [--train 100] [--test 20]
+    python benchmarks/blender_format.py generate OUTPUT --size 200 [--train 100] [--test 20] [--reach 1]
 
 `reduce` averages the images of a folder in the format of NeRF's and D-NeRF's synthetic scenes (`transforms_train.json`,
 `_val`, `_test`, RGBA images) down to `--size` pixels a side, a whole fraction of theirs; `--test-every N` keeps every
 Nth test frame.
 
 `generate` renders a moving scene of our own in that format, by casting rays at five textured solids: a ball that jumps,
-two that circle each other, one that swings, and a disc of floor that stays. As in D-NeRF every frame is another moment
+two that sway about it, one that swings, and a disc of floor that stays. As in D-NeRF every frame is another moment
 seen from another point of the upper hemisphere, 4 units away, and the background is transparent; the test cameras
 go round once while time passes. Everything is seeded: the same command gives the same pixels.
 """
@@ -82,21 +82,21 @@ def _save(pixels: np.ndarray, path: Path) -> None:
     Image.fromarray((np.clip(pixels, 0, 1) * 255).round().astype(np.uint8), "RGBA").save(path)
 
 
-def balls(time: float) -> list[tuple[np.ndarray, float, int]]:
-    """(centre [3], radius, texture) of every ball at `time` in [0, 1]."""
-    turn, height = 2 * math.pi * time, abs(math.sin(3 * math.pi * time))
-    circling = 0.75 * np.array([math.cos(turn), math.sin(turn), 0.0])
-    lower, swing = np.array([0.0, 0.0, 0.4]), 0.6 * math.sin(turn)
+def balls(time: float, reach: float = 1.0) -> list[tuple[np.ndarray, float, int]]:
+    """(centre [3], radius, texture) of every ball at `time` in [0, 1]; how far they move grows with `reach`."""
+    turn = 2 * math.pi * time
+    angle, swing = 0.5 * reach * math.sin(turn), 0.4 * reach * math.sin(turn)
+    around, lower = 0.75 * np.array([math.cos(angle), math.sin(angle), 0.0]), np.array([0.0, 0.0, 0.4])
     return [
-        (np.array([0.0, 0.0, -0.35 + 0.9 * height]), 0.3, 0),
-        (circling - lower, 0.25, 1),
-        (-circling - lower, 0.25, 2),
+        (np.array([0.0, 0.0, -0.35 + 0.5 * reach * math.sin(math.pi * time)]), 0.3, 0),
+        (around - lower, 0.25, 1),
+        (-around - lower, 0.25, 2),
         (np.array([0.9 * math.sin(swing), 0.0, 1.1 - 0.9 * math.cos(swing)]), 0.2, 3),
     ]
 
 
-def cast(origins: np.ndarray, directions: np.ndarray, time: float) -> np.ndarray:
-    """RGBA [R, 4] of what unit rays [R, 3] meet at `time`."""
+def cast(origins: np.ndarray, directions: np.ndarray, time: float, reach: float = 1.0) -> np.ndarray:
+    """RGBA [R, 4] of what unit rays [R, 3] meet at `time` (see `balls`)."""
     nearest = np.full(len(origins), np.inf)
     color = np.zeros((len(origins), 4))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -107,7 +107,7 @@ def cast(origins: np.ndarray, directions: np.ndarray, time: float) -> np.ndarray
     nearest[met] = depth[met]
     color[met, :3] = np.where(squares[:, None] > 0, [0.75, 0.72, 0.65], [0.35, 0.38, 0.45])
     color[met, 3] = 1
-    for center, radius, texture in balls(time):
+    for center, radius, texture in balls(time, reach):
         offset = origins - center
         b = (offset * directions).sum(1)
         inside = b * b - (offset * offset).sum(1) + radius * radius
@@ -139,18 +139,18 @@ def look_from(azimuth: float, elevation: float) -> np.ndarray:
     return pose
 
 
-def draw(pose: np.ndarray, time: float, size: int) -> np.ndarray:
+def draw(pose: np.ndarray, time: float, size: int, reach: float = 1.0) -> np.ndarray:
     """The scene at `time` as RGBA [size, size, 4]."""
     fine = size * SAMPLES
     slopes = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(ANGLE / 2)
     x, y = np.meshgrid(slopes, -slopes)
     directions = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3].T
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    pixels = cast(np.broadcast_to(pose[:3, 3], directions.shape), directions, time)
+    pixels = cast(np.broadcast_to(pose[:3, 3], directions.shape), directions, time, reach)
     return reduced(pixels.reshape(fine, fine, 4), size, Path("drawing"))
 
 
-def generate(output: Path, size: int, counts: dict[str, int], seed: int = 0) -> None:
+def generate(output: Path, size: int, counts: dict[str, int], reach: float = 1.0, seed: int = 0) -> None:
     """Write the moving scene to `output`: `counts` frames of each split."""
     generator = np.random.default_rng(seed)
     for split, count in counts.items():
@@ -161,7 +161,7 @@ def generate(output: Path, size: int, counts: dict[str, int], seed: int = 0) -> 
             if split == "test":
                 azimuth, elevation = 2 * math.pi * index / count, math.radians(30)
             pose = look_from(azimuth, elevation)
-            _save(draw(pose, time, size), output / split / f"r_{index:03d}.png")
+            _save(draw(pose, time, size, reach), output / split / f"r_{index:03d}.png")
             frames.append({"file_path": f"./{split}/r_{index:03d}", "time": time, "transform_matrix": pose.tolist()})
         write_json(output / f"transforms_{split}.json", {"camera_angle_x": ANGLE, "frames": frames})
 
@@ -176,6 +176,7 @@ def main() -> int:
     make = verbs.add_parser("generate")
     make.add_argument("--train", type=int, default=100)
     make.add_argument("--test", type=int, default=20)
+    make.add_argument("--reach", type=float, default=1.0, help="how far things move; at 1 by one to two of their radii")
     for verb in (shrink, make):
         verb.add_argument("output", type=Path)
         verb.add_argument("--size", type=int, default=200, help="pixels a side")
@@ -184,7 +185,8 @@ def main() -> int:
         if arguments.verb == "reduce":
             print(reduce_folder(arguments.source, arguments.output, arguments.size, arguments.test_every))
         else:
-            generate(arguments.output, arguments.size, {"train": arguments.train, "val": 5, "test": arguments.test})
+            counts = {"train": arguments.train, "val": 5, "test": arguments.test}
+            generate(arguments.output, arguments.size, counts, arguments.reach)
     except NeecoError as error:
         print(error, file=sys.stderr)
         return 1

@@ -29,7 +29,7 @@ from neeco.evaluation.truth import load_reference
 from neeco.files import write_text
 from neeco.raster import rasterize
 from neeco.raster.threads import set_threads
-from neeco.report.curves import nice_ticks
+from neeco.report.axes import nice_ticks
 from neeco.scene import Scene
 from neeco.training.options import training_config
 from neeco.training.run import load_run

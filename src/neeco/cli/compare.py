@@ -49,12 +49,17 @@ class Compare:
 
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
+    from neeco.capture import read_capture
     from neeco.cli._jobs import JobBars
     from neeco.evaluation.experiments.comparison import compare, failures
     from neeco.evaluation.experiments.tables import absent_notes, budget_words, tables_of
+    from neeco.report.comparison_page import write_comparison_report
 
     with JobBars() as bars:
         comparison = compare(_spec(args), bars.show, bars.stage)
+        bars.stage("report", 0, 1)
+        page = write_comparison_report(args.output, comparison, read_capture(args.capture))
+        bars.stage("report", 1, 1)
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
     for table in tables_of(comparison):
@@ -63,6 +68,7 @@ def run(args: Compare) -> int:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     for what, name in (("tables", "comparison.md, .csv, .tex"), ("all numbers", "comparison.json, data/")):
         console.print(f"{what}: {args.output}/: {name}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
     failed = failures(comparison)
     if failed:
         more = f" (and {len(failed) - 1} more, told above)" if len(failed) > 1 else ""

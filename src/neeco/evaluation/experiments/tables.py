@@ -14,6 +14,10 @@ from neeco.files import write_text
 
 METRICS = (*SPLIT_METRICS, *MASK_METRICS, *RUN_METRICS)
 UNKNOWN = "-"
+ABSENT = {
+    "psnr_instrument": "the capture has no true masks, or no run finished",
+    "mask_iou": "no method here carries labels, the capture has no true masks, or no run finished",
+}
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ def absent_notes(comparison: Mapping[str, Any]) -> list[str]:
     for column in SPLIT_COLUMNS:
         values = [row[column.key]["n"] for row in comparison["summary"]]
         if not any(values) and not any(note.startswith(column.key) for note in notes):
-            notes.append(f"{column.key}: nothing to compare with in this capture, or no method finished")
+            notes.append(f"{column.key}: nobody has it: {ABSENT.get(column.key, 'no run finished')}")
     if not any(row["num_gaussians"]["std"] is not None for row in comparison["summary"]):
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
     return notes
