@@ -27,17 +27,16 @@ from neeco.capture.model import Frame
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_text
-from neeco.raster import rasterize
 from neeco.raster.threads import set_threads
 from neeco.report.axes import nice_ticks
-from neeco.scene import Scene
+from neeco.scene import Drawable
 from neeco.training.options import training_config
+from neeco.training.protocol import TrainingSession
 from neeco.training.run import load_run
-from neeco.training.session import Session
 from neeco.training.train import train
 
 MINUTES = (0.5, 1.0, *range(2, 61, 2))  # of processor time, when a run is scored
-KINDS = {"str": str, "float": float, "int": int}
+KINDS = {"str": str, "float": float, "int": int, "int | None": lambda text: int(text) if text else None}
 COLORS = ("#0b6e99", "#b3541e", "#1a7f4b", "#7a3ea1", "#8a6d00", "#b3261e")
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 520, 300, 46, 170, 30, 40
 
@@ -49,7 +48,7 @@ class Row:
     name: str
     cpu_seconds: float
     iteration: int
-    gaussians: int
+    gaussians: int | None
     phase: int
     split: str
     psnr: float
@@ -73,13 +72,13 @@ class HeldOut:
                 rows.append((frame, frame.load_image(), None if reference is None else reference.mask))
 
     @torch.no_grad()
-    def score(self, scene: Scene) -> dict[str, tuple[float, float]]:
+    def score(self, scene: Drawable) -> dict[str, tuple[float, float]]:
         """Mean PSNR per split over whole images and inside the true masks (NaN where there are none), dB."""
         scores = {}
         for split, rows in self.frames.items():
             whole, inside = [], []
             for frame, photo, mask in rows:
-                image = rasterize(scene.at(frame.state), scene.camera(frame.camera)).color.clamp(0, 1)
+                image = scene.draw(frame.state, frame.camera).color.clamp(0, 1)
                 whole.append(psnr(image, photo, frame.load_mask()))
                 inside.append(psnr(image, photo, mask) if mask is not None else float("nan"))
             scores[split] = (sum(whole) / len(whole), sum(inside) / len(inside))
@@ -95,7 +94,7 @@ class Recorder:
         self.due = list(MINUTES)
         self.rows: list[Row] = []
 
-    def watch(self, session: Session) -> None:
+    def watch(self, session: TrainingSession) -> None:
         """After a step: score when it is time to; raises Enough at `stop` minutes."""
         minutes = session.seconds / 60
         if minutes < self.due[0] and session.progress < 1:
@@ -106,13 +105,13 @@ class Recorder:
         if self.stop is not None and minutes >= self.stop:
             raise Enough
 
-    def add(self, session: Session, scores: dict[str, tuple[float, float]]) -> None:
+    def add(self, session: TrainingSession, scores: dict[str, tuple[float, float]]) -> None:
         for split, (whole, inside) in scores.items():
             row = Row(
                 self.name,
                 round(session.seconds, 1),
                 session.iteration,
-                len(session.scene.canonical),
+                session.scene.num_gaussians,
                 session.schedule.phase,
                 split,
                 round(whole, 3),

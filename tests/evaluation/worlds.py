@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
-from neeco.raster import Camera, Gaussians, rasterize
+from neeco.raster import Camera, Gaussians, Rendering, rasterize
 from neeco.scene.deformations.static import Static
 
 WIDTH, HEIGHT = 48, 40
@@ -51,6 +52,16 @@ class TinyScene:
 
     def camera(self, camera: Camera) -> Camera:
         return camera
+
+    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+        return rasterize(self.at(state), camera, channels=self.label_channels() if labels and self.labelled else None)
+
+    def torch_threads(self) -> AbstractContextManager[None]:
+        return self.deformation.torch_threads()
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.tissue) + len(self.bar)
 
     def label_channels(self) -> Tensor:
         channels = torch.zeros(len(self.tissue) + len(self.bar), len(self.label_names))

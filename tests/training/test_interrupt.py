@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from neeco.cli import main
+from neeco.training import session as session_module
 from neeco.training import train as module
 from neeco.training.interrupt import hearing_stops
 from neeco.training.options import training_config
@@ -96,7 +97,7 @@ def test_ctrl_c_while_finishing_loses_no_step(capture: Path, tmp_path: Path, mon
 
     whole = train(capture, tmp_path / "whole", CONFIG)
     with monkeypatch.context() as patched:
-        patched.setattr(module, "finish_instruments", interrupted)
+        patched.setattr(session_module, "finish_gaussians", interrupted)
         with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
             train(capture, tmp_path / "cut", CONFIG)
     steps: list[int] = []
@@ -111,7 +112,7 @@ def test_ctrl_c_before_the_first_step_leaves_nothing(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "initial_scene", interrupted)
+    monkeypatch.setattr(module, "begin_session", interrupted)
     assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
     assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
     assert not (tmp_path / "runs").exists()

@@ -32,7 +32,8 @@ def train_with_progress(capture: Path, output: Path, config: TrainConfig, *, res
         if row.note:
             bar.console.print(row.note, style="dim", highlight=False)
             return
-        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB  {row.num_gaussians} Gaussians  phase {row.phase}"
+        size = "" if row.num_gaussians is None else f"  {row.num_gaussians} Gaussians  phase {row.phase}"
+        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{size}"
         bar.update(task, completed=row.progress, description=text)
 
     try:

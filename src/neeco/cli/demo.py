@@ -99,7 +99,7 @@ def _synthesize(trained: Run, output: Path) -> None:
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
-    with trained.scene.deformation.torch_threads(), counting("synthesize", IMAGES) as advance:
+    with trained.scene.torch_threads(), counting("synthesize", IMAGES) as advance:
         synthesize(trained, output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
 
 

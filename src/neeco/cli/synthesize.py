@@ -59,7 +59,7 @@ def run(arguments: Arguments) -> int:
     settings = Settings(**{name: getattr(arguments, name) for name in Settings.__dataclass_fields__})
     settings.check()
     trained = load_run(arguments.run)
-    with trained.scene.deformation.torch_threads(), counting("synthesize", arguments.count) as advance:
+    with trained.scene.torch_threads(), counting("synthesize", arguments.count) as advance:
         try:
             summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
         except KeyboardInterrupt:

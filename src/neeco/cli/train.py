@@ -18,7 +18,8 @@ class Arguments:
     output: Path
     """Run folder to write."""
     method: str = "kinematic"
-    """kinematic, neeco (the paper), 3dgs, deformable-3dgs or 4dgs; NAME+dta: with the paper's training adjustment."""
+    """kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
+    adjustment."""
     iterations: int | None = None
     """Optimisation steps; by default as the method has it."""
     minutes: float | None = None

@@ -14,11 +14,10 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.resize import resize_camera, resize_mask
-from neeco.raster import rasterize
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Drawable
 
 MAX_VIEWS = 96  # training views compared with, evenly spaced over the recording: neighbours see the same tissue
 FACTOR = 0.25  # of the image's resolution
@@ -70,15 +69,15 @@ class Coverage:
 
 
 @torch.no_grad()
-def observe(scene: Scene, frames: Sequence[Frame]) -> Coverage:
+def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
     """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
     count = min(len(frames), MAX_VIEWS)
     chosen = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, count)] if count else []
     drawn = []
     for frame in chosen:
-        camera = _small(scene.camera(frame.camera))
-        rendering = rasterize(scene.at(frame.state), camera)
-        drawn.append((camera, _filled(rendering.depth, rendering.alpha)))
+        camera = _small(frame.camera)
+        rendering = scene.draw(frame.state, camera)
+        drawn.append((scene.camera(camera), _filled(rendering.depth, rendering.alpha)))
     height = max((camera.height for camera, _ in drawn), default=1)
     width = max((camera.width for camera, _ in drawn), default=1)
     depths = torch.zeros(len(drawn), height, width)
@@ -94,19 +93,18 @@ def observe(scene: Scene, frames: Sequence[Frame]) -> Coverage:
 
 
 @torch.no_grad()
-def unseen_tissue(coverage: Coverage, scene: Scene, frame: Frame) -> tuple[Tensor, Tensor]:
+def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Tensor, Tensor]:
     """Tissue in `frame` that no training view saw, and all its tissue: two bool masks [H, W].
 
     The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the
     nearest drawn pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
-    camera = _small(scene.camera(frame.camera))
-    labels = scene.label_channels()
-    rendering = rasterize(scene.at(frame.state), camera, channels=labels if labels.shape[1] else None)
+    camera = _small(frame.camera)
+    rendering = scene.draw(frame.state, camera, labels=True)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
         tissue = composited_parts(rendering) == 0
-    points = _backproject(_filled(rendering.depth, rendering.alpha), camera)  # [h, w, 3]
+    points = _backproject(_filled(rendering.depth, rendering.alpha), scene.camera(camera))  # [h, w, 3]
     unseen = torch.zeros_like(tissue)
     unseen[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)

@@ -22,15 +22,16 @@ from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, m
 from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, draw, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
-from neeco.raster import rasterize
 from neeco.raster.types import Camera
+from neeco.scene.drawable import gaussian_scene
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Drawable
     from neeco.training.run import Run
 
 EVALUATION_FILE = "evaluation.json"
 TIMED_DRAWS = 7
+TIMED_SECONDS = 10.0  # after which a slow scene is not drawn again
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
@@ -47,7 +48,7 @@ class _Split:
 class _Context:
     """What is the same for every frame."""
 
-    scene: Scene
+    scene: Drawable
     capture: Capture
     networks: dict[str, Lpips]
     coverage: Coverage
@@ -69,9 +70,11 @@ def evaluate_run(
     """
     capture, scene = run.capture(), run.scene
     splits = _chosen_splits(capture, splits)
+    if align:
+        gaussian_scene(scene, "--align")
     networks = find_lpips(lpips_weights)  # these keep torch's threads, the rest of the scoring takes fewer
     report = progress or (lambda what, done, total: None)
-    with scene.deformation.torch_threads():
+    with scene.torch_threads():
         report("training views", 0, 1)
         context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
         report("training views", 1, 1)
@@ -132,7 +135,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) ->
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
-            state, camera = align_frame(scene, frame)
+            state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
             row |= _fit_of(frame, state, camera)
         _add(tally, row, scene, state, camera, photo, context.networks)
 
@@ -140,7 +143,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) ->
 def _add(
     tally: _Split,
     row: dict[str, Any],
-    scene: Scene,
+    scene: Drawable,
     state: State,
     camera: Camera,
     photo: Photograph,
@@ -163,7 +166,7 @@ def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _summary(scene: Scene, tally: _Split) -> tuple[dict[str, Any], str | None]:
+def _summary(scene: Drawable, tally: _Split) -> tuple[dict[str, Any], str | None]:
     """Means over the frames that have the number, and which way the jaws were matched."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.rows]) for key in SCORES}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.rows)
@@ -179,21 +182,21 @@ def _summary(scene: Scene, tally: _Split) -> tuple[dict[str, Any], str | None]:
 
 
 @torch.no_grad()
-def _speed(scene: Scene, frames: Sequence[Frame]) -> tuple[float, int]:
-    """Posed draws per second (scene.at + rasterize, median of TIMED_DRAWS after two to warm up) and Gaussians drawn."""
-    seconds = []
-    count = 0
+def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]:
+    """Posed draws per second (median of TIMED_DRAWS after two to warm up; of fewer where those take long) and Gaussians
+    drawn."""
+    seconds: list[float] = []
     for index in range(TIMED_DRAWS + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
-        gaussians = scene.at(frame.state)
-        rasterize(gaussians, scene.camera(frame.camera))
+        scene.draw(frame.state, frame.camera)
         seconds.append(time.perf_counter() - start)
-        count = len(gaussians)
-    return 1.0 / statistics.median(seconds[2:]), count
+        if len(seconds) > 1 and sum(seconds) > TIMED_SECONDS:
+            break
+    return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 
 
-def _scene_notes(scene: Scene, networks: dict[str, Lpips]) -> list[str]:
+def _scene_notes(scene: Drawable, networks: dict[str, Lpips]) -> list[str]:
     notes = []
     missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
     if missing:

@@ -14,11 +14,10 @@ from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.lpips import MIN_SIZE, Lpips
 from neeco.evaluation.mask_metrics import dice, iou
 from neeco.evaluation.truth import Reference
-from neeco.raster import rasterize
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Drawable
 
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
 IMAGE_SCORES = ("psnr", "ssim", "lpips", "lpips_vgg")
@@ -54,12 +53,10 @@ class Photograph:
 
 
 @torch.no_grad()
-def draw(scene: Scene, state: State, camera: Camera) -> Drawing:
+def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
     """Draw the scene with its labels, by the one path training and synthesis use too."""
-    labels = scene.label_channels()
-    channels = labels if labels.shape[1] else None
-    rendering = rasterize(scene.at(state), scene.camera(camera), channels=channels)
-    parts = None if channels is None else composited_parts(rendering)
+    rendering = scene.draw(state, camera, labels=True)
+    parts = None if rendering.channels is None else composited_parts(rendering)
     return Drawing(rendering.color.clamp(0, 1), parts)
 
 

@@ -52,7 +52,7 @@ def frame_rows(comparison: Mapping[str, Any], capture: Capture, output: Path) ->
     shots: list[list[Shot]] = [[] for _ in chosen]
     for name, seed in _first_seeds(comparison["jobs"]):
         scene = load_run(job_folder(output, name, seed)).scene
-        with scene.deformation.torch_threads():
+        with scene.torch_threads():
             for index, frame in enumerate(chosen):
                 image = draw(scene, frame.state, frame.camera).image
                 shots[index].append(_shot(name, seed, frame, image.numpy()))

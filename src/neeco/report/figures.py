@@ -19,7 +19,7 @@ from neeco.evaluation.difference import difference_map, overlay_outline, overlay
 from neeco.evaluation.scoring import draw
 from neeco.evaluation.truth import load_reference
 from neeco.raster.types import Camera
-from neeco.scene import Scene
+from neeco.scene import Drawable
 
 MAX_WIDTH = 480  # px; the page has to stay a file one can mail
 FRAMES_PER_SPLIT = 3
@@ -40,7 +40,7 @@ class FrameFigure:
     mask: str | None
 
 
-def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Scene, kind: str) -> list[FrameFigure]:
+def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[FrameFigure]:
     """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`."""
     figures = []
     for split, rows in evaluation.get("per_frame", {}).get(kind, {}).items():
@@ -63,7 +63,7 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
 
 
 def _figure(
-    capture: Capture, scene: Scene, split: str, frame: Frame, why: str, kind: str, row: dict[str, Any]
+    capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, kind: str, row: dict[str, Any]
 ) -> FrameFigure:
     state, camera = _poses(frame, row)
     drawing = draw(scene, state, camera)

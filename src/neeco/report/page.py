@@ -16,7 +16,7 @@ from neeco.files import write_text
 from neeco.report.curves import curve, read_metrics
 from neeco.report.figures import FrameFigure, file_uri, frame_figures
 from neeco.report.style import STYLE, html_page
-from neeco.scene import Scene
+from neeco.scene import Drawable
 
 REPORT_FILE = "report.html"
 COLUMNS = (  # key, heading, format, what it means
@@ -48,7 +48,7 @@ def write_report(
     run_path: Path,
     evaluation: dict[str, Any],
     capture: Capture,
-    scene: Scene,
+    scene: Drawable,
     *,
     synthesis_preview: Path | None = None,
 ) -> Path:
@@ -59,7 +59,7 @@ def write_report(
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
-    with scene.deformation.torch_threads():
+    with scene.torch_threads():
         figures = frame_figures(evaluation, capture, scene, kind)
     sections = [
         _header(run_path, evaluation, capture, scene),
@@ -79,13 +79,14 @@ def write_report(
     return path
 
 
-def _header(run_path: Path, evaluation: dict[str, Any], capture: Capture, scene: Scene) -> str:
+def _header(run_path: Path, evaluation: dict[str, Any], capture: Capture, scene: Drawable) -> str:
     instruments = ", ".join(item.name for item in scene.instruments) or "no instrument"
     trained = len(capture.split("train"))
+    kind = "A radiance field" if scene.num_gaussians is None else "A Gaussian-splatting model"
     seen = " (split train apart)" if "train" in evaluation["given"] else ""
     return (
         f"<header><h1>{escape(capture.root.name)} <span class='soft'>learned by {escape(scene.method)}</span></h1>"
-        f"<p>A Gaussian-splatting model of this recording ({escape(instruments)}), learned from {trained} frames and "
+        f"<p>{kind} of this recording ({escape(instruments)}), learned from {trained} frames and "
         f"compared here with photographs it never saw{seen}. Everything below was drawn by the model itself.</p>"
         f"<p class='soft'>{datetime.now().astimezone():%Y-%m-%d %H:%M %Z} · neeco {escape(neeco.__version__)} · "
         f"{escape(str(run_path))}</p></header>"
@@ -104,7 +105,8 @@ def _tiles(evaluation: dict[str, Any]) -> str:
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
         tiles.append((f"{first['fps']:.1f}", "posed drawings per second"))
-        tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
+        if first["num_gaussians"] is not None:
+            tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
     cells = "".join(f"<div class='tile'><b>{value}</b><span>{escape(name)}</span></div>" for value, name in tiles)
     return f"<div class='tiles'>{cells}</div>"
 
@@ -158,7 +160,7 @@ def _parts(evaluation: dict[str, Any]) -> str:
     )
 
 
-def _frames(figures: list[FrameFigure], scene: Scene, kind: str) -> str:
+def _frames(figures: list[FrameFigure], scene: Drawable, kind: str) -> str:
     if not figures:
         return ""
     parts = [
@@ -194,7 +196,7 @@ def _frame(figure: FrameFigure) -> str:
     )
 
 
-def _key(scene: Scene) -> str:
+def _key(scene: Drawable) -> str:
     """Which tint is which part."""
     if not scene.label_names:
         return ""
@@ -260,7 +262,7 @@ def _preview(path: Path | None) -> str:
     )
 
 
-def _made(run_path: Path, capture: Capture, scene: Scene, rows: list[dict[str, Any]]) -> str:
+def _made(run_path: Path, capture: Capture, scene: Drawable, rows: list[dict[str, Any]]) -> str:
     splits = ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
     facts = [("capture", str(capture.root)), ("frames", splits), ("method", scene.method)]
     if rows:

@@ -16,7 +16,8 @@ from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
-from neeco.scene.methods import make_deformation
+from neeco.scene.methods import is_field, make_deformation, make_field
+from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.scene import Recording, Scene
 
 SCHEMA = "neeco-scene/1"
@@ -30,7 +31,7 @@ CANONICAL_SHAPES = {  # of one Gaussian
 }
 
 
-def save_scene(scene: Scene, path: Path) -> None:
+def save_scene(scene: Scene | NerfScene, path: Path) -> None:
     """Write `scene` atomically. The same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
     save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True)}, path)
@@ -48,7 +49,7 @@ def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Pat
     write_atomically(path, write)
 
 
-def load_scene(path: Path) -> Scene:
+def load_scene(path: Path) -> Scene | NerfScene:
     """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
     path = Path(path)
     if not path.is_file():
@@ -69,25 +70,20 @@ def load_scene(path: Path) -> Scene:
         raise NeecoError(f"{path}: damaged scene ({error}); train again") from None
 
 
-def pack_scene(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def pack_scene(scene: Scene | NerfScene) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, JSON-able header) from which `unpack_scene` makes the scene again."""
     recorded = scene.recorded
-    tensors = {f"canonical.{name}": tensor for name, tensor in scene.canonical.tensors().items()}
-    tensors |= {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
+    tensors = {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
     if recorded.states:
         tensors["recorded.cameras"] = torch.stack([camera.world_from_camera for camera in recorded.cameras])
         names = [instrument.name for instrument in scene.instruments]
         if names:
             poses = [torch.stack([state.instruments[name].pose for name in names]) for state in recorded.states]
             tensors["recorded.poses"] = torch.stack(poses)
-    header = {
+    header: dict[str, Any] = {
         "schema": SCHEMA,
         "version": __version__,
         "method": scene.method,
-        "deformation": scene.deformation.config(),
-        "counts": list(scene.canonical.counts),
-        "sh_degree": scene.sh_degree,
-        "backdrop": scene.backdrop,
         "diagnostics": scene.diagnostics,
         "instruments": [
             {"name": instrument.name, "joints": {name: limits for name, limits in instrument.joints.items()}}
@@ -106,6 +102,14 @@ def pack_scene(scene: Scene) -> tuple[dict[str, Tensor], dict[str, Any]]:
             )
         ],
     }
+    if isinstance(scene, NerfScene):
+        header["deformation"] = scene.settings.config()
+    else:
+        tensors |= {f"canonical.{name}": tensor for name, tensor in scene.canonical.tensors().items()}
+        header["deformation"] = scene.deformation.config()
+        header["counts"] = list(scene.canonical.counts)
+        header["sh_degree"] = scene.sh_degree
+        header["backdrop"] = scene.backdrop
     return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, header
 
 
@@ -122,8 +126,34 @@ def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> Canonical
     return CanonicalGaussians.from_tensors(tensors, counts)
 
 
-def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
-    """The inverse of `pack_scene`."""
+def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene | NerfScene:
+    """The inverse of `pack_scene`; which kind of scene, the header's method says."""
+    instruments, recorded = _recording(tensors, header)
+    module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
+    scene: Scene | NerfScene
+    if is_field(header["method"]):
+        if broken := [name for name, tensor in module.items() if not torch.isfinite(tensor).all()]:
+            raise ValueError(f"{broken[0]} contains NaN or infinity")
+        scene = NerfScene(
+            header["method"], make_field(header["method"], instruments, header["deformation"]), instruments, recorded
+        )
+    else:
+        canonical = _canonical(
+            {name.removeprefix("canonical."): t for name, t in tensors.items() if name.startswith("canonical.")},
+            tuple(header["counts"]),
+        )
+        deformation = make_deformation(header["method"], instruments, header["deformation"])
+        scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
+        scene.sh_degree = int(header["sh_degree"])
+        scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
+    scene.diagnostics = header["diagnostics"]
+    scene.load_state_dict(module)
+    scene.requires_grad_(False)
+    return scene
+
+
+def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recording]:
+    """The instruments, and what the scene was learned from."""
     instruments = tuple(
         Instrument(
             entry["name"],
@@ -146,16 +176,4 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene:
         tuple(states),
         tuple(cameras),
     )
-    canonical = _canonical(
-        {name.removeprefix("canonical."): t for name, t in tensors.items() if name.startswith("canonical.")},
-        tuple(header["counts"]),
-    )
-    deformation = make_deformation(header["method"], instruments, header["deformation"])
-    scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
-    scene.sh_degree = int(header["sh_degree"])
-    scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
-    scene.diagnostics = header["diagnostics"]
-    module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
-    scene.load_state_dict(module)
-    scene.requires_grad_(False)
-    return scene
+    return instruments, recorded

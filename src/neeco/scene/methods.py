@@ -13,6 +13,7 @@ from neeco.capture.model import Capture, Instrument
 from neeco.errors import NeecoError
 from neeco.scene import deformations
 from neeco.scene.deformations.base import Deformation
+from neeco.scene.nerfies.settings import Nerfies
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
@@ -38,19 +39,27 @@ def find_methods() -> dict[str, type[Deformation]]:
     return dict(sorted(found.items(), key=lambda item: (item[0] != "kinematic", item[0])))
 
 
-METHODS: dict[str, type[Deformation]] = find_methods()
+METHODS: dict[str, type[Deformation] | type[Nerfies]] = {**find_methods(), "nerfies": Nerfies}
 
 
-def deformation_class(method: str) -> type[Deformation]:
-    """The class behind a method's name. Raises NeecoError for an unknown name."""
+def method_class(method: str) -> type[Deformation] | type[Nerfies]:
+    """What the methods say of themselves. Raises NeecoError for an unknown name."""
     if method not in METHODS:
         raise NeecoError(f"--method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
     return METHODS[method]
 
 
+def deformation_class(method: str) -> type[Deformation]:
+    """The deformation behind a method's name. Raises NeecoError for an unknown name or a method that has none."""
+    kind = method_class(method)
+    if not issubclass(kind, Deformation):
+        raise NeecoError(f"method {method} deforms no Gaussians; it has a scene of its own")
+    return kind
+
+
 def unmet_need(method: str, capture: Capture) -> str | None:
     """What `method` needs and `capture` has not recorded, in words; None when it can be trained on it."""
-    kind = deformation_class(method)
+    kind = method_class(method)
     if kind.needs_instruments and not capture.instruments:
         return "instrument states"
     times = {frame.state.time for frame in capture.split("train")} if capture.timed else set()
@@ -66,9 +75,22 @@ def make_deformation(method: str, instruments: tuple[Instrument, ...], config: d
         raise NeecoError(f"deformation: method {method}: {str(error).splitlines()[0]}; see --set deformation") from None
 
 
+def make_field(method: str, instruments: tuple[Instrument, ...], config: dict[str, Any]) -> Nerfies:
+    """The settings of a method that is a field. Raises NeecoError for an unknown field or a value that does not fit."""
+    check_fields(method, config)
+    kind = method_class(method)
+    assert issubclass(kind, Nerfies)
+    return kind(instruments, **config)
+
+
+def is_field(method: str) -> bool:
+    """Whether the method's scene is a radiance field (`NerfScene`) and not Gaussians (`Scene`)."""
+    return issubclass(method_class(method), Nerfies)
+
+
 def check_fields(method: str, config: dict[str, Any]) -> None:
     """Raises NeecoError for a field that the deformation of `method` does not have, or whose type does not fit."""
-    kind = deformation_class(method)
+    kind = method_class(method)
     known = list(inspect.signature(kind).parameters)[1:]
     if unknown := [name for name in config if name not in known]:
         raise NeecoError(

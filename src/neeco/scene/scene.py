@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
-from neeco.raster.types import Gaussians, Headlight
+from neeco.raster import rasterize
+from neeco.raster.types import Gaussians, Headlight, Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.rotations import rigid_from_vector
@@ -27,7 +29,7 @@ class Recording:
 
 
 class Scene(nn.Module):
-    """`scene.at(state)` is the one way from canonical to posed Gaussians, for every method.
+    """`scene.at(state)` is the one way from canonical to posed Gaussians, for every method; `draw` shows them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
@@ -98,6 +100,20 @@ class Scene(nn.Module):
     def camera(self, camera: Camera) -> Camera:
         """The camera to draw with. The recorded one: the correction is carried by the instruments."""
         return camera
+
+    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+        """Draw `state` as the recorded `camera` sees it; `labels`: with label channels, where the method learns any."""
+        channels = self.label_channels() if labels and self.label_names else None
+        return rasterize(self.at(state), self.camera(camera), channels=channels)
+
+    def torch_threads(self) -> AbstractContextManager[None]:
+        """As many of torch's threads as pay where the scene is drawn."""
+        return self.deformation.torch_threads()
+
+    @property
+    def num_gaussians(self) -> int:
+        """How many Gaussians one drawing uses."""
+        return len(self.canonical)
 
     @property
     def label_names(self) -> tuple[tuple[str, str], ...]:

@@ -18,6 +18,7 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.evaluation.labels import LABEL_THRESHOLD
 from neeco.files import new_folder, read_json, write_json
+from neeco.scene.drawable import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.annotation import KEYPOINTS, annotate
 from neeco.synthesis.drawing import (
@@ -86,7 +87,7 @@ def synthesize(
     """
     settings.check()
     output = Path(output)
-    scene = run.scene
+    scene = gaussian_scene(run.scene, "synthesize")
     info = _description(run, settings)
     begun = _check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():

@@ -10,6 +10,7 @@ import torch
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.truth import load_reference
+from neeco.scene.drawable import gaussian_scene
 from neeco.synthesis.drawing import CompositedLabels, Labeller, ThresholdLabels, draw
 from neeco.synthesis.settings import Settings
 from neeco.training.run import load_run
@@ -24,10 +25,10 @@ def score_label_ways(run_path: Path, splits: Sequence[str]) -> Scores:
     Raises NeecoError for an unreadable run or mask.
     """
     run = load_run(run_path)
-    scene, capture = run.scene, run.capture()
+    scene, capture = gaussian_scene(run.scene, "label ways"), run.capture()
     speckle = Settings(count=1).speckle
     scores: Scores = {}
-    with scene.deformation.torch_threads():
+    with scene.torch_threads():
         for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
             try:
                 labeller: Labeller = kind(scene)

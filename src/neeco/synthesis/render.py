@@ -17,13 +17,13 @@ from neeco.errors import NeecoError
 from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
-from neeco.raster import rasterize
 from neeco.raster.types import Camera
-from neeco.synthesis.samplers import make_sampler
+from neeco.synthesis.samplers import states_file
 from neeco.synthesis.statefile import read_states
+from neeco.synthesis.views import moved_camera
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Drawable
     from neeco.training.run import Run
 
 STATES_FOLDER = "states"
@@ -61,38 +61,40 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
     return [View(name, frame.state, frame.camera) for name, frame in zip(names, frames, strict=True)]
 
 
-def state_views(scene: Scene, path: Path) -> list[View]:
+def state_views(scene: Drawable, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
-    lines = read_states(path, scene.instruments)
-    sampler = make_sampler(scene, str(path), margin=0.0, views="recorded", count=len(lines))
+    lines = read_states(states_file(str(path)), scene.instruments)
     first = scene.recorded.cameras[0]
-    return [View(f"{k:06d}", line.state, sampler.cameras[k] or first) for k, line in enumerate(lines)]
+    cameras = [
+        first if line.world_from_camera is None else moved_camera(first, line.world_from_camera) for line in lines
+    ]
+    return [View(f"{k:06d}", line.state, camera) for k, (line, camera) in enumerate(zip(lines, cameras, strict=True))]
 
 
 @torch.no_grad()
 def render(
-    scene: Scene, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
+    scene: Drawable, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
 ) -> Rendered:
     """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
     mean. Raises NeecoError."""
-    channels = scene.label_channels() if scene.label_names else None
+    labelled = bool(scene.label_names)
     done = 0
-    with scene.deformation.torch_threads():
+    with scene.torch_threads():
         for view in views:
-            rendering = rasterize(scene.at(view.state), scene.camera(view.camera), channels=channels)
+            rendering = scene.draw(view.state, view.camera, labels=True)
             write_image(folder / f"{view.name}.png", rendering.color)
-            if channels is not None:
+            if labelled:
                 parts = composited_parts(rendering).cpu()
                 write_labels(folder / f"{view.name}_parts.png", parts)
                 write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
             done += 1
             on_progress(done)
-    if channels is not None:
+    if labelled:
         names = [
             {"id": index + 1, "instrument": name, "part": part} for index, (name, part) in enumerate(scene.label_names)
         ]
         write_json(folder / PARTS_FILE, {"ids": [{"id": 0, "part": "tissue"}, *names]})
-    return Rendered(folder, done, channels is not None)
+    return Rendered(folder, done, labelled)
 
 
 def _unique_names(frames: tuple[Frame, ...], root: Path) -> list[str]:

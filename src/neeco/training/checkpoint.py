@@ -12,8 +12,9 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.scene.io import pack_scene, save_tensors, unpack_scene
+from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.scene import Scene
-from neeco.training.session import Session, StepResult
+from neeco.training.protocol import StepResult, TrainingSession, members
 
 SCHEMA = "neeco-checkpoint/1"
 
@@ -23,35 +24,28 @@ def checkpoint_path(run: Path) -> Path:
     return run / "checkpoint" / "session.safetensors"
 
 
-def save_checkpoint(session: Session, run: Path) -> None:
+def save_checkpoint(session: TrainingSession, run: Path) -> None:
     """Write the session's whole state atomically."""
-    tensors, scene_header = pack_scene(session.scene)
-    tensors = {f"scene/{name}": tensor for name, tensor in tensors.items()}
-    groups = {
-        "adam": session.adam.tensors(),
-        "refinement": session.refinement.tensors(),
-        "statistics": {"total": session.statistics.total, "seen": session.statistics.seen},
-        "random": {"torch": torch.get_rng_state(), "generator": session.generator.get_state()},
-    }
-    for group, members in groups.items():
-        tensors |= {f"{group}/{name}": tensor.detach().contiguous() for name, tensor in members.items()}
+    of_scene, scene_header = pack_scene(session.scene)
+    of_session, fields = session.pack()
+    tensors = {f"scene/{name}": tensor for name, tensor in of_scene.items()} | of_session
+    tensors |= {f"adam/{name}": tensor for name, tensor in session.adam.tensors().items()}
+    tensors |= {"random/torch": torch.get_rng_state(), "random/generator": session.generator.get_state()}
     header = {
         "schema": SCHEMA,
         "scene": scene_header,
         "adam_steps": session.adam.steps,
-        "schedule": session.schedule.state_dict(),
-        "rng": session.rng.bit_generator.state,
-        "queue": session.queue,
-        "queue_phase": session.queue_phase,
         "iteration": session.iteration,
         "seconds": session.seconds,
         "window": [[step.loss, step.psnr] for step in session.window],
     }
-    metadata = {"neeco": json.dumps(header)}
-    save_tensors(tensors, metadata, checkpoint_path(run))
+    metadata = {"neeco": json.dumps(header | fields)}
+    save_tensors(
+        {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
+    )
 
 
-def read_checkpoint(run: Path) -> tuple[Scene, dict[str, Any], dict[str, Tensor]]:
+def read_checkpoint(run: Path) -> tuple[Scene | NerfScene, dict[str, Any], dict[str, Tensor]]:
     """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
     path = checkpoint_path(run)
     try:
@@ -69,19 +63,11 @@ def read_checkpoint(run: Path) -> tuple[Scene, dict[str, Any], dict[str, Tensor]
     return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
 
 
-def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+def restore_session(session: TrainingSession, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """Put a fresh session, made around the checkpoint's scene, where the checkpoint was."""
-
-    def group(name: str) -> dict[str, Tensor]:
-        return {key.removeprefix(f"{name}/"): t for key, t in tensors.items() if key.startswith(f"{name}/")}
-
-    session.adam.restore(group("adam"), header["adam_steps"])
-    session.refinement.restore(group("refinement"))
-    session.statistics.total, session.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
-    session.schedule.load_state_dict(header["schedule"])
-    session.rng.bit_generator.state = header["rng"]
+    session.adam.restore(members(tensors, "adam"), header["adam_steps"])
+    session.restore(tensors, header)
     session.generator.set_state(tensors["random/generator"])
     torch.set_rng_state(tensors["random/torch"])
-    session.queue, session.queue_phase = header["queue"], header["queue_phase"]
     session.window = [StepResult(loss, psnr) for loss, psnr in header.get("window", [])]  # not in older ones
     session.iteration, session.seconds = header["iteration"], header["seconds"]

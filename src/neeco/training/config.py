@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from neeco.scene.methods import deformation_class
+from neeco.scene.methods import method_class
 from neeco.training.schedule import ScheduleConfig
 
 
@@ -50,7 +50,7 @@ class TrainConfig:
 def method_defaults(method: str) -> TrainConfig:
     """The config a method starts from: the paper's, changed as its deformation says. Raises NeecoError for an unknown
     method."""
-    return with_fields(TrainConfig(method=method), deformation_class(method).training_defaults)
+    return with_fields(TrainConfig(method=method), method_class(method).training_defaults)
 
 
 def with_fields(config: Any, values: Mapping[str, Any]) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,9 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinged, Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.training.extend import extend_shaft
-from neeco.training.session import Session
+
+if TYPE_CHECKING:
+    from neeco.training.session import Session
 
 ROLLS = (0.5, -0.5)  # rad, with which rotational symmetry is tested: small, so that seen sides stay in view
 WRIST_STEPS = 14
@@ -27,6 +29,19 @@ SOLID = 0.3  # opacity of a Gaussian that counts as the instrument's substance
 ENOUGH = 10  # solid Gaussians without which an instrument is as good as absent
 
 Report = Callable[[str], None]
+
+
+def finish_gaussians(session: Session, report: Report) -> None:
+    """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
+    scene = session.scene
+    scene.requires_grad_(False)
+    for tensor in scene.canonical.tensors().values():
+        tensor.requires_grad_(False)
+    scene.diagnostics["iterations"] = session.iteration
+    scene.diagnostics["phase_2_began"] = session.schedule.phase_started
+    scene.diagnostics["phase_2_forced"] = session.schedule.forced
+    scene.canonical = scene.deformation.finished(scene.canonical, list(scene.recorded.states))
+    finish_instruments(session, report)
 
 
 @torch.no_grad()

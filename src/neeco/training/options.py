@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.scene.methods import check_fields, deformation_class
+from neeco.scene.methods import check_fields, is_field
 from neeco.training.config import TrainConfig, method_defaults, with_fields
 from neeco.training.run import config_from_dict, config_to_dict
 from neeco.training.schedule import Part, ScheduleConfig
@@ -31,7 +31,10 @@ def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[s
         return training_config(method, values, assignments)
     if not name.endswith(ADJUSTED) or name.count("+") > 1:
         raise NeecoError(f"--method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
-    deformation_class(method)  # it acts on Gaussians
+    if is_field(method):
+        raise NeecoError(
+            f"--method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
+        )
     base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
     adjusted = with_fields(base, on)
     if adjusted == base:

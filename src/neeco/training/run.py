@@ -16,8 +16,8 @@ from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
 from neeco.files import write_text
+from neeco.scene.drawable import Drawable
 from neeco.scene.io import load_scene
-from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
 
 SCHEMA = "neeco-run/1"
@@ -28,7 +28,7 @@ class Run:
     """A finished training run. `config` is config.yaml as a dict (keys schema, version, capture, and TrainConfig's)."""
 
     path: Path
-    scene: Scene
+    scene: Drawable
     config: dict[str, Any]
 
     def capture(self) -> Capture:

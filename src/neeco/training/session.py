@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from neeco.scene.deformations.base import UNPERTURBED, Perturbation, floored_dec
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig, decayed
 from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
+from neeco.training.finish import finish_gaussians, place_wrists
 from neeco.training.optimizer import Adam
+from neeco.training.protocol import Report, StepResult, done_share, members
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule
 
@@ -31,15 +34,8 @@ GAUSSIAN_RATES = {
 }
 LIGHT_RATE = 3e-3
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
+WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """What one step saw."""
-
-    loss: float
-    psnr: float
 
 
 @dataclass
@@ -87,10 +83,17 @@ class Session:
     @property
     def progress(self) -> float:
         """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
-        done = self.iteration / self.config.iterations
-        if self.config.minutes is not None:
-            done = max(done, self.seconds / (60 * self.config.minutes))
-        return min(1.0, done)
+        return done_share(self.config, self.iteration, self.seconds)
+
+    @property
+    def phase(self) -> int:
+        """1 or 2 of the dynamic training adjustment."""
+        return self.schedule.phase
+
+    @property
+    def forced(self) -> bool:
+        """Whether phase 2 began because the run was late."""
+        return self.schedule.forced
 
     def step(self) -> StepResult:
         """Draw one frame, compare, learn, and from time to time add and remove Gaussians."""
@@ -221,3 +224,34 @@ class Session:
         dense = 0.01 * self.extent
         tissue = Budget(self.config.tissue_budget, dense)
         return [tissue] + [Budget(self.config.instrument_budget, dense)] * (len(self.scene.canonical.counts) - 1)
+
+    def between_steps(self, before: float) -> None:
+        """Find the wrists once the run has passed its mark."""
+        if before < WRIST_FRACTION <= self.progress:
+            place_wrists(self)
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """What a checkpoint needs beside scene, optimiser and random numbers."""
+        groups = {
+            "refinement": self.refinement.tensors(),
+            "statistics": {"total": self.statistics.total, "seen": self.statistics.seen},
+        }
+        tensors = {f"{group}/{name}": tensor for group, named in groups.items() for name, tensor in named.items()}
+        return tensors, {
+            "schedule": self.schedule.state_dict(),
+            "rng": self.rng.bit_generator.state,
+            "queue": self.queue,
+            "queue_phase": self.queue_phase,
+        }
+
+    def restore(self, tensors: dict[str, Tensor], fields: dict[str, Any]) -> None:
+        """The inverse of `pack`."""
+        self.refinement.restore(members(tensors, "refinement"))
+        self.statistics.total, self.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
+        self.schedule.load_state_dict(fields["schedule"])
+        self.rng.bit_generator.state = fields["rng"]
+        self.queue, self.queue_phase = fields["queue"], fields["queue_phase"]
+
+    def finish(self, report: Report) -> None:
+        """Labels of the paper's method, the shaft's extent, the joints' verdict."""
+        finish_gaussians(self, report)

@@ -16,19 +16,16 @@ from neeco.capture.check import check_capture, errors_only
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_text
-from neeco.scene.io import save_scene
-from neeco.scene.methods import deformation_class, unmet_need
+from neeco.scene.io import pack_scene, save_scene
+from neeco.scene.methods import method_class, unmet_need
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
-from neeco.training.discovery import new_session
-from neeco.training.finish import finish_instruments, place_wrists
-from neeco.training.initial import initial_scene
 from neeco.training.interrupt import StopRequest, hearing_stops
+from neeco.training.kinds import begin_session, session_around
+from neeco.training.protocol import TrainingSession
 from neeco.training.run import config_from_dict, read_config, write_config
-from neeco.training.session import Session
 
 CHECKPOINT_INTERVAL = 500  # iterations
-WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
 ROW_INTERVAL = 50  # iterations averaged into one row of metrics.jsonl
 
 
@@ -39,7 +36,7 @@ class ProgressRow:
     iteration: int
     loss: float
     psnr: float
-    num_gaussians: int
+    num_gaussians: int | None  # None: the method has none
     phase: int
     seconds: float
     progress: float
@@ -47,7 +44,7 @@ class ProgressRow:
 
 
 Progress = Callable[[ProgressRow], None]
-Watch = Callable[[Session], None]  # after every step; may draw the scene, must not change it
+Watch = Callable[[TrainingSession], None]  # after every step; may draw the scene, must not change it
 
 
 def train(
@@ -81,7 +78,7 @@ def train(
     capture, frames = _open_capture(capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
-    with new_folder(output), deformation_class(config.method).torch_threads():
+    with new_folder(output), method_class(config.method).torch_threads():
         try:
             session = _begin(capture, frames, output, config, resume, log)
         except KeyboardInterrupt:
@@ -91,7 +88,8 @@ def train(
             _run(session, output, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
-            _finish(session, log.note)
+            _check_finite(session)
+            session.finish(log.note)
             save_scene(session.scene, output / "scene.safetensors")
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
@@ -111,7 +109,7 @@ def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
 
 def _begin(
     capture: Capture, frames: tuple[Frame, ...], output: Path, config: TrainConfig, resume: bool, log: _Log
-) -> Session:
+) -> TrainingSession:
     """The session before its first step, or where the checkpoint in `output` left it."""
     images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
     masks = [frame.load_mask() for frame in frames]
@@ -119,11 +117,10 @@ def _begin(
     torch.manual_seed(config.seed)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
-        session = new_session(scene, frames, images, masks, config)
+        session = session_around(scene, capture, frames, images, masks, config)
         restore_session(session, header, tensors)
     else:  # interrupted before its first checkpoint, a resumed run begins again
-        scene = initial_scene(capture, frames, images, masks, config, log.note)
-        session = new_session(scene, frames, images, masks, config)
+        session = begin_session(capture, frames, images, masks, config, log.note)
     log.keep_until(session.iteration)
     session.seconds += log.clock() - started
     return session
@@ -138,7 +135,7 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
     frames = capture.split("train")
     if not frames:
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
-    if deformation_class(config.method).needs_instruments and not capture.instruments:
+    if method_class(config.method).needs_instruments and not capture.instruments:
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
@@ -150,9 +147,9 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
     return capture, frames
 
 
-def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
+def _run(session: TrainingSession, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
     """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
-    phase = session.schedule.phase
+    phase = session.phase
     last = log.clock()
     try:
         while session.progress < 1:
@@ -160,11 +157,10 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
             session.window.append(session.step())
             now = log.clock()
             session.seconds, last = session.seconds + now - last, now
-            if session.schedule.phase != phase:
-                phase = session.schedule.phase
-                log.note(f"phase {phase} begins" + (" (forced)" if session.schedule.forced else ""))
-            if before < WRIST_FRACTION <= session.progress:
-                place_wrists(session)
+            if session.phase != phase:
+                phase = session.phase
+                log.note(f"phase {phase} begins" + (" (forced)" if session.forced else ""))
+            session.between_steps(before)
             if session.iteration % ROW_INTERVAL == 0:
                 log.row(session)
             if stop.heard or session.iteration % CHECKPOINT_INTERVAL == 0:
@@ -180,24 +176,16 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
 
 
-def _finish(session: Session, report: Callable[[str], None]) -> None:
-    """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
-    scene = session.scene
-    # what is learned, not the buffers: a shaft whose wrist was not found begins its wrist at minus infinity
-    learned = [*scene.canonical.tensors().values(), *scene.parameters()]
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in learned):
+def _check_finite(session: TrainingSession) -> None:
+    """Raises NeecoError when a number that was learned is not finite."""
+    # buffers may well be infinite: a shaft whose wrist was not found begins its wrist at minus infinity
+    buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
+    tensors = pack_scene(session.scene)[0]
+    if not all(bool(torch.isfinite(tensor).all()) for name, tensor in tensors.items() if name not in buffers):
         raise NeecoError(
             f"training: the scene holds numbers that are not finite after {session.iteration} iterations: it diverged, "
             "though its image did not tell; train anew with another --seed or a milder schedule"
         )
-    scene.requires_grad_(False)
-    for tensor in scene.canonical.tensors().values():
-        tensor.requires_grad_(False)
-    scene.diagnostics["iterations"] = session.iteration
-    scene.diagnostics["phase_2_began"] = session.schedule.phase_started
-    scene.diagnostics["phase_2_forced"] = session.schedule.forced
-    scene.canonical = scene.deformation.finished(scene.canonical, list(scene.recorded.states))
-    finish_instruments(session, report)
 
 
 class _Log:
@@ -210,7 +198,7 @@ class _Log:
         self.clock = clock
         self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
 
-    def row(self, session: Session) -> None:
+    def row(self, session: TrainingSession) -> None:
         """Write the means over the session's window, and empty it."""
         loss = sum(step.loss for step in session.window) / len(session.window)
         psnr = sum(step.psnr for step in session.window) / len(session.window)
@@ -219,8 +207,8 @@ class _Log:
             session.iteration,
             round(loss, 6),
             round(psnr, 3),
-            len(session.scene.canonical),
-            session.schedule.phase,
+            session.scene.num_gaussians,
+            session.phase,
             round(session.seconds, 2),
             round(session.progress, 4),
         )

@@ -29,7 +29,7 @@ from neeco.evaluation.experiments.derived import derive_capture
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.deformations.nps import WARM_UP
-from neeco.scene.methods import deformation_class
+from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
 from neeco.training.options import training_config
 from neeco.training.schedule import CLOSEST_RESETS
@@ -170,7 +170,7 @@ def _check_plan(plan: AblationPlan, variants: Sequence[Variant]) -> None:
 def _takes(method: str, name: str) -> bool:
     """Whether `method` has the setting: `deformation.FIELD` is the method's own, all others are everybody's."""
     group, _, field = name.partition(".")
-    return group != "deformation" or field in list(inspect.signature(deformation_class(method)).parameters)[1:]
+    return group != "deformation" or field in list(inspect.signature(method_class(method)).parameters)[1:]
 
 
 def _job(plan: AblationPlan, variant: Variant) -> Job:

@@ -218,7 +218,7 @@ def _complete(job: Job, watcher: Watcher) -> None:
     if not watcher.rows or watcher.rows[-1]["progress"] < 1:
         scene = load_run(job.folder).scene
         watcher.totals["iteration"] = scene.diagnostics.get("iterations", watcher.totals["iteration"])
-        with scene.deformation.torch_threads():
+        with scene.torch_threads():
             watcher.add_row(scene, 1.0)
 
 

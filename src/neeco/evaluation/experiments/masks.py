@@ -76,7 +76,7 @@ def draw_masks(run: Run, folder: Path, frames: Sequence[Frame]) -> bool:
         return False
     ids = [{"id": index + 1, "part": part} for index, (_, part) in enumerate(scene.label_names)]
     write_json(folder / PARTS_FILE, {"ids": ids})
-    with scene.deformation.torch_threads():
+    with scene.torch_threads():
         for frame in frames:
             parts = draw(scene, frame.state, frame.camera).parts
             assert parts is not None, "a scene with label names draws parts"

@@ -98,7 +98,7 @@ def absent_notes(comparison: Mapping[str, Any]) -> list[str]:
         values = [row[column.key]["n"] for row in comparison["summary"]]
         if not any(values) and not any(note.startswith(column.key) for note in notes):
             notes.append(f"{column.key}: nobody has it: {ABSENT.get(column.key, 'no run finished')}")
-    if not any(row["num_gaussians"]["std"] is not None for row in comparison["summary"]):
+    if not any(row["seconds"]["std"] is not None for row in comparison["summary"]):
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
     return notes
 

@@ -20,8 +20,8 @@ from neeco.evaluation.scoring import draw
 from neeco.files import read_json, write_json, write_text
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
-    from neeco.training.session import Session
+    from neeco.scene import Drawable
+    from neeco.training.protocol import TrainingSession
 
 BEGUN_FILE = "begun.json"
 CURVE_FILE = "curve.jsonl"
@@ -44,7 +44,7 @@ class HeldOut:
             self.frames[split] = [(f, f.load_image(), f.load_mask()) for f in (frames[index] for index in chosen)]
 
     @torch.no_grad()
-    def score(self, scene: Scene) -> dict[str, float | None]:
+    def score(self, scene: Drawable) -> dict[str, float | None]:
         """Mean PSNR of each split, dB; None when it is no number. Random states are left as they were."""
         scores: dict[str, float | None] = {}
         with torch.random.fork_rng(devices=[]):
@@ -75,7 +75,7 @@ class Watcher:
         self.earlier_peak = self.totals["peak_memory_mb"]
         self.clocks = self._read_clocks()
 
-    def watch(self, session: Session) -> None:
+    def watch(self, session: TrainingSession) -> None:
         """After a step: count its time; at one of MOMENTS also draw the held-out frames, which is not counted."""
         self._count(session.seconds)
         self.totals["iteration"] = session.iteration
@@ -86,7 +86,7 @@ class Watcher:
             self.add_row(session.scene, session.progress)
         self.clocks = self._read_clocks()
 
-    def add_row(self, scene: Scene, progress: float) -> None:
+    def add_row(self, scene: Drawable, progress: float) -> None:
         """Score the held-out frames, and write curve and totals."""
         for split, value in self.held_out.score(scene).items():
             row = {key: self.totals[key] for key in ("iteration", "seconds", "processor_seconds")}

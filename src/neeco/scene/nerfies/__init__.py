@@ -1,0 +1,1 @@
+"""Nerfies (Park et al. 2021), method `nerfies`: a radiance field seen through a learned SE(3) warp."""
