@@ -43,6 +43,10 @@ class Compare:
     """NAME=FOLDER: masks that something else made of the same frames, scored in the same table; repeatable."""
     workers: int = 1
     """Runs at once, by Ray (install neeco[cluster]); each gets its share of the cores. RAY_ADDRESS names a cluster."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """A field of every method's training config, as NAME=VALUE (e.g. tissue_budget=5000); repeatable."""
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
 
@@ -58,7 +62,7 @@ def run(args: Compare) -> int:
     with JobBars() as bars:
         comparison = compare(_spec(args), bars.show, bars.stage)
         bars.stage("report", 0, 1)
-        page = write_comparison_report(args.output, comparison, read_capture(args.capture))
+        page = write_comparison_report(args.output, comparison, read_capture(args.capture, args.transforms))
         bars.stage("report", 1, 1)
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
@@ -105,6 +109,8 @@ def _spec(args: Compare) -> ComparisonSpec:
         args.lpips_weights,
         args.workers,
         masks,
+        args.transforms,
+        args.set,
     )
 
 

@@ -22,8 +22,9 @@ PAGE_STYLE = """
 a { color: var(--accent); }
 td:nth-child(2), th:nth-child(2) { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
 tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margin: 14px 0;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px), 1fr)); }
-.figures svg { width: 100%; height: auto; background: var(--card); border: 1px solid var(--edge); border-radius: 10px; }
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 340px), 1fr)); }
+.figures figure > svg { width: 100%; height: auto; background: var(--card);
+  border: 1px solid var(--edge); border-radius: 10px; }
 .key { margin: 2px 0; } th { white-space: normal; min-width: 5em; }
 """
 

@@ -255,9 +255,13 @@ def command_of(comparison: Mapping[str, Any]) -> str:
         words += ["--iterations", str(budget["iterations"])]
     else:
         words += ["--processor-minutes" if budget["clock"] == "processor" else "--minutes", f"{budget['minutes']:g}"]
-    words += ["--splits", *comparison["splits"], "--output", "DIR"]
+    words += ["--splits", *comparison["splits"]]
+    if comparison["transforms"] != "transforms.json":
+        words += ["--transforms", comparison["transforms"]]
+    words += [word for setting in comparison["settings"] for word in ("--set", setting)]
+    words += ["--output", "DIR"]
     masks = [f"{entry['name']}={entry['folder']}" for entry in comparison["methods"] if entry["source"] == "masks"]
-    return shlex.join([*words, "--masks", *masks] if masks else words)
+    return shlex.join([*words, *(word for folder in masks for word in ("--masks", folder))])
 
 
 def _made(comparison: Mapping[str, Any], capture: Capture, output: Path) -> str:

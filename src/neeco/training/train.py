@@ -177,8 +177,11 @@ def _run(session: TrainingSession, output: Path, log: _Log, stop: StopRequest, g
 
 
 def _check_finite(session: TrainingSession) -> None:
-    """Raises NeecoError when a number of the scene is not finite."""
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in pack_scene(session.scene)[0].values()):
+    """Raises NeecoError when a number that was learned is not finite."""
+    # buffers may well be infinite: a shaft whose wrist was not found begins its wrist at minus infinity
+    buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
+    tensors = pack_scene(session.scene)[0]
+    if not all(bool(torch.isfinite(tensor).all()) for name, tensor in tensors.items() if name not in buffers):
         raise NeecoError(
             f"training: the scene holds numbers that are not finite after {session.iteration} iterations: it diverged, "
             "though its image did not tell; train anew with another --seed or a milder schedule"

@@ -115,9 +115,9 @@ def _neeco(job) -> bool:
         ({"tables": ()}, "--tables: names none"),
         ({"iterations": 0}, "--iterations: 0 is no training"),
         ({"kinematic_iterations": -1}, "--kinematic-iterations: -1 is no training"),
-        ({"settings": ("minutes=3",)}, "--set minutes: use --iterations"),
+        ({"settings": ("minutes=3",)}, "--set minutes: use the budget"),
         ({"settings": ("sed=3",)}, "--set: unknown field 'sed'"),
-        ({"settings": ("deformation.wide=3",)}, "--set deformation.wide: none of the chosen tables' methods"),
+        ({"settings": ("deformation.wide=3",)}, "--set deformation.wide: no such field in the methods"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_anything_is_written(changes: dict, named: str, plan) -> None:

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from neeco.capture import read_capture
 from neeco.cli import main
@@ -153,9 +154,9 @@ def test_masks_of_others_stand_in_the_same_table(spec: ComparisonSpec, tmp_path:
         assert rows["perfect", "test"][key]["mean"] == 1.0
     assert rows["perfect", "test"]["psnr"]["n"] == 0
     ours = rows["kinematic", "test"]
-    if ours["mask_iou"]["mean"] is not None:
-        assert ours["iou"]["mean"] == pytest.approx(ours["mask_iou"]["mean"])
-    assert ours["iou"]["n"] == 1
+    assert ours["failed"] == 0
+    assert ours["iou"]["n"] == ours["mask_iou"]["n"] == 1
+    assert ours["iou"]["mean"] == pytest.approx(ours["mask_iou"]["mean"])
     assert "| perfect |" in (spec.output / "comparison.md").read_text()
     assert {"name": "perfect", "method": None, "source": "masks", "folder": str(tmp_path / "perfect")} in result[
         "methods"
@@ -233,3 +234,23 @@ def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: Compar
     path.write_text(json.dumps(document))
     with pytest.raises(NeecoError, match="--methods: neeco needs instrument states"):
         compare(replace(spec, methods=("3dgs", "neeco")))
+
+
+def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None:
+    given = ("tissue_budget=70", "deformation.width=16")
+    result = compare(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
+    configs = {
+        name: yaml.safe_load((spec.output / "runs" / f"{name}-seed0" / "config.yaml").read_text())
+        for name in ("3dgs", "neeco")
+    }
+    assert [configs[name]["tissue_budget"] for name in configs] == [70, 70]
+    assert configs["neeco"]["deformation"] == {"width": 16}
+    assert configs["3dgs"]["deformation"] == {}
+    assert result["settings"] == list(given)
+
+
+@pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.moments=4", "no_such_field=1"])
+def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given: str) -> None:
+    with pytest.raises(NeecoError, match="--set"):
+        compare(replace(spec, assignments=(given,)))
+    assert not spec.output.exists()

@@ -122,6 +122,15 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
 
 
+def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
+    from neeco.training.run import load_run
+
+    job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
+    result = run_job(job)
+    assert float(load_run(job.folder).scene.deformation.hinges[0].wrist_start) == float("-inf")
+    assert result["splits"]["test"]["psnr"] > 5
+
+
 def test_drawing_the_curve_changes_no_bit_of_the_scene(make_job, tmp_path) -> None:
     job = make_job()
     run_job(job)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,9 +26,9 @@ from neeco.evaluation.experiments.ablations import (
 )
 from neeco.evaluation.experiments.derived import derive_capture
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
+from neeco.evaluation.experiments.settings import check_settings, settings_for
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.deformations.nps import WARM_UP
-from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
 from neeco.training.options import training_config
 from neeco.training.schedule import CLOSEST_RESETS
@@ -38,7 +37,6 @@ from neeco.training.train import ROW_INTERVAL
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
 KINEMATIC_LEAST = 1_000  # its shaft starts to spin and its hinges to learn after 600
-OWN_OPTION = {"iterations": "--iterations", "minutes": "--iterations", "seed": "--seed", "transforms": "--transforms"}
 
 # Mask IoU of a run by label way and split: {"composited": {"test": 0.9}, ...}; None where it cannot be told
 LabelScorer = Callable[[Path, Sequence[str]], dict[str, dict[str, float | None]]]
@@ -156,27 +154,16 @@ def _check_plan(plan: AblationPlan, variants: Sequence[Variant]) -> None:
     for name, value in (("iterations", plan.iterations), ("kinematic-iterations", plan.kinematic_iterations)):
         if value is not None and value < 1:
             raise NeecoError(f"--{name}: {value} is no training; give at least 1")
-    for assignment in plan.settings:
-        name = assignment.partition("=")[0]
-        if name in OWN_OPTION:
-            raise NeecoError(f"--set {name}: use {OWN_OPTION[name]}; all runs of a table share it")
-        if not any(_takes(variant.method, name) for variant in variants):
-            raise NeecoError(f"--set {name}: none of the chosen tables' methods has such a field")
+    check_settings(plan.settings, dict.fromkeys(variant.method for variant in variants), "--seed")
     capture = read_capture(plan.capture, plan.transforms)
     if not capture.instruments:
         raise NeecoError(f"{plan.capture}: instruments: no states are recorded; every ablation needs them")
 
 
-def _takes(method: str, name: str) -> bool:
-    """Whether `method` has the setting: `deformation.FIELD` is the method's own, all others are everybody's."""
-    group, _, field = name.partition(".")
-    return group != "deformation" or field in list(inspect.signature(method_class(method)).parameters)[1:]
-
-
 def _job(plan: AblationPlan, variant: Variant) -> Job:
     """The job of one variant. Settings: the paper's schedule, then the user's, then what the variant is about."""
     budget = plan.budget(variant.method)
-    given = [item for item in plan.settings if _takes(variant.method, item.partition("=")[0])]
+    given = settings_for(variant.method, plan.settings)
     common = PAPER_SETTINGS if variant.method == "neeco" else ()
     values = {"iterations": budget.iterations, "seed": plan.seed, "transforms": plan.transforms}
     config = training_config(variant.method, values, [*common, *given, *variant.settings])

@@ -19,6 +19,7 @@ from neeco.evaluation.experiments.distance import distances_to_training
 from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.evaluation.experiments.machine import machine
 from neeco.evaluation.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
+from neeco.evaluation.experiments.settings import check_settings, settings_for
 from neeco.evaluation.experiments.speed import measure_speed
 from neeco.evaluation.experiments.summary import summarise
 from neeco.evaluation.experiments.tables import write_tables
@@ -32,7 +33,6 @@ from neeco.training.run import load_run
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
 COMPARISON_FILE = "comparison.json"
-TRANSFORMS = "transforms.json"
 
 Progress = Callable[[JobNews], None]
 Stage = Callable[[str, int, int], None]  # what is done after the jobs, how many done, of how many
@@ -40,7 +40,8 @@ Stage = Callable[[str, int, int], None]  # what is done after the jobs, how many
 
 @dataclass(frozen=True)
 class ComparisonSpec:
-    """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name."""
+    """What to compare. `seeds`: how many, from 0. `splits` None: all but `train`. `masks`: folders of masks by name.
+    `assignments`: NAME=VALUE, fields of the training config that are changed for every method."""
 
     capture: Path
     output: Path
@@ -51,6 +52,8 @@ class ComparisonSpec:
     lpips_weights: Path | None = None
     workers: int = 1
     masks: Mapping[str, Path] = field(default_factory=dict)
+    transforms: str = "transforms.json"
+    assignments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -119,10 +122,8 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
         raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    configs = {name: variant_config(name, {}) for name in spec.methods}
-    if not configs:
-        raise NeecoError("--methods: none is given; name at least one")
-    capture = _open_capture(spec.capture, configs)
+    configs = _configs(spec)
+    capture = _open_capture(spec, configs)
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
     jobs = _jobs(spec, configs)
@@ -137,6 +138,16 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         scored += rows
         notes += told
     return _Plan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
+
+
+def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
+    """Every method's settings by name. Raises NeecoError."""
+    if not spec.methods:
+        raise NeecoError("--methods: none is given; name at least one")
+    values = {"transforms": spec.transforms}
+    methods = {name: variant_config(name, values).method for name in spec.methods}
+    check_settings(spec.assignments, dict.fromkeys(methods.values()), "--seeds")
+    return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
 def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job, ...]:
@@ -156,11 +167,12 @@ def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job
     )
 
 
-def _open_capture(path: Path, configs: Mapping[str, TrainConfig]) -> Capture:
-    problems = errors_only(check_capture(path, TRANSFORMS))
+def _open_capture(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> Capture:
+    path = spec.capture
+    problems = errors_only(check_capture(path, spec.transforms))
     if problems:
         raise NeecoError(f"{problems[0]}; `neeco check {path}` tells all")
-    capture = read_capture(path, TRANSFORMS)
+    capture = read_capture(path, spec.transforms)
     if not capture.split("train"):
         raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
     for name, config in configs.items():
@@ -212,6 +224,8 @@ def _document(plan: _Plan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "capture": str(spec.capture.absolute()),
         "machine": machine() | {"workers": spec.workers, "threads_per_worker": threads},
         "budget": asdict(spec.budget),
+        "transforms": spec.transforms,
+        "settings": list(spec.assignments),
         "seeds": list(range(spec.seeds)),
         "splits": list(plan.splits),
         "methods": methods,
