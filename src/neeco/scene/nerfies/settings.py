@@ -72,7 +72,7 @@ class Nerfies:
     background_weight: float = 1.0
     background_points: int = 512
     rate: float = 1e-3
-    chunk: int = 4096
+    chunk: int = 512
 
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     needs_instruments: ClassVar[bool] = False
