@@ -10,6 +10,7 @@ import re
 import shutil
 import signal
 import statistics
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -253,4 +254,11 @@ def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None
 def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given: str) -> None:
     with pytest.raises(NeecoError, match="--set"):
         compare(replace(spec, assignments=(given,)))
+    assert not spec.output.exists()
+
+
+def test_workers_without_ray_are_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
+        compare(replace(spec, workers=2))
     assert not spec.output.exists()

@@ -8,14 +8,17 @@ import signal
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.experiments import jobs as module
 from neeco.evaluation.experiments.cluster import threads_per_worker
 from neeco.evaluation.experiments.jobs import UNLIMITED, Budget, run_job, run_jobs
 from neeco.evaluation.experiments.memory import peak_memory_mb, reset_peak_memory
+from neeco.evaluation.experiments.watching import HeldOut
 from neeco.training import train as train_module
 from neeco.training.options import training_config
 from neeco.training.session import Session
@@ -265,3 +268,10 @@ def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
     here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
     there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
     assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
+
+
+def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
+    gaussians, field = (HeldOut(read_capture(capture), ("train",), field=kind) for kind in (False, True))
+    assert len(field.frames["train"]) < len(gaussians.frames["train"])
+    assert len(field.moments) < len(gaussians.moments)
+    assert field.moments[-1] == gaussians.moments[-1] == 1  # both end with the finished scene

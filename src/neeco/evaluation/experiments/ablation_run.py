@@ -24,6 +24,7 @@ from neeco.evaluation.experiments.ablations import (
     Ablation,
     Variant,
 )
+from neeco.evaluation.experiments.cluster import require_ray
 from neeco.evaluation.experiments.derived import derive_capture
 from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.evaluation.experiments.settings import check_settings, settings_for
@@ -74,6 +75,8 @@ def run_ablations(
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
     for unknown tables and settings, a capture without instruments, or an output that holds other runs.
     """
+    if workers > 1:
+        require_ray()
     chosen = chosen_ablations(plan.tables)
     variants = distinct_variants(chosen)
     _check_plan(plan, variants)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,18 +24,21 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def require_ray() -> None:
+    """Raises NeecoError when Ray is not installed."""
+    if importlib.util.find_spec("ray") is None:
+        raise NeecoError("--workers: several at once need Ray; install neeco[cluster], or leave --workers out")
+
+
 def run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them.
     """
+    require_ray()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ImportError:
-        raise NeecoError(
-            "--workers: several at once need Ray; install neeco[cluster], or leave --workers out"
-        ) from None
+    import ray
+
     address = os.environ.get("RAY_ADDRESS")
     threads = threads_per_worker(workers)
     if address:

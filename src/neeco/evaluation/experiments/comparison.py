@@ -14,7 +14,7 @@ from neeco.capture import Capture, read_capture
 from neeco.capture.check import check_capture, errors_only
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
-from neeco.evaluation.experiments.cluster import threads_per_worker
+from neeco.evaluation.experiments.cluster import require_ray, threads_per_worker
 from neeco.evaluation.experiments.distance import distances_to_training
 from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
 from neeco.evaluation.experiments.machine import machine
@@ -122,6 +122,8 @@ def _plan(spec: ComparisonSpec) -> _Plan:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
         raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
+    if spec.workers > 1:
+        require_ray()
     configs = _configs(spec)
     capture = _open_capture(spec, configs)
     networks = find_lpips(spec.lpips_weights)

@@ -15,6 +15,7 @@ from neeco.evaluation.experiments.memory import reset_peak_memory
 from neeco.evaluation.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
 from neeco.evaluation.lpips import find_lpips
 from neeco.files import read_json, write_json, write_text
+from neeco.scene.methods import is_field
 from neeco.training.config import TrainConfig
 from neeco.training.run import config_from_dict, load_run, read_config
 from neeco.training.train import ProgressRow, train
@@ -192,7 +193,8 @@ def check_folder(job: Job) -> None:
 def _train(job: Job, splits: tuple[str, ...], report: JobProgress) -> dict[str, Any]:
     """Train or go on training; returns what the run took."""
     reset_peak_memory()
-    held_out = HeldOut(read_capture(job.capture, job.config.transforms), splits)
+    capture = read_capture(job.capture, job.config.transforms)
+    held_out = HeldOut(capture, splits, field=is_field(job.config.method))
     watcher = Watcher(job.folder, held_out, job.budget.clock, job.identity())
 
     def tell(row: ProgressRow) -> None:

@@ -21,7 +21,7 @@ from neeco.training.run import Run
 WARM_UP = 3  # draws before any is timed
 ROUNDS = 3  # every run is drawn in turn, so often: a slow moment of the machine meets them all
 DRAWS = 7  # timed per run and round
-PATIENCE = 5.0  # s per run and round: slow methods are timed by fewer draws
+PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer draws
 
 Progress = Callable[[int, int], None]
 
@@ -63,22 +63,22 @@ def measure_speed(
         "frames": len(frames),
         "machine": machine(),
         "how": f"posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
-        f"run after {WARM_UP} to warm up" + ("; cuda: posed on the processor" if "cuda" in backends() else ""),
+        f"run after up to {WARM_UP} to warm up" + ("; cuda: posed on the processor" if "cuda" in backends() else ""),
     }
 
 
 def _timed(run: Run, frames: Sequence[Frame], backend: str) -> list[float]:
     """Seconds of each timed draw."""
     seconds: list[float] = []
-    began = time.perf_counter()
     with run.scene.torch_threads():
-        for index in range(WARM_UP + DRAWS):
-            start = time.perf_counter()
-            _draw(run, frames[index % len(frames)], backend)
-            seconds.append(time.perf_counter() - start)
-            if index >= WARM_UP and time.perf_counter() - began > PATIENCE:
-                break
-    return seconds[WARM_UP:]
+        for count, patience in ((WARM_UP, PATIENCE / 2), (DRAWS, PATIENCE)):
+            seconds.clear()
+            began = time.perf_counter()
+            while len(seconds) < count and time.perf_counter() - began < patience:
+                start = time.perf_counter()
+                _draw(run, frames[len(seconds) % len(frames)], backend)
+                seconds.append(time.perf_counter() - start)
+    return seconds
 
 
 def _draw(run: Run, frame: Frame, backend: str) -> None:

@@ -27,6 +27,8 @@ BEGUN_FILE = "begun.json"
 CURVE_FILE = "curve.jsonl"
 MOMENTS = (0.03, *(step / 10 for step in range(1, 11)))  # shares of the run at which the held-out frames are drawn
 CURVE_FRAMES = 8  # of each split, evenly spaced: the whole split is scored at the end
+FIELD_MOMENTS = (0.1, 0.4, 1.0)  # a field takes seconds for a drawing
+FIELD_CURVE_FRAMES = 2
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
 TOTALS = {"wall": "seconds", "processor": "processor_seconds"}  # their names in files
 
@@ -34,13 +36,15 @@ Row = dict[str, Any]
 
 
 class HeldOut:
-    """Some held-out frames of every split and their photographs, read once."""
+    """Some held-out frames of every split and their photographs, read once; fewer to score a `field` by."""
 
-    def __init__(self, capture: Capture, splits: tuple[str, ...]) -> None:
+    def __init__(self, capture: Capture, splits: tuple[str, ...], *, field: bool = False) -> None:
+        self.moments = FIELD_MOMENTS if field else MOMENTS
+        count = FIELD_CURVE_FRAMES if field else CURVE_FRAMES
         self.frames: dict[str, list[tuple[Frame, Tensor, Tensor | None]]] = {}
         for split in splits:
             frames = capture.split(split)
-            chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, CURVE_FRAMES)})
+            chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, count)})
             self.frames[split] = [(f, f.load_image(), f.load_mask()) for f in (frames[index] for index in chosen)]
 
     @torch.no_grad()
@@ -76,7 +80,7 @@ class Watcher:
         self.clocks = self._read_clocks()
 
     def watch(self, session: TrainingSession) -> None:
-        """After a step: count its time; at one of MOMENTS also draw the held-out frames, which is not counted."""
+        """After a step: count its time; at one of the moments also draw the held-out frames, which is not counted."""
         self._count(session.seconds)
         self.totals["iteration"] = session.iteration
         if not self.started:
@@ -113,7 +117,7 @@ class Watcher:
         self.read_curve()
         self.rows = [row for row in self.rows if row["iteration"] < iteration]
         reached = max((row["progress"] for row in self.rows), default=0.0)
-        self.due = [moment for moment in MOMENTS if moment > reached]
+        self.due = [moment for moment in self.held_out.moments if moment > reached]
 
     def _count(self, session_seconds: float) -> None:
         now = self._read_clocks()
