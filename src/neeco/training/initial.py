@@ -36,6 +36,7 @@ def initial_scene(
     images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame. Raises NeecoError when a joint asked for is
     unknown.
     """
+    backdrop = _backdrop(frames)  # first: files may go once training has begun
     instruments = tuple(
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
         for i in capture.instruments
@@ -51,7 +52,7 @@ def initial_scene(
     deformation = make_deformation(config.method, instruments, config.deformation)
     center = torch.from_numpy(np.median(positions, 0))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
-    scene.backdrop = _backdrop(frames)
+    scene.backdrop = backdrop
     deformation.fit_ranges(list(recorded.states), tissue.means)
     if deformation.gate_volume is not None:
         close_gate(scene, deformation.gate_volume, frames, images, masks, config, report)
