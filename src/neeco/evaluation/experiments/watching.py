@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 BEGUN_FILE = "begun.json"
 CURVE_FILE = "curve.jsonl"
 MOMENTS = (0.03, *(step / 10 for step in range(1, 11)))  # shares of the run at which the held-out frames are drawn
-CURVE_FRAMES = 8  # of each split, evenly spaced: the whole split is scored at the end
+CURVE_FRAMES = 4  # of each split, evenly spaced: the whole split is scored at the end
 FIELD_MOMENTS = (0.1, 0.4, 1.0)  # a field takes seconds for a drawing
 FIELD_CURVE_FRAMES = 2
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
