@@ -7,8 +7,9 @@ loss, a rate that falls to a tenth along a line of its logarithms, a sample at i
 
 Departures, all for a processor without a GPU or for states that were never trained:
 
-- sizes: the defaults are small; `PUBLISHED` are the source's. So is the first `rate`, 1e-3 there: with the hundredth of
-  the steps that a processor has time for, five times as much shows the tissue's marks, and 1e-3 its mean colour alone.
+- sizes: the defaults are small; `PUBLISHED` are the source's. So is the first `rate`, 1e-3 there: in the few thousand
+  steps that a processor has time for, five times as much shows the tissue's marks; 900 steps at 1e-3 showed its mean
+  colour alone.
 - codes of moments that were not trained are interpolated linearly between the neighbouring training frames' codes by
   time, and are the nearest one's outside; frames of one time share a code. The recorded instrument state is not used.
 - the elastic loss takes the Jacobian at the sample of median depth of `elastic_rays` rays (the source: of all samples,
