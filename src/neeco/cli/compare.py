@@ -67,7 +67,8 @@ def run(args: Compare) -> int:
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
     for table in tables_of(comparison):
-        console.print(_shown(table))
+        for part in fitting(table, console.width):
+            console.print(part)
     for note in absent_notes(comparison):
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     for what, name in (("tables", "comparison.md, .csv, .tex"), ("all numbers", "comparison.json, data/")):
@@ -134,15 +135,40 @@ def _budget(args: Compare) -> Budget:
     return Budget(args.minutes, args.iterations)
 
 
-def _shown(table: Any) -> Table:
-    """A table of the comparison for the terminal; the best of a column is bold."""
-    shown = Table(Column("method", no_wrap=True), title=table.title, title_justify="left")
-    for column in table.columns:
-        shown.add_column(column.title, justify="right")
+BORDER = 3  # what a column takes beside its text
+
+
+def fitting(table: Any, width: int) -> list[Table]:
+    """A table of the comparison for a terminal of `width` characters, cut between columns where it is wider."""
+    rows = {name: [_text(cell) for cell in cells] for name, cells in table.rows if name not in table.failed}
+    words = ["failed"] if table.failed else []
+    widths = [
+        max(map(len, [*words, *column.title.split(), *(texts[index] for texts in rows.values())]))
+        for index, column in enumerate(table.columns)
+    ]
+    left = width - 1 - BORDER - max(len(name) for name in ("method", *(name for name, _ in table.rows)))
+    groups: list[list[int]] = [[]]
+    for index in range(len(widths)):
+        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
+            groups.append([])
+        groups[-1].append(index)
+    return [_shown(table, group, widths) for group in groups]
+
+
+def _shown(table: Any, columns: list[int], widths: list[int]) -> Table:
+    """Those columns of the table, as wide as their longest words; the best of a column is bold."""
+    title = f"{table.title}, continued" if columns and columns[0] else table.title
+    shown = Table(Column("method", no_wrap=True), title=title, title_justify="left")
+    for index in columns:
+        shown.add_column(table.columns[index].title, justify="right", width=widths[index])
     for name, cells in table.rows:
         if name in table.failed:
             shown.add_row(name, "[red]failed[/red]")
             continue
-        texts = [f"{cell.mean} ± {cell.std}" if cell.std else cell.mean for cell in cells]
-        shown.add_row(name, *(f"[bold]{t}[/bold]" if c.best else t for t, c in zip(texts, cells, strict=True)))
+        texts = [(_text(cells[index]), cells[index].best) for index in columns]
+        shown.add_row(name, *(f"[bold]{text}[/bold]" if best else text for text, best in texts))
     return shown
+
+
+def _text(cell: Any) -> str:
+    return f"{cell.mean} ± {cell.std}" if cell.std else cell.mean

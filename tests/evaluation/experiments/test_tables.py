@@ -7,7 +7,9 @@ import io
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from neeco.cli.compare import fitting
 from neeco.evaluation.experiments.summary import RUN_METRICS, SPLIT_METRICS, spread, summarise
 from neeco.evaluation.experiments.tables import csv_text, latex_escape, latex_text, markdown_text, tables_of
 
@@ -90,3 +92,17 @@ def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
     assert float(rows[0]["psnr_std"]) == 2**0.5
     assert rows[2]["psnr_mean"] == ""
     assert rows[2]["failed"] == "1"
+
+
+@pytest.mark.parametrize("width", [40, 200])
+def test_the_terminal_shows_every_number_whole(comparison: dict[str, Any], width: int) -> None:
+    console = Console(width=width, record=True, file=io.StringIO())
+    tables = tables_of(comparison)
+    parts = [part for table in tables for part in fitting(table, width)]
+    for part in parts:
+        console.print(part)
+    shown = console.export_text()
+    assert "…" not in shown
+    assert all(text in shown for text in ("21.00 ± 1.41", "0.100 ± 0.000", "1.00 ± 0.00", "failed"))
+    assert max(map(len, shown.splitlines())) <= width
+    assert (len(parts) > len(tables)) == (width < 100)
