@@ -265,6 +265,16 @@ def test_a_captures_splits_and_ignored_pixels_are_honoured(tmp_path, world):
         score_masks(drawn, capture, splits=["spare"])
 
 
+def test_parts_named_for_masks_that_tell_none_are_refused(tmp_path):
+    capture = world_capture(tmp_path)
+    (capture / "truth").rename(tmp_path / "elsewhere")
+    save(capture / "reference_masks" / "seen.png", strip(255, 255, 255, 0))
+    drawn = folder(tmp_path / "drawn", seen=strip(1, 2, 3, 3))
+    assert score_masks(drawn, capture)["instrument"]["iou"] == 1.0
+    with pytest.raises(NeecoError, match=r"--truth-classes: .*reference_masks"):
+        score_masks(drawn, capture, truth_classes={1: "shaft"})
+
+
 def world_capture(root):
     capture = root / "capture"
     identity = np.eye(4).tolist()

@@ -145,5 +145,5 @@ def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
     ],
 )
 def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
-    with pytest.raises(NeecoError, match=f"--method: .*{named}"):
+    with pytest.raises(NeecoError, match=f"^method: .*{named}"):
         variant_config(name, {})

@@ -145,6 +145,10 @@ def _capture_masks(path: Path, frames: Sequence[Frame], classes: Mapping[int, st
     if not files:
         raise NeecoError(f"{path}: its frames have no truth/masks and no {REFERENCE_FOLDER}; give a folder of masks")
     parts = all(file.parent.name != REFERENCE_FOLDER for file in files.values())
+    if classes is not None and not parts:
+        raise NeecoError(
+            f"--truth-classes: {path / REFERENCE_FOLDER} tell the instrument, no parts; leave --truth-classes out"
+        )
     return Masks(path, files, (classes or TRUTH_NAMES) if parts else None, frames=masked)
 
 

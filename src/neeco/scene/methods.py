@@ -45,7 +45,7 @@ METHODS: dict[str, type[Deformation] | type[Nerfies]] = {**find_methods(), "nerf
 def method_class(method: str) -> type[Deformation] | type[Nerfies]:
     """What the methods say of themselves. Raises NeecoError for an unknown name."""
     if method not in METHODS:
-        raise NeecoError(f"--method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
+        raise NeecoError(f"method: {method!r} is unknown; choose one of {', '.join(METHODS)}")
     return METHODS[method]
 
 

@@ -30,15 +30,15 @@ def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[s
     if not plus:
         return training_config(method, values, assignments)
     if not name.endswith(ADJUSTED) or name.count("+") > 1:
-        raise NeecoError(f"--method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
+        raise NeecoError(f"method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
     if is_field(method):
         raise NeecoError(
-            f"--method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
+            f"method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
         )
     base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
     adjusted = with_fields(base, on)
     if adjusted == base:
-        raise NeecoError(f"--method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
+        raise NeecoError(f"method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
     return _configured(adjusted, values, assignments)
 
 
