@@ -12,20 +12,23 @@ from typing import Any
 
 import neeco
 from neeco.evaluation.experiments.ablation_results import EVEN_DB, primary_split
-from neeco.evaluation.experiments.ablation_tables import agreement, csv_text, grid
+from neeco.evaluation.experiments.ablation_tables import SETTING, agreement, csv_text, grid
 from neeco.evaluation.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.files import write_text
 from neeco.report.charts import Series, chart, download, legend
 from neeco.report.style import CHART_STYLE, STYLE, html_page
 
+WIDE = 9  # columns; with more a table is printed smaller
+
 PAGE_STYLE = """
 a { color: var(--accent); }
-td:nth-child(2), th:nth-child(2) { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
+.setting { text-align: left; } td.yes { color: var(--good); } td.no { color: var(--bad); }
 tr.reference td { font-weight: 650; } .figures { display: grid; gap: 14px; margin: 14px 0;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 340px), 1fr)); }
 .figures figure > svg { width: 100%; height: auto; background: var(--card);
   border: 1px solid var(--edge); border-radius: 10px; }
 .key { margin: 2px 0; } th { white-space: normal; min-width: 5em; }
+@media print { th { min-width: 0; } .wide table { font-size: 6.5pt; } .wide th, .wide td { padding: 2px; } }
 """
 
 
@@ -80,12 +83,13 @@ def _summary(tables: Sequence[dict[str, Any]]) -> str:
     """Do the paper's directions hold?"""
     judged = [table for table in tables if table["judged"]]
     rows = "".join(
-        f"<tr><td><a href='#{table['name']}'>{escape(table['title'])}</a></td><td>{escape(agreement(table))}</td></tr>"
+        f"<tr><td><a href='#{table['name']}'>{escape(table['title'])}</a></td>"
+        f"<td class='setting'>{escape(agreement(table))}</td></tr>"
         for table in judged
     )
     if not rows:
         return ""
-    head = "<tr><th>table</th><th>directions</th></tr>"
+    head = "<tr><th>table</th><th class='setting'>directions</th></tr>"
     return f"<h2>Do the paper's directions hold?</h2><div class='scroll'><table>{head}{rows}</table></div>"
 
 
@@ -94,21 +98,25 @@ def _section(table: dict[str, Any], ablation: dict[str, Any]) -> str:
     numbers = download(csv_text(table), f"{table['name']}.csv", "numbers of this table (CSV)")
     return (
         f"<section id='{table['name']}'><h2>{escape(table['title'])}</h2><p>{escape(table['question'])}</p>"
-        f"{_table(table)}<p class='soft'>{numbers}{' · ' + escape(told) if told else ''}</p>"
+        f"{_table(table)}<p class='soft'>{escape(told) + ' ' if told else ''}{numbers}</p>"
         f"{_figures(table, ablation)}</section>"
     )
 
 
 def _table(table: dict[str, Any]) -> str:
     headings, rows = grid(table)
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
+    setting = headings.index(SETTING)
+    marks = [" class='setting'" if index == setting else "" for index in range(len(headings))]
+    head = "".join(f"<th{mark}>{escape(cell)}</th>" for mark, cell in zip(marks, headings, strict=True))
     body = []
     for row, cells in zip(table["rows"], rows, strict=True):
         marks = [f" class='{cell}'" if cell in ("yes", "no") else "" for cell in cells]
+        marks[setting] = " class='setting'"
         told = "".join(f"<td{mark}>{escape(cell)}</td>" for mark, cell in zip(marks, cells, strict=True))
         opening = "<tr class='reference'>" if row["reference"] else "<tr>"
         body.append(f"{opening}{told}</tr>")
-    return f"<div class='scroll'><table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+    kind = "scroll wide" if len(headings) > WIDE else "scroll"
+    return f"<div class='{kind}'><table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
 
 
 def _figures(table: dict[str, Any], ablation: dict[str, Any]) -> str:

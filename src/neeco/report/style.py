@@ -57,7 +57,8 @@ pre { background: var(--card); border: 1px solid var(--edge); border-radius: 8px
   h1 { font-size: 1.4rem; } }
 @media print { :root { --ink: #000; --soft: #444; --paper: #fff; --card: #fff; --edge: #bbb; --accent: #04506f;
   --phase: #7a3410; }
-  body { max-width: none; padding: 0; font-size: 11pt; } h2 { break-after: avoid; } .scroll { overflow: visible; }
+  body { max-width: none; padding: 0; font-size: 11pt; } h2, h2 + p, h2 + p + p { break-after: avoid; }
+  p { break-inside: avoid; } .scroll { overflow: visible; }
   table { font-size: 8.5pt; } th, td { padding: 3px 5px; } .curves { grid-template-columns: repeat(3, 1fr); }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; } }
 """
@@ -84,7 +85,7 @@ td.failed { text-align: left; color: var(--bad); white-space: normal; }
 .verdicts li { margin: 4px 0; max-width: 80ch; }
 @media (max-width: 640px) { .shots { grid-template-columns: repeat(2, 1fr); } }
 @media print { .download { display: none; } .best { color: #000; } .shots { grid-template-columns: repeat(4, 1fr); }
-  .charts { grid-template-columns: repeat(2, 1fr); } h3, h2 + p, h2 + p + p { break-after: avoid; }
+  .charts { grid-template-columns: repeat(2, 1fr); } h3 { break-after: avoid; }
   .scroll, figure { break-inside: avoid; } }
 """
 

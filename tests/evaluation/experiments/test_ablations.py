@@ -189,7 +189,7 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
         "difference": -2.0,
         "agrees": "yes",
     }
-    assert "| SH order x compensation | both | 16.82 | 22.00 |  |" in markdown(table)
+    assert "\n| both | 16.82 | 22.00 |  |" in markdown(table)
     assert r"test PSNR at 20 \%: paper" in latex(table)
     written = write_tables(tmp_path, {"tables": [table]})
     assert [path.suffix for path in written] == [".csv", ".md", ".tex"]

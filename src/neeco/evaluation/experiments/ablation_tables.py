@@ -19,6 +19,8 @@ HEADINGS = {
 VERDICTS = {"yes": "yes", "no": "no", "even": "even", None: "-"}
 LATEX_SPECIAL = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#"})
 
+SETTING = "setting"
+
 Grid = tuple[list[str], list[list[str]]]  # headings, and rows of cells
 
 
@@ -51,14 +53,18 @@ def formatted(measure: str, value: float | None, *, signed: bool = False) -> str
 
 
 def grid(table: dict[str, Any]) -> Grid:
-    """A table for reading: per judged measure the paper's number, ours and the verdict; the rest as ours alone."""
+    """A table for reading: per judged measure the paper's number, ours and the verdict; the rest as ours alone.
+
+    The columns up to SETTING are words; what is compared has one of its own where it is not the same in all rows.
+    """
     judged = table["judged"]
-    headings = ["", "setting"]
+    several = len({row["comparison"] for row in table["rows"]}) > 1
+    headings = ["", SETTING] if several else [SETTING]
     for measure in table["measures"]:
         headings += [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
     rows = []
     for row in table["rows"]:
-        cells = [row["comparison"], row["label"]]
+        cells = [row["comparison"], row["label"]] if several else [row["label"]]
         for measure in table["measures"]:
             ours = _ours(row, measure)
             if measure not in judged:
@@ -109,7 +115,9 @@ def markdown(table: dict[str, Any]) -> str:
     """A Markdown table under its title."""
     headings, rows = grid(table)
     lines = [f"## {table['title']}", "", table["question"], ""]
-    lines += [_line(headings), "|---|---|" + "---:|" * (len(headings) - 2), *map(_line, rows)]
+    words = headings.index(SETTING) + 1
+    rule = "|" + "---|" * words + "---:|" * (len(headings) - words)
+    lines += [_line(headings), rule, *map(_line, rows)]
     told = agreement(table)
     return "\n".join([*lines, *(["", f"Directions: {told}."] if told else [])]) + "\n"
 
@@ -122,7 +130,8 @@ def latex(table: dict[str, Any]) -> str:
     """A LaTeX table (booktabs)."""
     headings, rows = grid(table)
     lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(table['title'])}}}"]
-    lines += [rf"\begin{{tabular}}{{ll{'r' * (len(headings) - 2)}}}", r"\toprule"]
+    words = headings.index(SETTING) + 1
+    lines += [rf"\begin{{tabular}}{{{'l' * words}{'r' * (len(headings) - words)}}}", r"\toprule"]
     lines += [_tex_row(headings), r"\midrule", *map(_tex_row, rows), r"\bottomrule"]
     return "\n".join([*lines, r"\end{tabular}", r"\end{table}"]) + "\n"
 
