@@ -11,9 +11,10 @@ from itertools import pairwise
 from neeco.report.axes import Axes, short, widened
 
 WIDTH, HEIGHT = 460, 270  # view box units; the page scales it
-MARGINS = (46, 104, 28, 42)  # left, right, top, bottom
+LEFT, TOP, BOTTOM = 46, 28, 42  # margins; the one at the right holds the names
 LABEL_STEP = 13  # units between two names
-LABEL_CHARACTERS = 16
+LABEL_CHARACTERS = 20  # of a name at the end of its line
+CHARACTER = 6.2  # units that one takes at most, on average
 COLORS = 7
 DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
 
@@ -37,15 +38,17 @@ def chart(title: str, x_title: str, series: Sequence[Series], *, lines: Sequence
     if len({x for x, _ in points}) < 2:
         return ""
     xs, ys = [x for x, _ in points], [y for _, y in points]
-    axes = Axes(min(0.0, *xs), max(xs), *widened(min(ys), max(ys)), WIDTH, HEIGHT, MARGINS)
+    right = 14 + round(CHARACTER * min(LABEL_CHARACTERS, max(len(item.name) for item in series)))
+    margins = (LEFT, right, TOP, BOTTOM)
+    axes = Axes(min(0.0, *xs), max(xs), *widened(min(ys), max(ys)), WIDTH, HEIGHT, margins)
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)} over {escape(x_title)}">']
-    parts.append(f'<text class="title" x="{MARGINS[0]}" y="17">{escape(title)}</text>')
+    parts.append(f'<text class="title" x="{LEFT}" y="17">{escape(title)}</text>')
     parts += axes.grid(short)
-    middle = (MARGINS[0] + WIDTH - MARGINS[1]) / 2
+    middle = (LEFT + WIDTH - right) / 2
     parts[-1] += f'<text x="{middle:.0f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_title)}</text>'
     for x, words in lines:
-        place = f"M{axes.across(x):.1f} {MARGINS[2]}V{HEIGHT - MARGINS[3]}"
-        text = f'<text class="phase-name" x="{axes.across(x) + 4:.1f}" y="{MARGINS[2] + 10}">{escape(words)}</text>'
+        place = f"M{axes.across(x):.1f} {TOP}V{HEIGHT - BOTTOM}"
+        text = f'<text class="phase-name" x="{axes.across(x) + 4:.1f}" y="{TOP + 10}">{escape(words)}</text>'
         parts.append(f'<path class="phase" d="{place}"/>{text}')
     for item in series:
         parts += [mark(item.order, axes.across(x), axes.down(y)) for x, y in item.dots]
@@ -118,14 +121,12 @@ def _names(series: Sequence[Series], axes: Axes) -> list[str]:
     places: list[float] = []
     for y, _ in ends:
         places.append(max(y + 4, places[-1] + LABEL_STEP) if places else y + 4)
-    beyond = max(0.0, places[-1] - (HEIGHT - MARGINS[3])) if places else 0.0
+    beyond = max(0.0, places[-1] - (HEIGHT - BOTTOM)) if places else 0.0
     texts = []
     for (_, item), y in zip(ends, places, strict=True):
         name = item.name if len(item.name) <= LABEL_CHARACTERS else item.name[: LABEL_CHARACTERS - 1] + "…"
-        texts.append(
-            f'<text class="name" x="{WIDTH - MARGINS[1] + 8}" y="{y - beyond:.1f}" style="fill:{color(item.order)}">'
-            f"{escape(name)}</text>"
-        )
+        place = f'x="{WIDTH - axes.margins[1] + 8}" y="{y - beyond:.1f}"'
+        texts.append(f'<text class="name" {place} style="fill:{color(item.order)}">{escape(name)}</text>')
     return texts
 
 

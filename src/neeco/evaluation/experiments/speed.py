@@ -62,7 +62,7 @@ def measure_speed(
         "image": [camera.width, camera.height],
         "frames": len(frames),
         "machine": machine(),
-        "how": f"posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
+        "how": f"Posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
         f"run after up to {WARM_UP} to warm up" + ("; cuda: posed on the processor" if "cuda" in backends() else ""),
     }
 

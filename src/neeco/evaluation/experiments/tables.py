@@ -175,7 +175,8 @@ def machine_words(comparison: Mapping[str, Any]) -> str:
     machine = comparison["machine"]
     threads = machine["threads_per_worker"] or machine["threads"]
     workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
-    return f"{machine['cpu']}, {machine['cores']} cores, {threads} drawing threads{workers}, torch {machine['torch']}"
+    drawing = f"{threads} drawing thread{'s' if threads > 1 else ''}"
+    return f"{machine['cpu']}, {machine['cores']} cores, {drawing}{workers}, torch {machine['torch']}"
 
 
 def markdown_text(comparison: Mapping[str, Any]) -> str:
