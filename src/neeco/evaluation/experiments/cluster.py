@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import logging
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -41,10 +42,11 @@ def run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews]
 
     address = os.environ.get("RAY_ADDRESS")
     threads = threads_per_worker(workers)
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address:
-        ray.init(address=address, log_to_driver=False)
+        ray.init(address=address, **quiet)
     else:
-        ray.init(num_cpus=threads * workers, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1")
+        ray.init(num_cpus=threads * workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
     try:
         return _run(ray, jobs, workers, threads, report)
     finally:
