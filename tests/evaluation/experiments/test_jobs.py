@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from dataclasses import replace
@@ -14,6 +15,7 @@ import pytest
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
+from neeco.evaluation.experiments import cluster
 from neeco.evaluation.experiments import jobs as module
 from neeco.evaluation.experiments.cluster import threads_per_worker
 from neeco.evaluation.experiments.jobs import UNLIMITED, Budget, run_job, run_jobs
@@ -239,6 +241,15 @@ def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, told: str, mak
 def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(NeecoError, match=r"install neeco\[cluster\]"):
+        run_jobs([make_job()], workers=2)
+
+
+def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        closed = server.getsockname()[1]
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
+    with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
         run_jobs([make_job()], workers=2)
 
 

@@ -6,12 +6,14 @@ import contextlib
 import importlib.util
 import logging
 import os
+import socket
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.evaluation.experiments.jobs import Job, JobNews, attempt_job, ended
 
+CONNECT = 5.0  # s that a cluster's head gets to answer
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
 
@@ -26,9 +28,19 @@ def usable_cores() -> int:
 
 
 def require_ray() -> None:
-    """Raises NeecoError when Ray is not installed."""
+    """Raises NeecoError when Ray is not installed, or nobody listens at the HOST:PORT that RAY_ADDRESS names."""
     if importlib.util.find_spec("ray") is None:
         raise NeecoError("--workers: several at once need Ray; install neeco[cluster], or leave --workers out")
+    address = os.environ.get("RAY_ADDRESS", "")
+    host, _, port = address.rpartition(":")
+    if "/" in address or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
+        return
+    try:
+        socket.create_connection((host, int(port)), CONNECT).close()
+    except (OSError, OverflowError) as error:
+        raise NeecoError(
+            f"RAY_ADDRESS: no Ray cluster answers at {address} ({error}); start it, or unset RAY_ADDRESS to work here"
+        ) from None
 
 
 def run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
@@ -44,7 +56,11 @@ def run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews]
     threads = threads_per_worker(workers)
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address:
-        ray.init(address=address, **quiet)
+        try:
+            ray.init(address=address, **quiet)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            told = " ".join(str(error).split()) or type(error).__name__
+            raise NeecoError(f"RAY_ADDRESS: {address} is no cluster that can be joined: {told}") from None
     else:
         ray.init(num_cpus=threads * workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
     try:
