@@ -35,9 +35,9 @@ def instrument_points(reading: float) -> Tensor:
     return torch.cat([shaft, *jaws])
 
 
-def make_evidence(shaft_from_sensor: Tensor, frames: int = 40, motion: float = 1.0) -> Evidence:
+def make_evidence(shaft_from_sensor: Tensor, frames: int = 40, motion: float = 1.0, thickness: float = 1.0) -> Evidence:
     """Silhouettes of the instrument in random poses before a still camera; `shaft_from_sensor`: how the sensor sits,
-    `motion`: how far the poses range."""
+    `motion`: how far the poses range, `thickness`: of the instrument, as a share of the usual one."""
     rng = np.random.default_rng(0)
     camera = Camera(torch.eye(4), 200.0, 200.0, 80.0, 64.0, 160, 128)
     hits, taken = [], []
@@ -49,7 +49,8 @@ def make_evidence(shaft_from_sensor: Tensor, frames: int = 40, motion: float = 1
         place = torch.tensor([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(-10, 10)], dtype=torch.float64)
         place = motion * place + torch.tensor([0.0, 0.0, 85.0], dtype=torch.float64)
         world_from_shaft = rigid(lean[:3, :3] @ spin[:3, :3], place)
-        world = instrument_points(reading).double() @ world_from_shaft[:3, :3].T + world_from_shaft[:3, 3]
+        points = instrument_points(reading).double() * torch.tensor([thickness, thickness, 1.0])
+        world = points @ world_from_shaft[:3, :3].T + world_from_shaft[:3, 3]
         u = (world[:, 0] / world[:, 2] * camera.fx + camera.cx).long()
         v = (world[:, 1] / world[:, 2] * camera.fy + camera.cy).long()
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (world[:, 2] > 1)
@@ -101,6 +102,16 @@ def test_the_hinge_is_found_without_training(mounting: str) -> None:
     assert math.degrees(math.acos(min(1.0, abs(float(axis @ truth))))) < 20
     pivot = true_from_carved @ torch.tensor([0.0, 0.0, balanced_depth(guesses), 1.0])
     assert abs(float(pivot[2]) - PIVOT_MM) < 7  # training takes it from here
+
+
+def test_an_instrument_much_thinner_than_the_first_grid_is_carved() -> None:
+    """On the real dVRK recording, whether an arm was found at all hung on where the grid's points fell."""
+    shaft_from_sensor = rigid_from_vector(torch.tensor([0.5, -0.7, 0.3, 7.4, -1.6, 6.0], dtype=torch.float64))
+    evidence = make_evidence(shaft_from_sensor, thickness=0.08)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    assert shape is not None
+    direction = (shaft_from_sensor.float() @ shape.instrument_from_shaft)[:3, 2]
+    assert math.degrees(math.acos(min(1.0, float(direction[2])))) < 5
 
 
 def test_background_that_nothing_explains_is_not_carved() -> None:

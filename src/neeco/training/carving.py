@@ -15,9 +15,10 @@ from torch import Tensor
 
 from neeco.training.evidence import Evidence
 
-COARSE = 48  # voxels per side of the first grid
+COARSE, FINER = 48, 72  # voxels per side of the first grid, and of the one for what is thin in it
 SOLID = (0.85, 0.75, 0.65)  # mean evidence of a point surely inside: the strictest level that enough points reach
 ENOUGH = 8  # of them
+FEW = 24  # of them: so few that which ones they are is chance
 MOVES = 1.5  # ratio of evidence under its own poses to that under exchanged ones
 EXCHANGES = 4  # ways of exchanging the poses
 POSSIBLE = 0.6  # mean evidence of a point that may be inside, or on a moving jaw
@@ -94,21 +95,30 @@ def views_of(evidence: Evidence, name: str) -> Views:
 def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int = 3000) -> CarvedShape | None:
     """The shape of instrument `name`, or None when nothing in its frame is evident (wrong poses, or never in view)."""
     reach = 0.6 * evidence.distance
-    ticks = torch.linspace(-reach, reach, COARSE)
-    grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     views = views_of(evidence, name)
-    score, seen = views.scores(grid)
-    level = next((level for level in SOLID if int(((score > level) & (seen > 0.25)).sum()) >= ENOUGH), None)
-    if level is None:
+    for side in (COARSE, FINER):
+        solid, level = _solid_points(views, reach, side)
+        if len(solid) >= FEW:
+            break
+    if len(solid) < ENOUGH:
         return None
-    base = _shaft_frame(views, grid[(score > level) & (seen > 0.25)])
-    spacing = float(ticks[1] - ticks[0])
-    base, line, radius = _refine_axis(views, base, spacing, level)
+    base, line, radius = _refine_axis(views, _shaft_frame(views, solid), 2 * reach / (side - 1), level)
     if line.shape[0] < 4:
         return None
     near, tip = float(line[0, 0]), float(line[-1, 0])
     points = _sample_seeds(views.seen_from(base), near, tip, max(3 * radius, 0.08 * reach), seeds, generator)
     return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
+
+
+def _solid_points(views: Views, reach: float, side: int) -> tuple[Tensor, float]:
+    """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
+    the strictest of SOLID that ENOUGH of them have."""
+    ticks = torch.linspace(-reach, reach, side)
+    grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+    score, seen = views.scores(grid)
+    score[seen <= 0.25] = 0
+    level = next((level for level in SOLID if int((score > level).sum()) >= ENOUGH), SOLID[-1])
+    return grid[score > level], level
 
 
 def _shaft_frame(views: Views, solid: Tensor) -> Tensor:
