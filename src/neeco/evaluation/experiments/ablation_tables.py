@@ -8,6 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from neeco.evaluation.experiments.tables import latex_escape
 from neeco.files import write_text
 
 HEADINGS = {
@@ -17,7 +18,6 @@ HEADINGS = {
     "mask_iou": "mask IoU",
 }
 VERDICTS = {"yes": "yes", "no": "no", "even": "even", None: "-"}
-LATEX_SPECIAL = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#"})
 
 SETTING = "setting"
 
@@ -129,7 +129,7 @@ def _line(cells: list[str]) -> str:
 def latex(table: dict[str, Any]) -> str:
     """A LaTeX table (booktabs)."""
     headings, rows = grid(table)
-    lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(table['title'])}}}"]
+    lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_escape(table['title'])}}}"]
     words = headings.index(SETTING) + 1
     lines += [rf"\begin{{tabular}}{{{'l' * words}{'r' * (len(headings) - words)}}}", r"\toprule"]
     lines += [_tex_row(headings), r"\midrule", *map(_tex_row, rows), r"\bottomrule"]
@@ -137,8 +137,4 @@ def latex(table: dict[str, Any]) -> str:
 
 
 def _tex_row(cells: list[str]) -> str:
-    return " & ".join(map(_tex, cells)) + r" \\"
-
-
-def _tex(text: str) -> str:
-    return text.translate(LATEX_SPECIAL)
+    return " & ".join(map(latex_escape, cells)) + r" \\"
