@@ -18,8 +18,9 @@ from neeco.errors import NeecoError
 from neeco.evaluation.experiments import cluster
 from neeco.evaluation.experiments import jobs as module
 from neeco.evaluation.experiments.cluster import threads_per_worker
-from neeco.evaluation.experiments.jobs import UNLIMITED, Budget, run_job, run_jobs
+from neeco.evaluation.experiments.jobs import UNLIMITED, Budget, run_job
 from neeco.evaluation.experiments.memory import peak_memory_mb, reset_peak_memory
+from neeco.evaluation.experiments.running import run_jobs
 from neeco.evaluation.experiments.watching import HeldOut
 from neeco.training import train as train_module
 from neeco.training.options import training_config

@@ -26,7 +26,8 @@ from neeco.evaluation.experiments.ablations import (
 )
 from neeco.evaluation.experiments.cluster import require_ray
 from neeco.evaluation.experiments.derived import derive_capture
-from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
+from neeco.evaluation.experiments.jobs import Budget, Job, JobNews, check_folder, held_out_splits
+from neeco.evaluation.experiments.running import run_jobs
 from neeco.evaluation.experiments.settings import check_settings, settings_for
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.deformations.nps import WARM_UP

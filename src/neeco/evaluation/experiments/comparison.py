@@ -16,9 +16,10 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.experiments.cluster import require_ray, threads_per_worker
 from neeco.evaluation.experiments.distance import distances_to_training
-from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits, run_jobs
+from neeco.evaluation.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits
 from neeco.evaluation.experiments.machine import machine
 from neeco.evaluation.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
+from neeco.evaluation.experiments.running import run_jobs
 from neeco.evaluation.experiments.settings import check_settings, settings_for
 from neeco.evaluation.experiments.speed import measure_speed
 from neeco.evaluation.experiments.summary import summarise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -224,53 +224,10 @@ def _complete(job: Job, watcher: Watcher) -> None:
             watcher.add_row(scene, 1.0)
 
 
-def run_jobs(
-    jobs: Sequence[Job], workers: int = 1, progress: Callable[[JobNews], None] | None = None
-) -> list[dict[str, Any]]:
-    """Run every job and return what each wrote, in their order.
-
-    workers 1: in this process, one after another; more: so many at once by Ray. A job that fails does not stop the
-    others: its place holds {name, method, seed, capture, budget, "error": why, "splits": {}}, and no job.json is
-    written, so that the next start tries again. Raises NeecoError before any work when a job's folder is another job's
-    or Ray is not there, and KeyboardInterrupt saying which job was stopped.
-    """
-    if workers < 1:
-        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    report = progress or (lambda news: None)
-    for job in jobs:
-        job.budget.check()
-        check_folder(job)
-    if workers > 1:
-        from neeco.evaluation.experiments.cluster import run_on_cluster
-
-        return run_on_cluster(jobs, workers, report)
-    return [_run_here(index, len(jobs), job, report) for index, job in enumerate(jobs)]
-
-
-def _run_here(index: int, total: int, job: Job, report: Callable[[JobNews], None]) -> dict[str, Any]:
-    """One job of `total` in this process."""
-
-    def tell(stage: str, share: float, text: str) -> None:
-        report(JobNews(index, total, job, stage, share, text))
-
-    try:
-        result = attempt_job(job, tell)
-    except KeyboardInterrupt as interrupt:
-        raise KeyboardInterrupt(stopped_line(f"job {index + 1} of {total} ({job.title})", interrupt)) from None
-    report(ended(index, total, job, result))
-    return result
-
-
 def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
     """The news that a job is done or has failed."""
     failure = result.get("error", "")
     return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
-
-
-def stopped_line(where: str, interrupt: KeyboardInterrupt) -> str:
-    """What to tell after Ctrl-C: where it stopped, and that nothing is lost."""
-    moment = " ".join(map(str, interrupt.args)).split(";")[0]
-    return f"{where}{', ' + moment if moment else ''}; run the same command again to go on, nothing finished is lost"
 
 
 def attempt_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
