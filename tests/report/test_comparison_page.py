@@ -196,7 +196,7 @@ def test_sentences_call_first_only_what_is_clear_of_the_spread():
         "b first in PSNR, 21.0 dB, 1.0 dB before a (clear of the seeds' spread)"
     )
     rows[1]["psnr"] = numbers(21.0)
-    assert "spread over seeds not known" in first_in(rows, "psnr", "PSNR", " dB", 1)
+    assert first_in(rows, "psnr", "PSNR", " dB", 1) == "b first in PSNR, 21.0 dB, 1.0 dB before a"
     assert first_in([{"name": "a", "psnr": numbers(None)}], "psnr", "PSNR", " dB", 1) is None
 
 
@@ -205,6 +205,17 @@ def test_sentences_go_split_by_split(comparison):
     assert told[0].startswith("test: kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
     assert told[1].startswith("unseen: kinematic first")
     assert "level in drawing speed" in told[2]
+
+
+def test_one_seed_is_said_once(comparison):
+    assert not any("one seed" in sentence for sentence in standings(comparison))
+    for row in comparison["summary"]:
+        for value in row.values():
+            if isinstance(value, dict) and value.get("std") is not None:
+                value["std"] = None
+    told = standings(comparison)
+    assert sum("one seed" in sentence for sentence in told) == 1
+    assert "not known" not in told[0]
 
 
 def test_charts_tell_methods_apart_without_colour():

@@ -80,6 +80,8 @@ svg .dot { fill: none; stroke-width: 1; opacity: .45; } svg text.name { font-siz
 .best { font-weight: 700; color: var(--good); } td small { color: var(--soft); font-size: .82em; }
 td.failed { text-align: left; color: var(--bad); white-space: normal; }
 .shots { display: grid; grid-template-columns: repeat(auto-fill, minmax(215px, 1fr)); gap: 12px 10px; margin: 6px 0; }
+@media screen and (min-width: 1000px) {
+  .shots:has(> :nth-child(5):last-child) { grid-template-columns: repeat(5, 1fr); } }
 .shots img + img { margin-top: 4px; }
 .download { font-size: .85rem; color: var(--accent); margin-right: 14px; }
 .verdicts li { margin: 4px 0; max-width: 80ch; }
