@@ -7,6 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich.console import Console
+from rich.text import Text
+
+from neeco.cli._tables import fitted
 
 if TYPE_CHECKING:
     from neeco.evaluation.experiments.jobs import JobNews
@@ -61,8 +65,9 @@ def run(args: Arguments) -> int:
         ablation = run_ablations(plan, score_label_ways, args.workers, bar.show)
     write_tables(args.output, ablation)
     page = write_ablation_report(args.output, ablation)
-    _print_verdicts(ablation)
-    print(f"report: {page}")
+    _print_tables(Console(), ablation)
+    for line in (f"tables: {args.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
+        print(line)
     return 1 if ablation["failures"] else 0
 
 
@@ -70,7 +75,6 @@ class _Bar:
     """All runs as one bar on stderr; it appears with the first news, so that bad input ends in its one line alone."""
 
     def __init__(self) -> None:
-        from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
         columns = [BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()]
@@ -96,11 +100,20 @@ class _Bar:
             self.bar.console.print(f"failed: {news.job.name}: {news.text}", style="red", markup=False)
 
 
-def _print_verdicts(ablation: dict[str, Any]) -> None:
-    from neeco.evaluation.experiments.ablation_tables import agreement
+def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
+    """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
+    from neeco.evaluation.experiments.ablation_tables import SETTING, agreement, grid
 
     for table in ablation["tables"]:
         if table["judged"]:
-            print(f"{table['title']}: {agreement(table)}")
+            console.print(f"{table['title']}: {agreement(table)}", markup=False, highlight=False)
+            continue
+        headings, lines = grid(table)
+        rows = [
+            [Text(cell, "bold" if row["reference"] else "") for cell in line]
+            for row, line in zip(table["rows"], lines, strict=True)
+        ]
+        for piece in fitted(table["title"], headings, rows, headings.index(SETTING) + 1, console.width):
+            console.print(piece)
     for note in ablation["notes"]:
-        print(f"note: {note}")
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)

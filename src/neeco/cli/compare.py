@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
+from rich.text import Text
+
+from neeco.cli._tables import fitted
 
 if TYPE_CHECKING:
     from neeco.evaluation.experiments.comparison import ComparisonSpec
     from neeco.evaluation.experiments.jobs import Budget
+    from neeco.evaluation.experiments.tables import Cell
+    from neeco.evaluation.experiments.tables import Table as ResultTable
 
 
 @dataclass(frozen=True)
@@ -135,40 +140,15 @@ def _budget(args: Compare) -> Budget:
     return Budget(args.minutes, args.iterations)
 
 
-BORDER = 3  # what a column takes beside its text
-
-
-def fitting(table: Any, width: int) -> list[Table]:
-    """A table of the comparison for a terminal of `width` characters, cut between columns where it is wider."""
-    rows = {name: [_text(cell) for cell in cells] for name, cells in table.rows if name not in table.failed}
-    words = ["failed"] if table.failed else []
-    widths = [
-        max(map(len, [*words, *column.title.split(), *(texts[index] for texts in rows.values())]))
-        for index, column in enumerate(table.columns)
+def fitting(table: ResultTable, width: int) -> list[Table]:
+    """A table of the comparison for a terminal of `width` characters; the best of a column is bold."""
+    headings = ["method", *(column.title for column in table.columns)]
+    rows = [
+        [Text(name), Text("failed", "red")] if name in table.failed else [Text(name), *map(_text, cells)]
+        for name, cells in table.rows
     ]
-    left = width - 1 - BORDER - max(len(name) for name in ("method", *(name for name, _ in table.rows)))
-    groups: list[list[int]] = [[]]
-    for index in range(len(widths)):
-        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
-            groups.append([])
-        groups[-1].append(index)
-    return [_shown(table, group, widths) for group in groups]
+    return fitted(table.title, headings, rows, 1, width)
 
 
-def _shown(table: Any, columns: list[int], widths: list[int]) -> Table:
-    """Those columns of the table, as wide as their longest words; the best of a column is bold."""
-    title = f"{table.title}, continued" if columns and columns[0] else table.title
-    shown = Table(Column("method", no_wrap=True), title=title, title_justify="left")
-    for index in columns:
-        shown.add_column(table.columns[index].title, justify="right", width=widths[index])
-    for name, cells in table.rows:
-        if name in table.failed:
-            shown.add_row(name, "[red]failed[/red]")
-            continue
-        texts = [(_text(cells[index]), cells[index].best) for index in columns]
-        shown.add_row(name, *(f"[bold]{text}[/bold]" if best else text for text, best in texts))
-    return shown
-
-
-def _text(cell: Any) -> str:
-    return f"{cell.mean} ± {cell.std}" if cell.std else cell.mean
+def _text(cell: Cell) -> Text:
+    return Text(f"{cell.mean} ± {cell.std}" if cell.std else cell.mean, "bold" if cell.best else "")

@@ -1,0 +1,49 @@
+"""Tables for the terminal, cut between columns where they are wider than it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Column, Table
+from rich.text import Text
+
+BORDER = 3  # what a column takes beside its text
+
+
+def fitted(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
+    """A table in as many pieces as a terminal of `width` characters needs; the first `keys` columns stand in each.
+
+    A row with fewer cells than there are headings says the same in every piece.
+    """
+    widths = [
+        max([*map(len, heading.split()), *(len(row[index]) for row in rows if index < len(row))], default=0)
+        for index, heading in enumerate(headings)
+    ]
+    left = width - 1 - sum(BORDER + widths[index] for index in range(keys))
+    groups: list[list[int]] = [[]]
+    for index in range(keys, len(headings)):
+        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
+            groups.append([])
+        groups[-1].append(index)
+    return [
+        _piece(title if group is groups[0] else f"{title}, continued", headings, rows, keys, group, widths)
+        for group in groups
+    ]
+
+
+def _piece(
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[Sequence[Text]],
+    keys: int,
+    group: list[int],
+    widths: Sequence[int],
+) -> Table:
+    """The columns of `group` behind the key columns, each as wide as its longest word."""
+    whole = Text(title, "italic", no_wrap=True, overflow="ignore")
+    table = Table(*(Column(headings[i], no_wrap=True) for i in range(keys)), title=whole, title_justify="left")
+    for index in group:
+        table.add_column(headings[index], justify="right", width=widths[index])
+    for row in rows:
+        table.add_row(*row[:keys], *([row[i] for i in group] if len(row) == len(headings) else row[keys:]))
+    return table

@@ -1,0 +1,57 @@
+"""What `neeco ablate` prints."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from neeco.cli.ablate import _print_tables
+
+MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
+
+
+def _row(label: str, reference: bool, psnr: float | None, **more: Any) -> dict[str, Any]:
+    values = {} if psnr is None else dict(zip(MEASURES, (psnr, psnr - 2, 0.7, 0.5), strict=True))
+    difference = {} if reference else {key: 0.25 for key in values}
+    return {
+        "comparison": "c",
+        "label": label,
+        "reference": reference,
+        "values": values,
+        "difference": difference,
+    } | more
+
+
+@pytest.mark.parametrize("width", [50, 160])
+def test_own_tables_are_printed_whole_and_the_papers_as_their_verdict(width: int) -> None:
+    judged = {"paper": {}, "paper_direction": "", "agrees": {"psnr.test": "yes"}}
+    ablation = {
+        "tables": [
+            {
+                "title": "The paper's",
+                "judged": ["psnr.test"],
+                "measures": [],
+                "rows": [_row("x", False, 1.0, **judged)],
+            },
+            {
+                "title": "Joints, taken away one after another from a hand",
+                "judged": [],
+                "measures": MEASURES,
+                "rows": [_row("[off]", False, 21.25), _row("on", True, 22.5), _row("lost", False, None)],
+            },
+        ],
+        "notes": ["[few] steps"],
+    }
+    console = Console(width=width, record=True, file=io.StringIO())
+    _print_tables(console, ablation)
+    shown = console.export_text()
+    assert "The paper's: 1 of 1 as in the paper" in shown
+    assert all(text in shown for text in ("21.25 (+0.25)", "20.50", "0.700 (+0.250)", "0.500"))
+    assert "…" not in shown
+    assert "note: [few] steps" in shown
+    pieces = shown.count("Joints, taken away one after another from a hand")
+    assert shown.count("[off]") == shown.count("lost") == pieces
+    assert (pieces > 1) == (width == 50)
