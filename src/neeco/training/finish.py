@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import InstrumentState, State
+from neeco.capture.model import Frame, InstrumentState, State
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinged, Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
+from neeco.scene.scene import Scene
 from neeco.training.extend import extend_shaft
-
-if TYPE_CHECKING:
-    from neeco.training.session import Session
+from neeco.training.refinement import Refinement
+from neeco.training.schedule import Schedule
 
 ROLLS = (0.5, -0.5)  # rad, with which rotational symmetry is tested: small, so that seen sides stay in view
 WRIST_STEPS = 14
@@ -31,7 +32,21 @@ ENOUGH = 10  # solid Gaussians without which an instrument is as good as absent
 Report = Callable[[str], None]
 
 
-def finish_gaussians(session: Session, report: Report) -> None:
+class Fitted(Protocol):
+    """What is read of a training session: its scene, and what it was fitted to (as in `Session`)."""
+
+    scene: Scene
+    frames: tuple[Frame, ...]
+    images: list[Tensor]
+    masks: list[Tensor | None]
+    pose_order: np.ndarray
+    extent: float
+    refinement: Refinement
+    schedule: Schedule
+    iteration: int
+
+
+def finish_gaussians(session: Fitted, report: Report) -> None:
     """What is found once learning has ended: labels of the paper's method, the shaft's extent, the joints' verdict."""
     scene = session.scene
     scene.requires_grad_(False)
@@ -45,7 +60,7 @@ def finish_gaussians(session: Session, report: Report) -> None:
 
 
 @torch.no_grad()
-def finish_instruments(session: Session, report: Report) -> None:
+def finish_instruments(session: Fitted, report: Report) -> None:
     """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`.
 
     Says so when hardly anything was learned of an instrument: nothing else would tell of labels that stay empty.
@@ -79,7 +94,7 @@ def finish_instruments(session: Session, report: Report) -> None:
 
 
 @torch.no_grad()
-def place_wrists(session: Session) -> None:
+def place_wrists(session: Fitted) -> None:
     """Find where each shaft ends and the wrist begins: where the colour along it changes, or, on an instrument of one
     colour, where it stops being a surface of revolution."""
     hinged = session.scene.deformation.hinged
@@ -115,7 +130,7 @@ def color_boundary(canonical: CanonicalGaussians, hinged: Hinged, index: int) ->
     return float(edges[best]) if splits[best] < COLOR_SCATTER * scatter(slice(0, COLOR_BINS)) else None
 
 
-def _symmetry_boundary(session: Session, hinged: Hinged, index: int) -> float:
+def _symmetry_boundary(session: Fitted, hinged: Hinged, index: int) -> float:
     """Position mm along the shaft up to which spinning what lies behind costs little."""
     scene = session.scene
     hinges = hinged.hinges_of(index)
@@ -134,13 +149,13 @@ def _symmetry_boundary(session: Session, hinged: Hinged, index: int) -> float:
     return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
-def _spread(session: Session, count: int) -> list[int]:
+def _spread(session: Fitted, count: int) -> list[int]:
     """Indices of `count` training frames spread evenly along the walk through poses."""
     order = session.pose_order
     return [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(count, len(order)))]
 
 
-def _image_error(session: Session, index: int, perturbation: Perturbation) -> float:
+def _image_error(session: Fitted, index: int, perturbation: Perturbation) -> float:
     frame = session.frames[index]
     state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
     rendering = rasterize(session.scene.at(state, perturbation), camera)
@@ -162,7 +177,7 @@ def _extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor
     return torch.quantile(along, torch.tensor([0.02, 0.985]))
 
 
-def _verdict(session: Session, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
+def _verdict(session: Fitted, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
     """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving
     parts' image?
 
