@@ -260,3 +260,10 @@ def test_damaged_point_clouds_are_refused(tmp_path, content):
     (tmp_path / "bad.ply").write_bytes(content)
     with pytest.raises(NeecoError, match=r"bad\.ply"):
         read_ply(tmp_path / "bad.ply")
+
+
+def test_a_folder_that_is_not_there_is_told_in_one_plain_line(tmp_path):
+    missing = tmp_path / "nowhere"
+    with pytest.raises(NeecoError) as raised:
+        read_capture(missing)
+    assert str(raised.value) == f"{missing}: no such folder; give the folder of a capture"

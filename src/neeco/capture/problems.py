@@ -52,7 +52,8 @@ class Report:
         if not errors:
             return
         more = f" ({len(errors) - 1} more: run `neeco check {root}`)" if len(errors) > 1 else ""
-        raise NeecoError(f"{root}: {errors[0]}{more}")
+        place = "" if errors[0].file == str(root) else f"{root}: "
+        raise NeecoError(f"{place}{errors[0]}{more}")
 
 
 def shown(value: Any, limit: int = 60) -> str:

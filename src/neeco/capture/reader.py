@@ -15,7 +15,7 @@ from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.parsed import Parsed
 from neeco.capture.paths import inside
 from neeco.capture.points import random_points
-from neeco.capture.problems import Report
+from neeco.capture.problems import Report, errors_only
 from neeco.capture.transforms import parse_transforms
 from neeco.errors import NeecoError
 
@@ -31,7 +31,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
     """
     report = Report()
     parsed = parse_capture(path, report, transforms, background)
-    if not parsed.frames:
+    if not parsed.frames and not errors_only(report.problems):
         report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
     report.raise_first(parsed.root)
     points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
