@@ -13,10 +13,11 @@ BORDER = 3  # what a column takes beside its text
 def fitted(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
     """A table in as many pieces as a terminal of `width` characters needs; the first `keys` columns stand in each.
 
-    A row with fewer cells than there are headings says the same in every piece.
+    A row of one cell behind its keys says the same in every piece.
     """
+    full = [[*row[:keys], *[row[keys]] * (len(headings) - keys)] if len(row) == keys + 1 else row for row in rows]
     widths = [
-        max([*map(len, heading.split()), *(len(row[index]) for row in rows if index < len(row))], default=0)
+        max([*map(len, heading.split()), *(len(row[index]) for row in full)], default=0)
         for index, heading in enumerate(headings)
     ]
     left = width - 1 - sum(BORDER + widths[index] for index in range(keys))
@@ -45,5 +46,5 @@ def _piece(
     for index in group:
         table.add_column(headings[index], justify="right", width=widths[index])
     for row in rows:
-        table.add_row(*row[:keys], *([row[i] for i in group] if len(row) == len(headings) else row[keys:]))
+        table.add_row(*row[:keys], *(row[keys:] if len(row) == keys + 1 else [row[i] for i in group]))
     return table

@@ -1,0 +1,26 @@
+"""Tables cut to the terminal's width."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+from rich.text import Text
+
+from neeco.cli._tables import fitted
+
+
+@pytest.mark.parametrize("width", [22, 60])
+def test_a_failed_row_is_whole_in_every_piece_however_narrow_its_columns(width: int) -> None:
+    rows = [[Text(text) for text in ("a", "12.00", "3", "4")], [Text("lost"), Text("failed")]]
+    console = Console(width=width, record=True, file=io.StringIO())
+    pieces = fitted("t", ["method", "PSNR", "n", "m"], rows, 1, width)
+    for piece in pieces:
+        console.print(piece)
+    shown = console.export_text()
+    assert shown.count("failed") == shown.count("lost") == len(pieces)
+    assert all(number in shown for number in ("12.00", "3", "4"))
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= width
+    assert (len(pieces) > 1) == (width == 22)
