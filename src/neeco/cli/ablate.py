@@ -102,18 +102,18 @@ class _Bar:
 
 def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
     """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
-    from neeco.evaluation.experiments.ablation_tables import SETTING, agreement, grid
+    from neeco.evaluation.experiments.ablation_tables import agreement, grid
 
     for table in ablation["tables"]:
         if table["judged"]:
             console.print(f"{table['title']}: {agreement(table)}", markup=False, highlight=False)
             continue
-        headings, lines = grid(table)
+        headings, lines, keys = grid(table)
         rows = [
             [Text(cell, "bold" if row["reference"] else "") for cell in line]
             for row, line in zip(table["rows"], lines, strict=True)
         ]
-        for piece in fitted(table["title"], headings, rows, headings.index(SETTING) + 1, console.width):
+        for piece in fitted(table["title"], headings, rows, keys, console.width):
             console.print(piece)
     for note in ablation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)

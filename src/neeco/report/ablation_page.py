@@ -12,7 +12,7 @@ from typing import Any
 
 import neeco
 from neeco.evaluation.experiments.ablation_results import EVEN_DB, primary_split
-from neeco.evaluation.experiments.ablation_tables import SETTING, agreement, csv_text, grid
+from neeco.evaluation.experiments.ablation_tables import agreement, csv_text, grid
 from neeco.evaluation.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.files import write_text
 from neeco.report.charts import Series, chart, download, legend
@@ -104,8 +104,8 @@ def _section(table: dict[str, Any], ablation: dict[str, Any]) -> str:
 
 
 def _table(table: dict[str, Any]) -> str:
-    headings, rows = grid(table)
-    setting = headings.index(SETTING)
+    headings, rows, keys = grid(table)
+    setting = keys - 1
     marks = [" class='setting'" if index == setting else "" for index in range(len(headings))]
     head = "".join(f"<th{mark}>{escape(cell)}</th>" for mark, cell in zip(marks, headings, strict=True))
     body = []

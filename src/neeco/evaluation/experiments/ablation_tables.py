@@ -6,7 +6,7 @@ import csv
 import io
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from neeco.evaluation.experiments.tables import latex_escape
 from neeco.files import write_text
@@ -19,9 +19,13 @@ HEADINGS = {
 }
 VERDICTS = {"yes": "yes", "no": "no", "even": "even", None: "-"}
 
-SETTING = "setting"
 
-Grid = tuple[list[str], list[list[str]]]  # headings, and rows of cells
+class Grid(NamedTuple):
+    """A table as text. The first `keys` columns say what a row is, the last of them its setting; numbers follow."""
+
+    headings: list[str]
+    rows: list[list[str]]
+    keys: int
 
 
 def write_tables(output: Path, ablation: dict[str, Any]) -> list[Path]:
@@ -55,11 +59,12 @@ def formatted(measure: str, value: float | None, *, signed: bool = False) -> str
 def grid(table: dict[str, Any]) -> Grid:
     """A table for reading: per judged measure the paper's number, ours and the verdict; the rest as ours alone.
 
-    The columns up to SETTING are words; what is compared has one of its own where it is not the same in all rows.
+    What is compared has a column of its own where it is not the same in all rows.
     """
     judged = table["judged"]
     several = len({row["comparison"] for row in table["rows"]}) > 1
-    headings = ["", SETTING] if several else [SETTING]
+    headings = ["", "setting"] if several else ["setting"]
+    keys = len(headings)
     for measure in table["measures"]:
         headings += [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
     rows = []
@@ -74,7 +79,7 @@ def grid(table: dict[str, Any]) -> Grid:
             told = formatted(measure, paper) if paper is not None else row["paper_direction"] or "-"
             cells += [told, ours, "" if row["reference"] else VERDICTS[row["agrees"].get(measure)]]
         rows.append(cells)
-    return headings, rows
+    return Grid(headings, rows, keys)
 
 
 def _ours(row: dict[str, Any], measure: str) -> str:
@@ -113,10 +118,9 @@ def csv_text(table: dict[str, Any]) -> str:
 
 def markdown(table: dict[str, Any]) -> str:
     """A Markdown table under its title."""
-    headings, rows = grid(table)
+    headings, rows, keys = grid(table)
     lines = [f"## {table['title']}", "", table["question"], ""]
-    words = headings.index(SETTING) + 1
-    rule = "|" + "---|" * words + "---:|" * (len(headings) - words)
+    rule = "|" + "---|" * keys + "---:|" * (len(headings) - keys)
     lines += [_line(headings), rule, *map(_line, rows)]
     told = agreement(table)
     return "\n".join([*lines, *(["", f"Directions: {told}."] if told else [])]) + "\n"
@@ -128,10 +132,9 @@ def _line(cells: list[str]) -> str:
 
 def latex(table: dict[str, Any]) -> str:
     """A LaTeX table (booktabs)."""
-    headings, rows = grid(table)
+    headings, rows, keys = grid(table)
     lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_escape(table['title'])}}}"]
-    words = headings.index(SETTING) + 1
-    lines += [rf"\begin{{tabular}}{{{'l' * words}{'r' * (len(headings) - words)}}}", r"\toprule"]
+    lines += [rf"\begin{{tabular}}{{{'l' * keys}{'r' * (len(headings) - keys)}}}", r"\toprule"]
     lines += [_tex_row(headings), r"\midrule", *map(_tex_row, rows), r"\bottomrule"]
     return "\n".join([*lines, r"\end{tabular}", r"\end{table}"]) + "\n"
 
