@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from neeco.training.carving import MOVES, CarvedShape, carve, score_points, view
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.evidence import Evidence, gather_evidence
 from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
+from neeco.training.protocol import Report
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import order_by_pose
 from neeco.training.session import Session
@@ -29,8 +30,6 @@ UNEXPLAINED = 0.25  # mean evidence that is too much for instruments alone
 SEEDS = 3000  # Gaussians per instrument at the start
 AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted frame seeds are strewn
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
-
-Report = Callable[[str], None]
 
 
 def find_instruments(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from neeco.scene.deformations._hinges import Hinged, Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.scene.scene import Scene
 from neeco.training.extend import extend_shaft
+from neeco.training.protocol import Report
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule
 
@@ -28,8 +28,6 @@ COLOR_SCATTER = 0.4  # of the profile's scatter that may be left when two colour
 FOUND = 0.35  # share of the moving parts' error that the readings must explain: .5-.9 where found, .27 half-way off
 SOLID = 0.3  # opacity of a Gaussian that counts as the instrument's substance
 ENOUGH = 10  # solid Gaussians without which an instrument is as good as absent
-
-Report = Callable[[str], None]
 
 
 class Fitted(Protocol):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -14,10 +14,9 @@ from neeco.scene.swept import SweptVolume
 from neeco.training.carving import carve
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import SEEDS, judge_evidence, tissue_evidence
+from neeco.training.protocol import Report
 
 LEAST = 0.01  # share of the Gaussians that a gate must let through: from nothing the network can make no instrument
-
-Report = Callable[[str], None]
 
 
 def close_gate(

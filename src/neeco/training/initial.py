@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -17,10 +17,9 @@ from neeco.scene.scene import Recording, Scene
 from neeco.training.config import TrainConfig
 from neeco.training.discovery import find_instruments
 from neeco.training.gate import close_gate
+from neeco.training.protocol import Report
 
 REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
-
-Report = Callable[[str], None]
 
 
 def initial_scene(
