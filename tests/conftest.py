@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import signal
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+# A shell without job control starts what it puts in the background with SIGINT ignored, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"
 
