@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from neeco.capture import Capture, read_capture
-from neeco.capture.check import check_capture, errors_only
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_text
@@ -127,14 +127,8 @@ def _begin(
 
 
 def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame, ...]]:
-    problems = errors_only(check_capture(path, config.transforms))
-    if problems:
-        more = f" (and {len(problems) - 1} more: run `neeco check {path}`)" if len(problems) > 1 else ""
-        raise NeecoError(f"{problems[0]}{more}")
-    capture = read_capture(path, config.transforms)
+    capture = read_checked(path, config.transforms)
     frames = capture.split("train")
-    if not frames:
-        raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
     if method_class(config.method).needs_instruments and not capture.instruments:
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"

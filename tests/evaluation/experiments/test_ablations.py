@@ -126,6 +126,14 @@ def test_what_cannot_be_run_is_refused_before_anything_is_written(changes: dict,
     assert not plan.output.exists()
 
 
+def test_a_damaged_capture_is_refused_before_anything_is_written(plan: AblationPlan) -> None:
+    image = next((plan.capture / "images").iterdir())
+    image.write_bytes(b"no image")
+    with pytest.raises(NeecoError, match=rf"{image.name}: not an image file"):
+        run_ablations(plan, no_labels)
+    assert not plan.output.exists()
+
+
 def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
     run_ablations(plan, no_labels)
     with pytest.raises(NeecoError, match="12 iterations, not 13 iterations; give another --output"):

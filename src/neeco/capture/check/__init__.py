@@ -9,10 +9,11 @@ from neeco.capture.check.geometry import check_geometry
 from neeco.capture.check.images import check_images
 from neeco.capture.check.states import check_states
 from neeco.capture.check.summary import Summary, summarize
+from neeco.capture.model import Capture
 from neeco.capture.problems import Problem, Report, errors_only
-from neeco.capture.reader import parse_capture
+from neeco.capture.reader import parse_capture, read_capture
 
-__all__ = ["Problem", "Summary", "check_capture", "errors_only", "inspect_capture", "summarize"]
+__all__ = ["Problem", "Summary", "check_capture", "errors_only", "inspect_capture", "read_checked", "summarize"]
 
 
 def check_capture(path: Path | str, transforms: str = "transforms.json") -> list[Problem]:
@@ -21,6 +22,12 @@ def check_capture(path: Path | str, transforms: str = "transforms.json") -> list
     Training refuses a capture with errors; warnings tell what may be meant but often is not.
     """
     return inspect_capture(path, transforms)[0]
+
+
+def read_checked(path: Path | str, transforms: str = "transforms.json") -> Capture:
+    """A capture that can be trained on. Raises NeecoError with the first error that `check_capture` finds."""
+    Report(check_capture(path, transforms)).raise_first(path)
+    return read_capture(path, transforms)
 
 
 def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> tuple[list[Problem], Summary]:

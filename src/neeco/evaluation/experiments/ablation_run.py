@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neeco import __version__
-from neeco.capture import read_capture
+from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.experiments.ablation_results import LabelScores, table_of
 from neeco.evaluation.experiments.ablations import (
@@ -159,7 +159,7 @@ def _check_plan(plan: AblationPlan, variants: Sequence[Variant]) -> None:
         if value is not None and value < 1:
             raise NeecoError(f"--{name}: {value} is no training; give at least 1")
     check_settings(plan.settings, dict.fromkeys(variant.method for variant in variants), "--seed")
-    capture = read_capture(plan.capture, plan.transforms)
+    capture = read_checked(plan.capture, plan.transforms)
     if not capture.instruments:
         raise NeecoError(f"{plan.capture}: instruments: no states are recorded; every ablation needs them")
 

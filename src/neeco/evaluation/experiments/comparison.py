@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from neeco import __version__
-from neeco.capture import Capture, read_capture
-from neeco.capture.check import check_capture, errors_only
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.experiments.cluster import require_ray, threads_per_worker
@@ -172,12 +172,7 @@ def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job
 
 def _open_capture(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> Capture:
     path = spec.capture
-    problems = errors_only(check_capture(path, spec.transforms))
-    if problems:
-        raise NeecoError(f"{problems[0]}; `neeco check {path}` tells all")
-    capture = read_capture(path, spec.transforms)
-    if not capture.split("train"):
-        raise NeecoError(f"{path}: no frame has split 'train'; mark the frames to learn from")
+    capture = read_checked(path, spec.transforms)
     for name, config in configs.items():
         if need := unmet_need(config.method, capture):
             raise NeecoError(f"--methods: {name} needs {need}, which {path} has not; leave it out")
