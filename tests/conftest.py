@@ -1,4 +1,4 @@
-"""Gives tests the tiny world of tests/evaluation/worlds.py."""
+"""Gives tests the worlds that several rooms' tests share: modules of this folder, and tests/evaluation/worlds.py."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import pytest
 
 # A shell without job control starts what it puts in the background with SIGINT ignored, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 WORLDS = Path(__file__).resolve().parent / "evaluation" / "worlds.py"
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neeco.errors import NeecoError
-from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, to_truth_ids
+from neeco.labels.composited import composited_parts
 from neeco.raster.types import Rendering
 
 

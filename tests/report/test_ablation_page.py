@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from html_page import Page
 
-from neeco.evaluation.experiments.ablation_results import table_of, verdict
-from neeco.evaluation.experiments.ablations import ABLATIONS
+from neeco.experiments.ablation_results import table_of, verdict
+from neeco.experiments.ablations import ABLATIONS
 from neeco.report.ablation_page import write_ablation_report
 
 VOID = ("meta", "br", "img", "path", "circle")

@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 from html_page import Page
 
-from neeco.evaluation.experiments.summary import summarise
+from neeco.experiments.summary import summarise
 from neeco.report import comparison_shots
 from neeco.report.charts import Series, binned, chart, legend
 from neeco.report.comparison_page import command_of, write_comparison_report

@@ -16,11 +16,11 @@ from html_page import Page
 from PIL import Image
 
 from neeco.capture import read_capture
-from neeco.capture.ingest.clocks import ClockOffset
-from neeco.capture.ingest.moving import Shape
-from neeco.capture.ingest.registration import Registration
-from neeco.capture.ingest.result import IngestResult
 from neeco.errors import NeecoError
+from neeco.ingest.clocks import ClockOffset
+from neeco.ingest.moving import Shape
+from neeco.ingest.registration import Registration
+from neeco.ingest.result import IngestResult
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes
 from neeco.report.ingest_page import write_ingest_page

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.labels.annotation import annotate
+from neeco.labels.drawing import CompositedLabels, ThresholdLabels, draw
 from neeco.scene import CanonicalGaussians, Recording, Scene
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
-from neeco.synthesis.annotation import annotate
-from neeco.synthesis.drawing import CompositedLabels, ThresholdLabels, draw
 from neeco.synthesis.states import Inside
 
 WALL, BAR = 300, 40

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.training.carving import CarvedShape, carve
-from neeco.training.evidence import Evidence
-from neeco.training.hinge_search import balanced_depth, dominant_angle, search_hinge
+from neeco.training.instruments.carving import CarvedShape, carve
+from neeco.training.instruments.evidence import Evidence
+from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame

@@ -16,9 +16,9 @@ from neeco.scene.deformations._hinges import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Recording, Scene
 from neeco.training.config import TrainConfig
-from neeco.training.discovery import new_session
-from neeco.training.extend import extend_shaft, shaft_coverage
 from neeco.training.finish import finish_instruments, place_wrists
+from neeco.training.instruments.discovery import new_session
+from neeco.training.instruments.extend import extend_shaft, shaft_coverage
 from neeco.training.session import Session
 
 

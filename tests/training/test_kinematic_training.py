@@ -16,10 +16,10 @@ from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training import discovery
 from neeco.training import train as module
-from neeco.training.evidence import gather_evidence
 from neeco.training.initial import initial_scene
+from neeco.training.instruments import discovery
+from neeco.training.instruments.evidence import gather_evidence
 from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train

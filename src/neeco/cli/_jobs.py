@@ -7,7 +7,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from neeco.evaluation.experiments.jobs import JobNews
+from neeco.experiments.jobs import JobNews
 
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 

@@ -13,7 +13,7 @@ from rich.text import Text
 from neeco.cli._tables import fitted
 
 if TYPE_CHECKING:
-    from neeco.evaluation.experiments.jobs import JobNews
+    from neeco.experiments.jobs import JobNews
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
-    from neeco.evaluation.experiments.ablation_run import AblationPlan, run_ablations
-    from neeco.evaluation.experiments.ablation_tables import write_tables
+    from neeco.experiments.ablation_run import AblationPlan, run_ablations
+    from neeco.experiments.ablation_tables import write_tables
     from neeco.report.ablation_page import write_ablation_report
     from neeco.synthesis.label_ways import score_label_ways
 
@@ -102,7 +102,7 @@ class _Bar:
 
 def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
     """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
-    from neeco.evaluation.experiments.ablation_tables import agreement, grid
+    from neeco.experiments.ablation_tables import agreement, grid
 
     for table in ablation["tables"]:
         if table["judged"]:

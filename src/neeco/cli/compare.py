@@ -14,10 +14,10 @@ from rich.text import Text
 from neeco.cli._tables import fitted
 
 if TYPE_CHECKING:
-    from neeco.evaluation.experiments.comparison import ComparisonSpec
-    from neeco.evaluation.experiments.jobs import Budget
-    from neeco.evaluation.experiments.tables import Cell
-    from neeco.evaluation.experiments.tables import Table as ResultTable
+    from neeco.experiments.comparison import ComparisonSpec
+    from neeco.experiments.jobs import Budget
+    from neeco.experiments.tables import Cell
+    from neeco.experiments.tables import Table as ResultTable
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
     from neeco.capture import read_capture
     from neeco.cli._jobs import JobBars
-    from neeco.evaluation.experiments.comparison import compare, failures
-    from neeco.evaluation.experiments.tables import absent_notes, budget_words, tables_of
+    from neeco.experiments.comparison import compare, failures
+    from neeco.experiments.tables import absent_notes, budget_words, tables_of
     from neeco.report.comparison_page import write_comparison_report
 
     with JobBars() as bars:
@@ -95,7 +95,7 @@ def run(args: Compare) -> int:
 def _spec(args: Compare) -> ComparisonSpec:
     """What the words mean. Raises NeecoError for a budget or masks that cannot be understood."""
     from neeco.errors import NeecoError
-    from neeco.evaluation.experiments.comparison import ComparisonSpec
+    from neeco.experiments.comparison import ComparisonSpec
 
     masks: dict[str, Path] = {}
     for word in args.masks:
@@ -122,7 +122,7 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.evaluation.experiments.jobs import Budget
+    from neeco.experiments.jobs import Budget
 
     options = {
         "--minutes": args.minutes,

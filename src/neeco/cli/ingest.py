@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from neeco.capture.ingest.recording import Recording
-    from neeco.capture.ingest.result import IngestResult
+    from neeco.ingest.recording import Recording
+    from neeco.ingest.result import IngestResult
 
 PAGE = "ingest.html"
 RECORDING = "recording.yaml"
@@ -80,9 +80,9 @@ def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
 
 
 def _init(folder: Path) -> int:
-    from neeco.capture.ingest.template import write_template
     from neeco.errors import NeecoError
     from neeco.files import write_text
+    from neeco.ingest.template import write_template
 
     path = folder / RECORDING
     if path.exists():
@@ -93,7 +93,7 @@ def _init(folder: Path) -> int:
 
 
 def _convert(folder: Path, output: Path) -> int:
-    from neeco.capture.ingest.convert import convert_folder
+    from neeco.ingest.convert import convert_folder
 
     for sentence in convert_folder(folder, output):
         print(f"note: {sentence}")
@@ -102,8 +102,8 @@ def _convert(folder: Path, output: Path) -> int:
 
 
 def _recording(args: Ingest) -> Recording:
-    from neeco.capture.ingest.recording import check_frames, read_recording, recording_from_flags
     from neeco.errors import NeecoError
+    from neeco.ingest.recording import check_frames, read_recording, recording_from_flags
 
     if args.source is not None:
         _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "json"))
@@ -129,7 +129,7 @@ def _recording(args: Ingest) -> Recording:
 def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
     from neeco.capture import check_capture
     from neeco.capture.check import errors_only
-    from neeco.capture.ingest.pipeline import ingest
+    from neeco.ingest.pipeline import ingest
     from neeco.report.ingest_page import write_ingest_page
 
     console = Console(stderr=True)

@@ -12,8 +12,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from neeco.capture.model import Frame
-from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.resize import resize_camera, resize_mask
+from neeco.labels.composited import composited_parts
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from neeco.capture.model import Frame, State
 from neeco.evaluation.image_metrics import psnr, ssim
-from neeco.evaluation.labels import composited_parts
 from neeco.evaluation.lpips import MIN_SIZE, Lpips
 from neeco.evaluation.mask_metrics import dice, iou
 from neeco.evaluation.truth import Reference
+from neeco.labels.composited import composited_parts
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:

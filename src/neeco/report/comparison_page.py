@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.model import Capture
-from neeco.evaluation.experiments.comparison import job_folder
-from neeco.evaluation.experiments.summary import MASK_METRICS
-from neeco.evaluation.experiments.tables import (
+from neeco.evaluation.mask_metrics import mean_of
+from neeco.experiments.comparison import job_folder
+from neeco.experiments.summary import MASK_METRICS
+from neeco.experiments.tables import (
     UNKNOWN,
     Table,
     absent_notes,
@@ -27,7 +28,6 @@ from neeco.evaluation.experiments.tables import (
     rows_as_csv,
     tables_of,
 )
-from neeco.evaluation.mask_metrics import mean_of
 from neeco.files import write_text
 from neeco.report.charts import Series, binned, chart, download, legend
 from neeco.report.comparison_shots import FrameRow, frame_rows, shots_html

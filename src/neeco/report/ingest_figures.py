@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
 
-from neeco.capture.ingest.moving import Shape
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import outline
+from neeco.ingest.moving import Shape
 from neeco.raster.types import Camera
 from neeco.report.figures import MAX_WIDTH, jpeg
 

@@ -12,9 +12,9 @@ import numpy as np
 
 import neeco
 from neeco.capture import read_capture
-from neeco.capture.ingest.result import IngestResult
 from neeco.capture.model import Capture
 from neeco.files import write_text
+from neeco.ingest.result import IngestResult
 from neeco.report.coverage import Degree, degrees_of_freedom, extrapolations, histogram, unvisited
 from neeco.report.ingest_figures import MainAxis, axis_length, in_view, main_axes, sample_figures
 from neeco.report.ingest_style import INGEST_STYLE

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from neeco.capture.model import State
+from neeco.labels.annotation import project
+from neeco.labels.drawing import Drawing, Labeller, draw
 from neeco.raster.types import Camera
-from neeco.synthesis.annotation import project
-from neeco.synthesis.drawing import Drawing, Labeller, draw
 
 if TYPE_CHECKING:
     from neeco.scene import Scene

@@ -16,12 +16,10 @@ import torch
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.evaluation.labels import LABEL_THRESHOLD
 from neeco.files import new_folder, read_json, write_json
-from neeco.scene.drawable import gaussian_scene
-from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
-from neeco.synthesis.annotation import KEYPOINTS, annotate
-from neeco.synthesis.drawing import (
+from neeco.labels.annotation import KEYPOINTS, annotate
+from neeco.labels.composited import LABEL_THRESHOLD
+from neeco.labels.drawing import (
     CompositedLabels,
     DeltaThresholds,
     Drawing,
@@ -30,6 +28,8 @@ from neeco.synthesis.drawing import (
     draw,
     instruments_of,
 )
+from neeco.scene.drawable import gaussian_scene
+from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import Sampler, make_sampler, states_fingerprint
 from neeco.synthesis.settings import Format, Settings

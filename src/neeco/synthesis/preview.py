@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 from neeco.files import write_atomically
-from neeco.synthesis.annotation import OCCLUDED, SKELETON
+from neeco.labels.annotation import OCCLUDED, SKELETON
 from neeco.synthesis.writers.folder import Record
 
 TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17

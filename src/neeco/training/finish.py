@@ -15,7 +15,7 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._hinges import Hinged, Hinges
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.scene.scene import Scene
-from neeco.training.extend import extend_shaft
+from neeco.training.instruments.extend import extend_shaft
 from neeco.training.protocol import Report
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule

@@ -15,8 +15,8 @@ from neeco.scene.canonical import neighbour_spacing, seed_gaussians
 from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Recording, Scene
 from neeco.training.config import TrainConfig
-from neeco.training.discovery import find_instruments
-from neeco.training.gate import close_gate
+from neeco.training.instruments.discovery import find_instruments
+from neeco.training.instruments.gate import close_gate
 from neeco.training.protocol import Report
 
 REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body

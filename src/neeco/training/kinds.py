@@ -11,8 +11,8 @@ from neeco.scene.methods import is_field
 from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
-from neeco.training.discovery import new_session
 from neeco.training.initial import initial_scene
+from neeco.training.instruments.discovery import new_session
 from neeco.training.nerfies import initial_field, new_nerfies_session
 from neeco.training.protocol import Report, TrainingSession
 

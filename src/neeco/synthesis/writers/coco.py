@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neeco.files import write_json
-from neeco.synthesis.annotation import SKELETON
+from neeco.labels.annotation import SKELETON
 from neeco.synthesis.writers.folder import Record
 
 FOLDER = "coco"

@@ -1,0 +1,116 @@
+"""Captures made from a capture: fewer training frames, or noisier instrument poses. The input is never touched."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.capture import read_capture
+from neeco.capture.model import Capture, Frame, InstrumentState, State
+from neeco.capture.writer import write_capture
+from neeco.errors import NeecoError
+from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
+from neeco.files import read_json, write_atomically, write_json
+from neeco.scene.rotations import rotation_from_vector
+
+RECIPE_FILE = "derived.json"
+MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)
+
+
+def derive_capture(source: Path, transforms: str, derived: Derived, seed: int, output: Path) -> Path:
+    """Write the capture that `derived` makes of `source` to folder `output`, true masks included; at once when it is
+    there.
+
+    The same seed gives the same noise, and the noise of one level is that of another times a number. Raises NeecoError
+    when `output` holds something else, and what reading and writing captures raise.
+    """
+    capture = read_capture(source, transforms)
+    recipe: dict[str, Any] = {
+        "source": str(source.absolute()),
+        "transforms": transforms,
+        "states_sha256": _digest(capture),
+    }
+    recipe |= {"seed": seed, **asdict(derived)}
+    if (output / RECIPE_FILE).exists():
+        _require_same(output / RECIPE_FILE, recipe)
+        if (output / "transforms.json").exists():
+            return output
+    elif output.is_dir() and any(output.iterdir()):
+        raise NeecoError(f"{output}: not empty, and not made by ablate; give another --output")
+    changed = replace(capture, frames=_frames(capture, derived, seed))
+    write_json(output / RECIPE_FILE, recipe)
+    for frame in changed.frames:
+        if frame.split != "train":
+            _copy_masks(capture.root, frame.name, output)
+    write_capture(changed, output)  # transforms.json comes last: that it exists says that all is there
+    return output
+
+
+def _digest(capture: Capture) -> str:
+    """Tells recordings with other frames, splits or instrument states apart."""
+    rows = [
+        [
+            frame.name,
+            frame.split,
+            *((name, s.pose.tolist(), dict(s.joints)) for name, s in frame.state.instruments.items()),
+        ]
+        for frame in capture.frames
+    ]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+
+
+def _require_same(path: Path, recipe: dict[str, Any]) -> None:
+    stored = read_json(path)
+    for key, value in recipe.items():
+        if stored.get(key) != value:
+            raise NeecoError(f"{path}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
+
+
+def _frames(capture: Capture, derived: Derived, seed: int) -> tuple[Frame, ...]:
+    """The frames of the derived capture, in recorded order."""
+    train = [index for index, frame in enumerate(capture.frames) if frame.split == "train"]
+    count = max(1, round(derived.train_share * len(train)))
+    kept = {train[place] for place in np.linspace(0, len(train) - 1, count).round().astype(int)}
+    rng = np.random.default_rng(seed)
+    frames = []
+    for index, frame in enumerate(capture.frames):
+        if frame.split != "train":
+            frames.append(frame)
+        elif index in kept:
+            state = _with_noise(frame.state, derived.noise_mm, rng) if derived.noise_mm > 0 else frame.state
+            frames.append(replace(frame, state=state))
+    return tuple(frames)
+
+
+def _with_noise(state: State, level: float, rng: np.random.Generator) -> State:
+    """Every instrument's pose off by about `level` mm and as much times NOISE_DEGREES_PER_MM, joints as they were."""
+    moved = {}
+    for name, given in state.instruments.items():
+        turn, shift = rng.standard_normal(3), rng.standard_normal(3)
+        pose = given.pose.double().clone()
+        turned = rotation_from_vector(torch.from_numpy(np.radians(level * NOISE_DEGREES_PER_MM) * turn))
+        pose[:3, :3] = turned @ pose[:3, :3]
+        pose[:3, 3] += torch.from_numpy(level * shift)
+        moved[name] = InstrumentState(pose, given.joints)
+    return replace(state, instruments=moved)
+
+
+def _copy_masks(root: Path, name: str, output: Path) -> None:
+    """What a frame is scored against, by the file names that scoring looks for."""
+    for folder in MASK_FOLDERS:
+        source = root / folder / f"{name}.png"
+        if source.is_file():
+            write_atomically(output / folder / source.name, partial(_copy, source))
+
+
+def _copy(source: Path, target: Path) -> None:
+    shutil.copyfile(source, target)

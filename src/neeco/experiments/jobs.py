@@ -1,0 +1,246 @@
+"""Jobs: one method trained on one seed under a budget, and scored. Each stands on its own and can be resumed."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import evaluate_run
+from neeco.evaluation.lpips import find_lpips
+from neeco.experiments.memory import reset_peak_memory
+from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
+from neeco.files import read_json, write_json, write_text
+from neeco.scene.methods import is_field
+from neeco.training.config import TrainConfig
+from neeco.training.run import config_from_dict, load_run, read_config
+from neeco.training.train import ProgressRow, train
+
+JOB_SCHEMA = "neeco-job/1"
+JOB_FILE = "job.json"
+UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
+SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames")
+
+JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long every job may train: minutes on `clock`, or iterations; the other is None.
+
+    "wall" is the time that passes; "processor" is what all threads of the process spend, which others' work on the same
+    machine does not change. Drawing the curve is counted by neither.
+    """
+
+    minutes: float | None
+    iterations: int | None
+    clock: Literal["wall", "processor"] = "wall"
+
+    def check(self) -> None:
+        """Raises NeecoError unless exactly one of the two is given and can be spent."""
+        if (self.minutes is None) == (self.iterations is None):
+            raise NeecoError("budget: give minutes or iterations, one of them (e.g. --minutes 5)")
+        if self.minutes is not None and not 0 < self.minutes < float("inf"):
+            raise NeecoError(f"budget: {self.minutes} minutes is no time to train; give more than 0")
+        if self.iterations is not None and self.iterations < 1:
+            raise NeecoError(f"budget: {self.iterations} iterations is none at all; give at least 1")
+        if self.clock not in CLOCKS:
+            raise NeecoError(f"budget: clock {self.clock!r} is unknown; choose one of {', '.join(CLOCKS)}")
+
+    def applied(self, config: TrainConfig, seed: int) -> TrainConfig:
+        """`config` under this budget: with minutes no method is held back by its iterations."""
+        return replace(config, minutes=self.minutes, iterations=self.iterations or UNLIMITED, seed=seed)
+
+    def __str__(self) -> str:
+        if self.iterations is not None:
+            amount = f"{self.iterations} iterations"
+        else:
+            amount = f"{self.minutes:g} minutes"
+        return amount + (", processor time" if self.clock == "processor" else "")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to train and score. `config`'s seed, minutes and iterations are replaced by the job's.
+
+    `splits`: those to score (None: all but `train`). `folder` becomes a run folder with the job's files beside.
+    """
+
+    name: str
+    seed: int
+    capture: Path
+    folder: Path
+    config: TrainConfig
+    budget: Budget
+    splits: tuple[str, ...] | None = None
+    lpips_weights: Path | None = None
+
+    @property
+    def title(self) -> str:
+        """Name and seed, as a person reads it."""
+        return f"{self.name}, seed {self.seed}"
+
+    @property
+    def train_config(self) -> TrainConfig:
+        """The settings it is trained with."""
+        return self.budget.applied(self.config, self.seed)
+
+    def identity(self) -> dict[str, Any]:
+        """What a folder must agree with to be this job's, besides the settings of the training."""
+        return {
+            "name": self.name,
+            "method": self.config.method,
+            "seed": self.seed,
+            "capture": str(self.capture.absolute()),
+            "budget": asdict(self.budget),
+        }
+
+
+@dataclass(frozen=True)
+class JobNews:
+    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage; `result`
+    is there once the job is done or has failed."""
+
+    index: int
+    total: int
+    job: Job
+    stage: str
+    share: float = 0.0
+    text: str = ""
+    result: dict[str, Any] | None = None
+
+
+def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
+    """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
+
+    A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
+    (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are asked for.
+    Raises NeecoError when `folder` is another job's, and what `train` and `evaluate_run` raise.
+    """
+    report = progress or (lambda stage, share, text: None)
+    job.budget.check()
+    check_folder(job)
+    splits = held_out_splits(job)
+    networks = sorted(find_lpips(job.lpips_weights))
+    file = job.folder / JOB_FILE
+    if file.exists():
+        stored = read_json(file)
+        if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == networks:
+            return dict(stored)
+        totals = {key: stored[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
+        totals["iteration"] = stored["iterations"]
+    else:
+        totals = _train(job, splits, report)
+    report("evaluating", 0.0, "")
+    evaluation = evaluate_run(
+        load_run(job.folder),
+        splits,
+        lpips_weights=job.lpips_weights,
+        progress=lambda what, done, total: report("evaluating", done / max(total, 1), what),
+    )
+    given = evaluation["given"]
+    first = given[splits[0]]
+    result = {"schema": JOB_SCHEMA} | job.identity()
+    result |= {"iterations": totals["iteration"]}
+    result |= {key: totals[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
+    result |= {"num_gaussians": first["num_gaussians"], "fps": first["fps"], "lpips_networks": networks}
+    result |= {"splits": {split: {key: given[split][key] for key in SPLIT_SCORES} for split in splits}}
+    write_json(file, result)
+    return result
+
+
+def held_out_splits(job: Job) -> tuple[str, ...]:
+    """The splits that `job` scores. Raises NeecoError for one that the capture lacks, or when it has only `train`."""
+    present = read_capture(job.capture, job.config.transforms).splits
+    splits = job.splits if job.splits is not None else tuple(name for name in present if name != "train")
+    if not splits:
+        raise NeecoError(f"{job.capture}: split: all frames are training frames; keep some for scoring (split test)")
+    for name in splits:
+        if name not in present:
+            raise NeecoError(f"--splits: {job.capture} has no split {name!r}; it has {', '.join(present)}")
+    return tuple(dict.fromkeys(splits))
+
+
+def check_folder(job: Job) -> None:
+    """Raises NeecoError when `job.folder` holds a run of other settings, another capture or another budget."""
+    folder, differs = job.folder, "give another --output"
+    if not (folder / "config.yaml").exists():
+        return
+    stored = read_config(folder)
+    if stored["capture"] != str(job.capture.absolute()):
+        raise NeecoError(f"{folder}: capture: this run was trained on {stored['capture']}; {differs}")
+    identity = job.identity()
+    for name in (JOB_FILE, BEGUN_FILE):
+        values = read_json(folder / name) if (folder / name).exists() else identity
+        if values["budget"] != identity["budget"]:
+            raise NeecoError(
+                f"{folder}: budget: this run has {Budget(**values['budget'])}, not {job.budget}; {differs}"
+            )
+        for key in (key for key in identity if values[key] != identity[key]):
+            raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
+    try:
+        old, new = vars(config_from_dict(stored)), vars(job.train_config)
+    except NeecoError as error:  # of another version
+        raise NeecoError(f"{folder / error.args[0].removesuffix('; train again')}; {differs}") from None
+    for field in (name for name in new if old[name] != new[name]):
+        raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
+
+
+def _train(job: Job, splits: tuple[str, ...], report: JobProgress) -> dict[str, Any]:
+    """Train or go on training; returns what the run took."""
+    reset_peak_memory()
+    capture = read_capture(job.capture, job.config.transforms)
+    held_out = HeldOut(capture, splits, field=is_field(job.config.method))
+    watcher = Watcher(job.folder, held_out, job.budget.clock, job.identity())
+
+    def tell(row: ProgressRow) -> None:
+        count = f"  {row.num_gaussians} Gaussians" if row.num_gaussians else ""
+        report("training", row.progress, row.note or f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{count}")
+
+    report("training", 0.0, "")
+    config, clock = job.train_config, CLOCKS[job.budget.clock]
+    resume = (job.folder / "config.yaml").exists()
+    try:
+        train(job.capture, job.folder, config, resume=resume, progress=tell, watch=watcher.watch, clock=clock)
+    finally:
+        if watcher.started:
+            watcher.save()
+    _complete(job, watcher)
+    return watcher.totals
+
+
+def _complete(job: Job, watcher: Watcher) -> None:
+    """Add the curve's last row where the run was stopped between its last step and its finish."""
+    if not watcher.started:
+        watcher.read_curve()
+    if not watcher.rows or watcher.rows[-1]["progress"] < 1:
+        scene = load_run(job.folder).scene
+        watcher.totals["iteration"] = scene.diagnostics.get("iterations", watcher.totals["iteration"])
+        with scene.torch_threads():
+            watcher.add_row(scene, 1.0)
+
+
+def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
+    """The news that a job is done or has failed."""
+    failure = result.get("error", "")
+    return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
+
+
+def attempt_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
+    """`run_job`, a failure told in its result. A failure that no user can cause leaves its traceback beside the
+    folder."""
+    record = job.folder.with_name(job.folder.name + ".error.txt")
+    try:
+        result = run_job(job, progress)
+    except NeecoError as error:
+        return job.identity() | {"error": " ".join(str(error).split()), "splits": {}}
+    except Exception as error:
+        write_text(record, traceback.format_exc())
+        told = " ".join(str(error).split()) or "no reason given"
+        return job.identity() | {"error": f"{type(error).__name__}: {told}; see {record}", "splits": {}}
+    record.unlink(missing_ok=True)
+    return result

@@ -1,0 +1,280 @@
+"""Poses and readings at any time, from noisy logs: robust local polynomials (Cleveland 1979), never across a gap.
+
+At each time asked for, a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how
+well they fit (bisquare). Rotations are fitted as rotation vectors about their local mean. How wide the window is
+follows from the log: the width that best predicts each sample from its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.ingest.logs import PoseLog, ReadingLog
+
+WIDTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)  # half windows tried, in usual steps
+WIDEST_S = 1.0
+JUDGED = 600  # samples predicted to choose a width
+TOO_FEW, FEW = 4, 6  # samples in a window: fewer are interpolated linearly, fitted by a line
+ROUNDS = 3  # of robust reweighting
+CUTOFF = 4.7  # bisquare, in noise sigmas per axis (Beaton & Tukey 1974)
+CHUNK = 300_000  # window samples worked on at once
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Half widths s of the windows for positions (or readings) and rotations; 0: linear between samples. noise: what
+    one sample is off its neighbours' fit, mm (or rad) per axis and rad per axis."""
+
+    position_s: float
+    rotation_s: float
+    position_noise: float
+    rotation_noise: float
+
+
+def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] where the log has any.
+
+    smooth_s: half width of the window, s; None: as the log's own noise asks (`pose_smoothing`); 0: linear.
+    Outside the log and inside its gaps poses are NaN.
+    """
+    times = np.asarray(times, dtype=np.float64)
+    widths = pose_smoothing(log) if smooth_s is None else None
+    position_s, rotation_s = (widths.position_s, widths.rotation_s) if widths else (smooth_s or 0.0, smooth_s or 0.0)
+    samples = _Samples(log.times, log.gaps)
+    valid = samples.covers(times)
+    poses = np.full((len(times), 4, 4), np.nan)
+    poses[valid] = np.eye(4)
+    poses[valid, :3, 3] = _fit(samples, log.positions, times[valid], position_s)
+    quats = _fit_rotations(samples, log.quats, times[valid], rotation_s)
+    if valid.any():
+        poses[valid, :3, :3] = _rotation(quats).as_matrix()
+    return poses, valid
+
+
+def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Readings [N] rad at times [N] on the log's clock, and bool [N] where the log has any; see `poses_at`."""
+    times = np.asarray(times, dtype=np.float64)
+    width = reading_smoothing(log).position_s if smooth_s is None else smooth_s
+    samples = _Samples(log.times, log.gaps)
+    valid = samples.covers(times)
+    values = np.full(len(times), np.nan)
+    values[valid] = _fit(samples, log.values[:, None], times[valid], width)[:, 0]
+    return values, valid
+
+
+@lru_cache(maxsize=32)
+def pose_smoothing(log: PoseLog) -> Smoothing:
+    """The windows that best predict each sample of this log from its neighbours (leave-one-out cross-validation)."""
+    samples = _Samples(log.times, log.gaps)
+    chosen = samples.judged()
+
+    def position_errors(width: float) -> np.ndarray:
+        fitted = _fit(samples, log.positions, log.times[chosen], width, leave_out=chosen)
+        return np.linalg.norm(fitted - log.positions[chosen], axis=1)
+
+    def rotation_errors(width: float) -> np.ndarray:
+        fitted = _fit_rotations(samples, log.quats, log.times[chosen], width, leave_out=chosen)
+        return (_rotation(fitted).inv() * _rotation(log.quats[chosen])).magnitude()
+
+    position_s, position_noise = _best_width(samples, position_errors)
+    rotation_s, rotation_noise = _best_width(samples, rotation_errors)
+    return Smoothing(position_s, rotation_s, position_noise / 3**0.5, rotation_noise / 3**0.5)
+
+
+@lru_cache(maxsize=32)
+def reading_smoothing(log: ReadingLog) -> Smoothing:
+    """The same for readings (the rotation's fields are 0)."""
+    samples = _Samples(log.times, log.gaps)
+    chosen = samples.judged()
+
+    def errors(width: float) -> np.ndarray:
+        fitted = _fit(samples, log.values[:, None], log.times[chosen], width, leave_out=chosen)
+        return np.abs(fitted[:, 0] - log.values[chosen])
+
+    width, noise = _best_width(samples, errors)
+    return Smoothing(width, 0.0, noise, 0.0)
+
+
+class _Samples:
+    """Times of samples [T] and the stretches without gaps they fall into."""
+
+    def __init__(self, times: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> None:
+        self.times = times
+        starts = np.searchsorted(times, [end for _, end in gaps])
+        stretch = np.zeros(len(times), dtype=np.int64)
+        stretch[starts] = 1
+        self.stretch = np.cumsum(stretch)
+        self.first = np.searchsorted(self.stretch, self.stretch)  # of each sample's stretch
+        self.last = np.searchsorted(self.stretch, self.stretch, side="right")  # one past it
+        self.step = float(np.median(np.diff(times)))
+
+    def covers(self, times: np.ndarray) -> np.ndarray:
+        """bool [N]: whether a time lies within a stretch."""
+        left, right = self._around(times)
+        inside = (times >= self.times[0]) & (times <= self.times[-1])
+        exact = (self.times[left] == times) | (self.times[right] == times)
+        return inside & (exact | (self.stretch[left] == self.stretch[right]))
+
+    def judged(self) -> np.ndarray:
+        """Samples [M] to choose a width by: evenly spread, never the end of a stretch."""
+        inner = np.arange(len(self.times))
+        inner = inner[(inner > self.first) & (inner < self.last - 1)]
+        return inner[np.unique(np.linspace(0, len(inner) - 1, JUDGED).astype(int))] if len(inner) else inner
+
+    def window(self, times: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+        """Samples within `width` of each time, of its own stretch: index [N, K] and bool [N, K]."""
+        left, right = self._around(times)
+        home = np.where(self.times[right] == times, right, left)
+        low = np.maximum(np.searchsorted(self.times, times - width), self.first[home])
+        high = np.minimum(np.searchsorted(self.times, times + width, side="right"), self.last[home])
+        index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
+        return np.minimum(index, len(self.times) - 1), index < high[:, None]
+
+    def neighbours(self, times: np.ndarray, leave_out: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The samples before and after each time [N] and the share [N] of the later one, for linear interpolation."""
+        left, right = self._around(times)
+        if leave_out is not None:
+            left, right = leave_out - 1, leave_out + 1
+        span = self.times[right] - self.times[left]
+        return left, right, np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
+
+    def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        right = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
+        left = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
+        return left, right
+
+
+def _fit(
+    samples: _Samples, values: np.ndarray, times: np.ndarray, width: float, leave_out: np.ndarray | None = None
+) -> np.ndarray:
+    """Values [N, D] at covered times [N] from samples [T, D]; `leave_out`: a sample [N] each time may not use."""
+    left, right, share = samples.neighbours(times, leave_out)
+    result = values[left] + share[:, None] * (values[right] - values[left])
+    if width <= 0 or not len(times):
+        return result
+    noise = _noise(values)
+    for part in _chunks(samples, len(times), width):
+        index, used = samples.window(times[part], width)
+        if leave_out is not None:
+            used &= index != leave_out[part, None]
+        enough = used.sum(axis=1) >= TOO_FEW
+        offsets = (samples.times[index] - times[part, None]) / width
+        fitted = _local_polynomial(offsets[enough], used[enough], values[index[enough]], noise)
+        result[np.arange(len(times))[part][enough]] = fitted
+    return result
+
+
+def _fit_rotations(
+    samples: _Samples, quats: np.ndarray, times: np.ndarray, width: float, leave_out: np.ndarray | None = None
+) -> np.ndarray:
+    """Unit quaternions wxyz [N, 4] at covered times [N] from samples [T, 4]; as `_fit`, about each local mean."""
+    left, right, share = samples.neighbours(times, leave_out)
+    if not len(times):
+        return np.zeros((0, 4))
+    step = (_rotation(quats[left]).inv() * _rotation(quats[right])).as_rotvec()
+    result = _wxyz(_rotation(quats[left]) * Rotation.from_rotvec(step * share[:, None]))
+    if width <= 0:
+        return result
+    noise = _noise(_turns(quats))
+    for part in _chunks(samples, len(times), width):
+        index, used = samples.window(times[part], width)
+        if leave_out is not None:
+            used &= index != leave_out[part, None]
+        enough = used.sum(axis=1) >= TOO_FEW
+        if not enough.any():
+            continue
+        index, used = index[enough], used[enough]
+        offsets = (samples.times[index] - times[part][enough, None]) / width
+        around = quats[index]  # sign-continuous, so their mean is a mean of rotations
+        mean = _rotation((around * (used * _tricube(offsets))[..., None]).sum(axis=1))
+        flat = np.repeat(np.arange(len(index)), index.shape[1])
+        vectors = (mean[flat].inv() * _rotation(around.reshape(-1, 4))).as_rotvec().reshape(*index.shape, 3)
+        vector = _local_polynomial(offsets, used, vectors, noise)
+        result[np.arange(len(times))[part][enough]] = _wxyz(mean * Rotation.from_rotvec(vector))
+    return result
+
+
+def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
+    """The value [N, D] at offset 0 of quadratics through values [N, K, D] at offsets [N, K] in [-1, 1]."""
+    near = used * _tricube(offsets)
+    powers = np.stack([np.ones_like(offsets), offsets, offsets**2], axis=-1)  # [N, K, 3]
+    # with few samples the curvature is held at 0; the rest only keeps the equations solvable
+    ridge = np.zeros((len(offsets), 3))
+    ridge[:, 1] = 1e-9
+    ridge[:, 2] = np.where(used.sum(axis=1) < FEW, 1e6, 1e-9)
+    # start from what the middle of the window says, so that one wild sample does not bend the first fit
+    axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
+    middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
+    residuals = np.linalg.norm(values - middle, axis=-1)
+    scale = np.maximum(_median(residuals, used), noise)
+    weights = near / (1 + (residuals / (3 * scale[:, None])) ** 2)
+    axes = np.sqrt(values.shape[-1])
+    for round_ in range(ROUNDS + 1):
+        normal = np.einsum("nk,nki,nkj->nij", weights, powers, powers) + ridge[:, :, None] * np.eye(3)
+        right = np.einsum("nk,nki,nkd->nid", weights, powers, values)
+        normal[:, 0, 0] += 1e-300
+        coefficients = np.linalg.solve(normal, right)
+        if round_ == ROUNDS:
+            break
+        residuals = np.linalg.norm(values - powers @ coefficients, axis=-1)
+        scale = np.maximum(1.48 * _median(residuals, used) / axes, noise)
+        weights = near * np.clip(1 - (residuals / (CUTOFF * axes * scale[:, None])) ** 2, 0, None) ** 2
+        # a fit that trusts too few samples is no fit
+        lost = (weights > 0).sum(axis=1) < TOO_FEW
+        weights[lost] = near[lost]
+    return coefficients[:, 0]
+
+
+def _best_width(samples: _Samples, errors: Callable[[float], np.ndarray]) -> tuple[float, float]:
+    """The half width s with the smallest prediction errors, and the typical size of those."""
+    widths = [0.0] + [
+        steps * samples.step for steps in WIDTHS if steps == WIDTHS[0] or steps * samples.step <= WIDEST_S
+    ]
+    found = [errors(width) for width in widths]
+    if not len(found[0]):
+        return 0.0, 0.0
+    # wild samples are no reason for one width or another
+    limit = 5 * max(float(np.median(found[0])), 1e-12)
+    scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in found]
+    best = int(np.argmin(scores))
+    return widths[best], float(np.sqrt(scores[best]))
+
+
+def _chunks(samples: _Samples, count: int, width: float) -> list[slice]:
+    size = max(int(CHUNK / max(2 * width / samples.step, 8)), 1)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+def _noise(values: np.ndarray) -> float:
+    """How far one sample [T, D] is off the line through its neighbours, per axis, robustly."""
+    bend = values[1:-1] - (values[:-2] + values[2:]) / 2
+    return max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
+
+
+def _turns(quats: np.ndarray) -> np.ndarray:
+    """Turns [T, 3] rad summed up from sample to sample, each in its own axes: second differences show the noise."""
+    steps = (_rotation(quats[:-1]).inv() * _rotation(quats[1:])).as_rotvec()
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Lower median [..., N] of the used among values [..., N, K]."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=-1)
+    return np.take_along_axis(ordered, (used.sum(axis=-1, keepdims=True) - 1) // 2, axis=-1)[..., 0]
+
+
+def _tricube(offsets: np.ndarray) -> np.ndarray:
+    return np.clip(1 - np.abs(offsets) ** 3, 0, None) ** 3
+
+
+def _rotation(quats: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quats[..., [1, 2, 3, 0]])
+
+
+def _wxyz(rotation: Rotation) -> np.ndarray:
+    return rotation.as_quat()[..., [3, 0, 1, 2]]

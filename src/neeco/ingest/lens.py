@@ -1,0 +1,248 @@
+"""The camera's lens: read from a calibration, and taken out of the images once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from neeco.capture.problems import shown
+from neeco.errors import NeecoError
+from neeco.files import read_json, read_text, require_file
+from neeco.ingest.requirements import optional_module
+
+NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
+DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
+FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
+WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
+COUNTS = (0, 4, 5, 8, 12, 14)  # distortion coefficients that OpenCV's model comes with
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Focal lengths and principal point, px, pixel centres at +0.5; distortion: OpenCV's k1, k2, p1, p2[, k3, ...],
+    empty for a pinhole; size: (width, height) of the images it was measured on, None when nothing says it."""
+
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
+
+    @property
+    def distorted(self) -> bool:
+        return any(self.distortion)
+
+    def check_size(self, size: tuple[int, int], source: object) -> None:
+        """Raise NeecoError when measured on images of another size than (width, height). source: named in it."""
+        if self.size is not None and self.size != tuple(size):
+            measured, found = "x".join(map(str, self.size)), "x".join(map(str, size))
+            raise NeecoError(
+                f"{source}: calibrated on {measured} images, the video is {found}; calibrate at the video's size, or "
+                "scale fl_x, fl_y, cx, cy and the size if the video was only resized"
+            )
+        if not (0 < self.cx < size[0] and 0 < self.cy < size[1]):
+            raise NeecoError(
+                f"{source}: the principal point ({self.cx:g}, {self.cy:g}) lies outside the {size[0]}x{size[1]} video; "
+                "give the calibration of this video"
+            )
+        if not all(WIDEST < focal / max(size) < LONGEST for focal in (self.fl_x, self.fl_y)):
+            raise NeecoError(
+                f"{source}: focal lengths {self.fl_x:g} and {self.fl_y:g} px fit no lens on a {size[0]}x{size[1]} "
+                "video; give the calibration of this video, in pixels"
+            )
+
+    def pinhole(self, size: tuple[int, int]) -> Lens:
+        """The pinhole of undistorted images (width, height): zoomed so that every pixel shows something. Raises
+        NeecoError when the distortion folds the image over."""
+        if not self.distorted:
+            return replace(self, distortion=(), size=size)
+        matrix, _ = optional_module("cv2").getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
+        fl_x, fl_y, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        found = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
+        if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(found, size):
+            listed = ", ".join(f"{value:g}" for value in self.distortion)
+            raise NeecoError(f"lens: distortion {listed} folds the image over; calibrate again")
+        return found
+
+    def undistort(self, image: np.ndarray) -> np.ndarray:
+        """An image uint8 [H, W, 3] (or [H, W]) as `pinhole` sees it, bilinear."""
+        return self._remap(image, "INTER_LINEAR")
+
+    def undistort_mask(self, mask: np.ndarray) -> np.ndarray:
+        """A mask bool [H, W] as `pinhole` sees it."""
+        return self._remap(mask.astype(np.uint8), "INTER_NEAREST") > 0
+
+    def _remap(self, image: np.ndarray, interpolation: str) -> np.ndarray:
+        if not self.distorted:
+            return image
+        cv2 = optional_module("cv2")
+        maps = _maps(self, (image.shape[1], image.shape[0]))
+        return cv2.remap(image, *maps, getattr(cv2, interpolation), borderMode=cv2.BORDER_CONSTANT)
+
+    def _folds(self, pinhole: Lens, size: tuple[int, int]) -> bool:
+        """Whether somewhere in the undistorted image a ray farther out is not seen farther out."""
+        x = np.array([-pinhole.cx, size[0] - pinhole.cx]) / pinhole.fl_x
+        y = np.array([-pinhole.cy, size[1] - pinhole.cy]) / pinhole.fl_y
+        r2 = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), 200) ** 2
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * 8)[:8]
+        with np.errstate(all="ignore"):
+            seen = np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return not bool((np.diff(seen) > 0).all())
+
+    def _matrix(self) -> np.ndarray:
+        """K [3, 3] as OpenCV means it: the first pixel's centre at 0."""
+        return np.array([[self.fl_x, 0, self.cx - 0.5], [0, self.fl_y, self.cy - 0.5], [0, 0, 1]])
+
+    def _coefficients(self) -> np.ndarray:
+        return np.array(self.distortion, dtype=np.float64)
+
+
+def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
+    """A lens from an OpenCV or ROS calibration (YAML), the fields of a nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
+
+    None: to be estimated. OpenCV's principal point counts from the first pixel's centre, ours from its corner: half a
+    pixel is added. Raises NeecoError naming file, field and remedy.
+    """
+    if source is None:
+        return None
+    if not isinstance(source, Path):
+        return _checked("intrinsics", [*source], (), None)
+    require_file(source, "a calibration as YAML or JSON")
+    if source.suffix.lower() == ".json":
+        return _nerfstudio(source, read_json(source))
+    return _opencv(source, _read_opencv_yaml(source))
+
+
+@lru_cache(maxsize=4)
+def _maps(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    new = lens.pinhole(size)._matrix()
+    cv2 = optional_module("cv2")
+    return cv2.initUndistortRectifyMap(lens._matrix(), lens._coefficients(), None, new, size, cv2.CV_32FC1)
+
+
+def _nerfstudio(path: Path, document: Any) -> Lens:
+    if not isinstance(document, dict):
+        raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
+    model = str(document.get("camera_model", "")).lower()
+    if model in FISHEYE:
+        raise _fisheye(path, "camera_model", model)
+    width, height = document.get("w"), document.get("h")
+    size = _size(path, width, height)
+    if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
+        focal = (
+            size[0] / 2 / math.tan(float(document["camera_angle_x"]) / 2) if document["camera_angle_x"] else math.nan
+        )
+        document = {"fl_x": focal, "fl_y": focal, "cx": size[0] / 2, "cy": size[1] / 2} | document
+    missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
+    if missing:
+        raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
+    values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
+    return _checked(path, values, [document.get(key, 0.0) for key in NERFSTUDIO_DISTORTION], size)
+
+
+def _opencv(path: Path, document: Any) -> Lens:
+    """From `camera_matrix`, `distortion_coefficients`, `image_width`, `image_height`, as OpenCV's samples and ROS's
+    camera_calibration write them."""
+    if not isinstance(document, dict):
+        raise NeecoError(f"{path}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
+    matrix = _numbers(path, _first(document, MATRIX_NAMES), "camera_matrix")
+    if len(matrix) != 9:
+        raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
+    model = str(document.get("distortion_model", "")).lower()
+    if model in FISHEYE:
+        raise _fisheye(path, "distortion_model", model)
+    found = _first(document, DISTORTION_NAMES)
+    size = _size(
+        path,
+        document.get("image_width", document.get("image_Width")),
+        document.get("image_height", document.get("image_Height")),
+    )
+    values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
+    return _checked(path, values, _numbers(path, [] if found is None else found, "distortion_coefficients"), size)
+
+
+def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int] | None) -> Lens:
+    for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
+        for value in given:
+            ok = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+            if not ok:  # NaN compares false
+                raise NeecoError(f"{source}: {field}: {shown(value)} is not a usable number; calibrate again")
+    if len(values) != 4 or min(values[:2]) <= 0:
+        raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
+    coefficients = tuple(float(value) for value in distortion)
+    if len(coefficients) not in COUNTS:
+        raise NeecoError(
+            f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV's models have 4, 5, 8, 12 or 14"
+        )
+    if not any(coefficients):
+        coefficients = ()
+    fl_x, fl_y, cx, cy = (float(value) for value in values)
+    return Lens(fl_x, fl_y, cx, cy, coefficients, size)
+
+
+def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
+    if width is None or height is None:
+        return None
+    if not all(isinstance(value, int | float) and 1 <= value < 1e6 for value in (width, height)):
+        raise NeecoError(f"{path}: image size: {shown(width)} x {shown(height)} is not one; correct it")
+    return int(width), int(height)
+
+
+def _fisheye(path: Path, field: str, model: str) -> NeecoError:
+    return NeecoError(
+        f"{path}: {field}: {model} lenses are not supported; calibrate with OpenCV's standard model (calibrateCamera)"
+    )
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with OpenCV's matrices."""
+
+
+def _matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
+    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+
+
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix_node)
+
+
+def _read_opencv_yaml(path: Path) -> Any:
+    text = read_text(path, "OpenCV's calibration as YAML")
+    if text.lstrip().startswith("<"):
+        raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
+    # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
+    lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
+    try:
+        return yaml.load("\n".join(lines), Loader=_Loader)  # a SafeLoader
+    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}: " if mark else ""
+        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:80]
+        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); save the calibration again") from None
+
+
+def _first(document: dict[Any, Any], names: Sequence[str]) -> Any:
+    return next((document[name] for name in names if document.get(name) is not None), None)
+
+
+def _numbers(path: Path, value: Any, field: str) -> list[Any]:
+    """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    if value is None:
+        raise NeecoError(f"{path}: {field}: missing; expected it as OpenCV writes it")
+    if not isinstance(value, list):
+        raise NeecoError(f"{path}: {field}: expected numbers, found {shown(value)}; write it as OpenCV does")
+    flat: list[Any] = []
+    for item in value:
+        flat.extend(item if isinstance(item, list) else [item])
+    return flat

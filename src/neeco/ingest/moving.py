@@ -1,0 +1,181 @@
+"""Where the instrument is in the images, from motion and its tracked pose: its features must not hold up the cameras.
+
+Three steps: pixels whose optical flow is not what a still scene would show; the set of points in the instrument's
+tracked frame that such pixels cover in most frames (its rough shape); and that shape projected into every frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import binary_dilation
+from scipy.spatial import QhullError
+
+from neeco.ingest.requirements import optional_module
+from neeco.ingest.sfm import Pinhole, SfmResult
+
+STEP = 4  # px between the places where flow is compared
+NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
+PATCH = 0.04  # of the image: about what an instrument's front takes
+MOVED = 1.5  # px of flow the still scene does not explain
+FRAMES = 60  # that shape is carved from
+CELLS = 48  # of the carving grid, per side
+REACH = 0.4  # of the distance to the camera: half a side of that grid
+COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
+MARGIN = 6  # px about its projection
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Points [K, 3] mm of an instrument in its tracked frame, the grid's spacing mm, and how often the images agree."""
+
+    points: np.ndarray
+    spacing: float
+    agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
+
+
+def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pinhole, rows: np.ndarray) -> np.ndarray:
+    """[R, h, w] share of neighbours, at every STEP-th pixel, against which the pixel moved otherwise than tissue would.
+
+    load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted.
+    """
+    cv2 = optional_module("cv2")
+    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    grey = lru_cache(maxsize=16)(lambda row: cv2.cvtColor(load(row), cv2.COLOR_RGB2GRAY))
+    height, width = grey(int(rows[0])).shape
+    v, u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+    evidence = np.zeros((len(rows), *u.shape))
+    for index, row in enumerate(rows.tolist()):
+        depth = _still_depth(sfm, row, pinhole, u, v)
+        others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(sfm.indices)]
+        for other in others:
+            flow = estimator.calc(grey(row), grey(other), None)[v, u]  # [h, w, 2]
+            expected = _still_flow(sfm.world_from_camera[row], sfm.world_from_camera[other], depth, pinhole, u, v)
+            evidence[index] += np.linalg.norm(flow - expected, axis=-1) > MOVED
+        evidence[index] /= max(len(others), 1)
+    return evidence
+
+
+def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pinhole) -> np.ndarray:
+    """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
+    cv2 = optional_module("cv2")
+    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    grey = [cv2.cvtColor(load(0), cv2.COLOR_RGB2GRAY)]
+    height, width = grey[0].shape
+    v, u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+    patch = max(1, round(PATCH * u.size))
+    motion = np.zeros(len(sfm.indices) - 1)
+    for row in range(len(motion)):
+        grey = [grey[-1], cv2.cvtColor(load(row + 1), cv2.COLOR_RGB2GRAY)]
+        flow = estimator.calc(*grey, None)[v, u]  # [h, w, 2]
+        depth = _still_depth(sfm, row, pinhole, u, v)
+        still = _still_flow(sfm.world_from_camera[row], sfm.world_from_camera[row + 1], depth, pinhole, u, v)
+        left = np.linalg.norm(flow - still, axis=-1)
+        motion[row] = np.sort(left, axis=None)[-patch:].mean()
+    return motion
+
+
+def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Pinhole) -> Shape | None:
+    """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
+
+    evidence [R, h, w] from `moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
+    instrument hardly moves, or its poses do not fit the cameras.
+    """
+    distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
+    if distance <= 0:
+        return None
+    axis = np.linspace(-REACH, REACH, CELLS) * distance
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
+    total, seen = np.zeros(len(grid)), np.zeros(len(grid))
+    for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
+        x, y, inside = _project(grid, pose, pinhole, pixels.shape)
+        total[inside] += pixels[y[inside], x[inside]]
+        seen += inside
+    enough = seen > 0.3 * len(evidence)
+    share = np.where(enough, total / np.maximum(seen, 1), 0.0)
+    background = float(evidence.mean())
+    best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
+    if best < 2 * background or best < 0.3:
+        return None
+    belongs = share > max(COVERED * best, 2 * background)
+    return Shape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
+
+
+def project_mask(
+    shape: Shape, camera_from_instrument: np.ndarray, pinhole: Pinhole, size: tuple[int, int]
+) -> np.ndarray:
+    """[H, W] bool: pixels the shape may cover in a frame of `size` (width, height), with a margin."""
+    width, height = size
+    small = (height // STEP + 1, width // STEP + 1)
+    x, y, inside = _project(shape.points, camera_from_instrument, pinhole, small)
+    mask = np.zeros(small, dtype=bool)
+    mask[y[inside], x[inside]] = True
+    depth = float(camera_from_instrument[2, 3])
+    cell = shape.spacing * pinhole.fl_x / max(depth, 1.0)  # px between neighbouring points
+    mask = binary_dilation(mask, iterations=max(1, round((MARGIN + cell / 2) / STEP)))
+    return np.kron(mask, np.ones((STEP, STEP), dtype=bool))[:height, :width]
+
+
+def project_points(
+    points: np.ndarray, world_from_camera: np.ndarray, pinhole: Pinhole
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [K, 2] and depths [K] of points [K, 3]."""
+    camera = (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    z = np.where(np.abs(camera[:, 2]) < 1e-9, 1e-9, camera[:, 2])
+    pixels = camera[:, :2] / z[:, None] * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
+    return pixels, camera[:, 2]
+
+
+def _project(
+    points: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Pinhole, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column, row and insideness [K] of points on the STEP-spaced raster of `shape` (rows, columns)."""
+    camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
+    z = np.maximum(camera[:, 2], 1e-6)
+    x = np.floor((pinhole.fl_x * camera[:, 0] / z + pinhole.cx) / STEP)
+    y = np.floor((pinhole.fl_y * camera[:, 1] / z + pinhole.cy) / STEP)
+    inside = (camera[:, 2] > 1e-3) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
+
+
+def _still_depth(sfm: SfmResult, row: int, pinhole: Pinhole, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """[h, w] depth of the still scene at pixels u, v: between the points this frame sees, nearest beyond them."""
+    seen = sfm.observations[:, 0] == row
+    spots, depth = project_points(
+        sfm.points[sfm.observations[seen, 1].astype(int)], sfm.world_from_camera[row], pinhole
+    )
+    near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
+    keep = (depth > 0.3 * near) & (depth < 3 * near)
+    spots, inverse = spots[keep], 1 / depth[keep]
+    if len(spots) == 0:
+        return np.full(u.shape, np.nan)  # nothing is known, so nothing is seen to move
+    places = np.stack([u + 0.5, v + 0.5], -1)
+    nearest = NearestNDInterpolator(spots, inverse)(places)
+    try:
+        between = LinearNDInterpolator(spots, inverse)(places)
+    except QhullError:  # fewer than three, or all on one line
+        return np.asarray(1 / nearest)
+    return np.asarray(1 / np.where(np.isnan(between), nearest, between))
+
+
+def _still_flow(
+    world_from_first: np.ndarray,
+    world_from_second: np.ndarray,
+    depth: np.ndarray,
+    pinhole: Pinhole,
+    u: np.ndarray,
+    v: np.ndarray,
+) -> np.ndarray:
+    """[h, w, 2] px by which a still point at that depth moves from the first frame to the second."""
+    rays = np.stack(
+        [(u + 0.5 - pinhole.cx) / pinhole.fl_x, (v + 0.5 - pinhole.cy) / pinhole.fl_y, np.ones(u.shape)], -1
+    )
+    relative = np.linalg.inv(world_from_second) @ world_from_first
+    moved = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
+    z = np.maximum(moved[..., 2], 1e-9)
+    x, y = pinhole.fl_x * moved[..., 0] / z + pinhole.cx, pinhole.fl_y * moved[..., 1] / z + pinhole.cy
+    return np.stack([x - u - 0.5, y - v - 0.5], -1)

@@ -1,0 +1,217 @@
+"""Keys of recording.yaml, each read with its file and place so that mistakes are told exactly."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from neeco.capture.problems import shown
+from neeco.errors import NeecoError
+from neeco.ingest.columns import (
+    EULER,
+    FORMS,
+    MATRIX,
+    JointColumns,
+    PoseColumns,
+    Units,
+    quaternion_form,
+)
+from neeco.ingest.units import KINDS, canonical_unit
+
+_EULER = re.compile(r"^(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})$")  # no axis twice in a row
+
+
+def close_match(name: str, names: Iterable[str]) -> str | None:
+    """The name that a misspelt one probably means."""
+    matches = difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)
+    return matches[0] if matches else None
+
+
+class Section:
+    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys`."""
+
+    def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...]) -> None:
+        self.file, self.place = file, place
+        if not isinstance(value, dict):
+            where = f"{file}: {place}" if place else str(file)
+            raise NeecoError(
+                f"{where}: expected keys such as `{keys[0]}:`, found {shown(value)}; write them as key: value"
+            )
+        self.value: dict[str, Any] = value
+        for key in value:
+            if key not in keys:
+                likely = close_match(str(key), keys)
+                hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
+                raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
+
+    def error(self, key: str, message: str) -> NeecoError:
+        place = f"{self.place}.{key}" if self.place and key else self.place or key
+        return NeecoError(" ".join(f"{self.file}: {place}: {message}".split()))
+
+    def text(self, key: str, required: bool = False) -> str | None:
+        value = self.value.get(key)
+        if value is None and not required:
+            return None
+        if value is None:
+            raise self.error(key, "missing; give it")
+        if isinstance(value, bool) or not isinstance(value, str | int) or not str(value).strip():
+            raise self.error(key, f"expected a name, found {shown(value)}; put it in quotes if it is one")
+        return str(value)
+
+    def path(self, key: str, required: bool = False) -> Path | None:
+        """An existing file or folder, relative to this file."""
+        text = self.text(key, required)
+        if text is None:
+            return None
+        try:
+            path = self.file.parent / Path(text).expanduser()
+            found = path.exists()
+        except (OSError, ValueError, RuntimeError):
+            found = False
+        if not found:
+            raise self.error(key, f"no such file: {shown(text, 120)}; correct the path (relative to {self.file.name})")
+        return path
+
+    def number(
+        self, key: str, above: float | None = None, least: float | None = None, below: float | None = None
+    ) -> float | None:
+        value = self.value.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+            raise self.error(key, f"{shown(value)} is not a usable number; correct it")
+        wrong = []
+        wrong += [f"above {above:g}"] if above is not None and value <= above else []
+        wrong += [f"{least:g} or more"] if least is not None and value < least else []
+        wrong += [f"below {below:g}"] if below is not None and value >= below else []
+        if wrong:
+            raise self.error(key, f"{value:g} is out of range; give a number {wrong[0]}")
+        return float(value)
+
+    def integer(self, key: str, least: int) -> int | None:
+        value = self.number(key)
+        if value is not None and (value != int(value) or value < least):
+            raise self.error(key, f"{value:g} is out of range; give a whole number, {least} or more")
+        return None if value is None else int(value)
+
+    def numbers(self, key: str, count: int, what: str) -> list[float]:
+        value = self.value.get(key)
+        good = isinstance(value, list) and len(value) == count
+        good = good and all(
+            isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e12 for x in value or ()
+        )
+        if not good:
+            raise self.error(key, f"expected {count} numbers ({what}), found {shown(value)}; correct it")
+        return [float(x) for x in value or ()]
+
+    def names(self, key: str, counts: tuple[int, ...]) -> tuple[str, ...] | None:
+        """Names of columns, as a list or, for one, alone."""
+        value = self.value.get(key)
+        if value is None:
+            return None
+        items = value if isinstance(value, list) else [value]
+        good = all(isinstance(item, str | int) and not isinstance(item, bool) for item in items)
+        if not good or len(items) not in counts:
+            wanted = "the name of a column" if counts == (1,) else f"{' or '.join(map(str, counts))} names of columns"
+            raise self.error(key, f"expected {wanted}, found {shown(value)}; list them")
+        if len({str(item) for item in items}) < len(items):
+            raise self.error(key, "names a column twice; list different columns")
+        return tuple(str(item) for item in items)
+
+    def range(self, key: str, unit: str) -> tuple[float, float]:
+        """Least and greatest of something."""
+        low, high = self.numbers(key, 2, f"least and greatest, {unit}")
+        if low >= high:
+            raise self.error(key, f"{low:g} is not below {high:g}; give the least first, in {unit}")
+        return low, high
+
+    def ranges(self, key: str) -> tuple[tuple[int, int], ...]:
+        """Frame numbers and ranges such as "30-40", as (first, last)."""
+        value = self.value.get(key)
+        if value is None:
+            return ()
+        found = []
+        for item in value if isinstance(value, list) else [value]:
+            match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
+            if match is None or int(match[2] or match[1]) < int(match[1]):
+                raise self.error(key, f"{shown(item)} is no range of frames; write 12 or 30-40")
+            found.append((int(match[1]), int(match[2] or match[1])))
+        return tuple(found)
+
+
+def pose_columns(parent: Section, key: str, value: Any, clock: str) -> PoseColumns:
+    """A log of poses: a file's name, or a mapping. Raises NeecoError."""
+    place = f"{parent.place}.{key}" if parent.place else key
+    value = value if isinstance(value, dict) else {"file": value}
+    section = Section(parent.file, place, value, ("file", "clock", "columns", "units", "rate_hz"))
+    file = section.path("file", required=True)
+    assert file is not None
+    keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
+    columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), keys)
+    forms = [form for form in ("quaternion", *FORMS) if columns.value.get(form) is not None]
+    if len(forms) > 1:
+        raise columns.error(forms[1], f"the rotation is already given by {forms[0]}; keep one of them")
+    form, rotation = None, None
+    if forms:
+        rotation = columns.names(forms[0], FORMS.get(forms[0], (4,)))
+        assert rotation is not None
+        form = forms[0] if forms[0] in FORMS else quaternion_form(rotation)
+        if form is None:
+            raise columns.error("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
+    if form == MATRIX and columns.value.get("position") is not None:
+        raise columns.error("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
+    convention = columns.text("euler_convention")
+    if convention is not None and (
+        not _EULER.match(convention) or convention[0] == convention[1] or convention[1] == convention[2]
+    ):
+        raise columns.error(
+            "euler_convention", f"{shown(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
+        )
+    if form == EULER and convention is None:
+        raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
+    good = columns.value.get("good")
+    goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
+    return PoseColumns(
+        file, section.text("clock") or clock, columns.names("time", (1, 2)), columns.names("position", (3,)), rotation,
+        form, convention, columns.text("state"), goods, _units(section), section.number("rate_hz", above=0.0),
+    )  # fmt: skip
+
+
+def joint_columns(parent: Section, key: str, value: Any, clock: str, poses: PoseColumns | None) -> JointColumns:
+    """A log of a joint: a file's name, or a mapping. In the file of the poses it shares their clock. Raises
+    NeecoError."""
+    place = f"{parent.place}.{key}"
+    value = value if isinstance(value, dict) else {"file": value}
+    keys = ("file", "clock", "columns", "units", "rate_hz", "calibration", "limits")
+    section = Section(parent.file, place, value, keys)
+    file = section.path("file", required=True)
+    assert file is not None
+    if poses is not None and file == poses.path:
+        clock = poses.clock
+    columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), ("time", "value"))
+    limits = None
+    if section.value.get("limits") is not None:
+        limits = section.range("limits", "rad")
+    names = columns.names("value", (1,))
+    return JointColumns(
+        file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
+        _units(section), section.number("rate_hz", above=0.0), section.path("calibration"), limits,
+    )  # fmt: skip
+
+
+def _mapping(value: Any) -> Any:
+    return {} if value is None else value
+
+
+def _units(section: Section) -> Units:
+    given = Section(section.file, f"{section.place}.units", _mapping(section.value.get("units")), tuple(KINDS))
+    found: dict[str, str | None] = {}
+    for kind, units in KINDS.items():
+        text = given.text(kind)
+        found[kind] = None if text is None else canonical_unit(text)
+        if found[kind] is not None and found[kind] not in units:
+            raise given.error(kind, f"{shown(text)} is no unit of {kind}; use {', '.join(units)}")
+    return Units(found["time"], found["length"], found["angle"])

@@ -1,0 +1,309 @@
+"""Where the frames come from: a video file in any format ffmpeg reads, or a folder of images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image
+
+from neeco.errors import NeecoError
+from neeco.ingest.columns import recognise_time
+from neeco.ingest.requirements import optional_module
+from neeco.ingest.tables import numbers, read_table
+from neeco.ingest.units import scale_of
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+FEWEST = 2
+
+
+class VideoSource(Protocol):
+    """Frames with their times. size: (width, height) px; notes: what could not be read, in words."""
+
+    @property
+    def path(self) -> Path: ...
+
+    @property
+    def size(self) -> tuple[int, int]: ...
+
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+
+    def frame_times(self) -> np.ndarray:
+        """Times [N] s, increasing; of a video, from its first frame."""
+        ...
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
+        ...
+
+
+def open_video(path: Path, fps: float | None = None) -> VideoSource:
+    """A video file. Its frames are decoded once to find those that can be, with their own times (`fps`: overrides
+    them). What is damaged is left out and noted; raises NeecoError when nothing can be read."""
+    path = Path(path)
+    if not path.is_file():
+        raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
+    scan = _Scan(path)
+    scan.run()
+    if scan.failure or scan.corrupt:
+        # decoding frames in parallel, which of the damaged ones are given up differs from run to run
+        scan = _Scan(path, threads="SLICE")
+        scan.run()
+    return scan.finish(fps)
+
+
+def open_images(folder: Path, fps: float | None = None, times: Path | None = None) -> VideoSource:
+    """A folder of images, ordered by name (2 before 10), at `fps` or at the times of a CSV file: one column of times,
+    and perhaps one of file names. Images that cannot be read are left out and noted. Raises NeecoError."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise NeecoError(
+            f"{folder}: {'is a file, expected a folder of images' if folder.exists() else 'no such folder'}"
+        )
+    folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
+    files = sorted(
+        (file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=lambda file: _natural(file.name)
+    )
+    if len(files) < FEWEST:
+        raise NeecoError(
+            f"{folder}: holds {len(files)} images; expected a video's frames as {', '.join(IMAGES[:3])} files"
+        )
+    if times is not None:
+        files, stamps = _image_times(folder, files, Path(times))
+    elif fps is not None:
+        stamps = np.arange(len(files)) / fps
+    else:
+        raise NeecoError(f"{folder}: when were the images taken? Give fps, or a CSV file of times, in the recording")
+    notes: list[str] = []
+    size, usable, bad = None, [], []
+    for index, file in enumerate(files):
+        try:
+            with Image.open(file) as image:
+                image.load()
+                found = image.size
+        except Exception:  # damaged files make pillow's decoders raise nearly anything
+            bad.append(file.name)
+            continue
+        if size is not None and found != size:
+            raise NeecoError(
+                f"{file}: is {found[0]}x{found[1]}, the images before it {size[0]}x{size[1]}; give images of one size"
+            )
+        size = found
+        usable.append(index)
+    if size is None or len(usable) < FEWEST:
+        raise NeecoError(f"{folder}: {len(usable)} of {len(files)} images can be read; replace the damaged files")
+    if bad:
+        notes.append(f"{folder.name}: {len(bad)} images cannot be read and are left out ({', '.join(bad[:3])})")
+    return _Images(folder, size, tuple(notes), tuple(files[i] for i in usable), stamps[usable])
+
+
+@dataclass(frozen=True)
+class _Images:
+    path: Path
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    files: tuple[Path, ...]
+    times: np.ndarray
+
+    def frame_times(self) -> np.ndarray:
+        return self.times
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        for index in sorted({int(i) for i in indices}):
+            try:
+                with Image.open(self.files[index]) as image:
+                    pixels = np.array(image.convert("RGB"))
+            except Exception as error:
+                raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
+            yield index, pixels
+
+
+@dataclass(frozen=True)
+class _Video:
+    path: Path
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
+    times: np.ndarray
+    numbered: bool
+    threads: str
+
+    def frame_times(self) -> np.ndarray:
+        return self.times
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = {self.stamps[int(index)]: int(index) for index in indices}
+        for number, frame in enumerate(_Scan(self.path, self.threads).decoded()):
+            if not wanted:
+                return
+            index = wanted.pop(number if self.numbered else frame.pts, None)
+            if index is not None:
+                yield index, _rgb(frame)
+        if wanted:
+            raise NeecoError(
+                f"{self.path}: frame {min(wanted.values())} cannot be read any more; do not change the file"
+            )
+
+
+@dataclass
+class _Scan:
+    """One pass over a video's frames."""
+
+    path: Path
+    threads: str = "AUTO"
+    stamps: list[int | None] = field(default_factory=list)
+    size: tuple[int, int] | None = None
+    rate: float | None = None
+    time_base: float | None = None
+    failure: str | None = None
+    corrupt: int = 0
+    interlaced: bool = False
+    turned: int = 0
+    promised: int = 0  # frames the file's header speaks of
+
+    def decoded(self) -> Iterator[Any]:
+        """Frames as far as they can be decoded; damaged ones are counted and left out."""
+        av = optional_module("av")
+        try:
+            container = av.open(str(self.path))
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            raise NeecoError(
+                f"{self.path}: cannot be opened as a video ({_reason(error)}); give an intact video file"
+            ) from None
+        with container:
+            if not container.streams.video:
+                raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
+            stream = container.streams.video[0]
+            stream.thread_type = self.threads
+            self.promised = int(stream.frames or 0)
+            self.rate = float(stream.average_rate) if stream.average_rate else None
+            self.time_base = float(stream.time_base) if stream.time_base else None
+            packets = container.demux(stream)
+            while True:
+                try:
+                    packet = next(packets)
+                    frames = packet.decode()
+                except StopIteration:
+                    return
+                except (av.error.FFmpegError, ValueError) as error:
+                    self.failure = self.failure or _reason(error)
+                    if isinstance(error, av.error.EOFError) or self.corrupt > 1000:
+                        return
+                    self.corrupt += 1
+                    continue
+                for frame in frames:
+                    if frame.is_corrupt:
+                        self.corrupt += 1
+                    else:
+                        yield frame
+
+    def run(self) -> None:
+        for frame in self.decoded():
+            self.add(frame)
+
+    def add(self, frame: Any) -> None:
+        size = (frame.width, frame.height)
+        if self.size is not None and size != self.size:
+            raise NeecoError(
+                f"{self.path}: changes from {self.size} to {size} pixels midway; cut it into one video each"
+            )
+        self.size = size
+        self.stamps.append(frame.pts)
+        self.interlaced |= bool(frame.interlaced_frame)
+        self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
+
+    def finish(self, fps: float | None) -> _Video:
+        if self.size is None or len(self.stamps) < FEWEST:
+            why = f" ({self.failure})" if self.failure else ""
+            raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
+        notes = self._notes()
+        stamps = [stamp for stamp in self.stamps if stamp is not None]
+        order = sorted(set(stamps))
+        if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
+            times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            if fps is not None:
+                times = np.arange(len(order)) / fps
+            if len(order) < len(stamps):
+                notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
+            return _Video(self.path, self.size, tuple(notes), tuple(order), times, False, self.threads)
+        rate = fps or self.rate
+        if not rate:
+            raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
+        if fps is None:
+            notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
+        count = len(self.stamps)
+        return _Video(
+            self.path, self.size, tuple(notes), tuple(range(count)), np.arange(count) / rate, True, self.threads
+        )
+
+    def _notes(self) -> list[str]:
+        notes, read = [], len(self.stamps)
+        if self.failure or self.corrupt:
+            what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
+            notes.append(f"{self.path.name}: is damaged: {what}")
+        elif self.promised > read:
+            notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
+        if self.interlaced:
+            notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
+        if self.turned:
+            notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
+        return notes
+
+
+def _rgb(frame: Any) -> np.ndarray:
+    """uint8 [H, W, 3]. The converter's quick default is over one level too dark, so it is asked for exact rounding."""
+    flags = optional_module("av.video.reformatter").Interpolation
+    exact = flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT | flags.BITEXACT
+    return frame.to_ndarray(format="rgb24", interpolation=exact)
+
+
+def _reason(error: BaseException) -> str:
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(str(text).split())[:100] or type(error).__name__
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts frame2 before frame10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def _image_times(folder: Path, files: list[Path], table_path: Path) -> tuple[list[Path], np.ndarray]:
+    """The files a table of times names (all of them, in order, when it names none) and their times [N] s."""
+    table = read_table(table_path)
+    found = recognise_time(table.header)
+    column = found.time[0] if found.time else table.header[0] if len(table.header) == 1 else None
+    if column is None:
+        raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
+    scale = scale_of(str(table_path), (column,), "time", None, found.time_unit, "")
+    values, missing, bad = numbers(table, (column,))
+    wrong = [*[row for row, _ in bad], *np.flatnonzero(missing)]
+    if wrong:
+        raise NeecoError(f"{table_path}: line {table.lines[min(wrong)]}: {column}: no time; repair or remove the line")
+    times = values[:, 0] * scale
+    by_name = {file.name: file for file in files} | {file.stem: file for file in files}
+    for index in range(len(table.header)):
+        cells = [Path(row[index]).name if index < len(row) else "" for row in table.rows]
+        if sum(cell in by_name for cell in cells) > 0.5 * len(cells):
+            absent = [row for row, cell in enumerate(cells) if cell not in by_name]
+            if absent:
+                raise NeecoError(
+                    f"{table_path}: line {table.lines[absent[0]]}: {cells[absent[0]]!r} is not in {folder.name}"
+                    "; correct the name"
+                )
+            files = [by_name[cell] for cell in cells]
+            break
+    else:
+        if len(times) != len(files):
+            raise NeecoError(
+                f"{table_path}: has {len(times)} times for {len(files)} images; add a column with file names"
+            )
+    falling = np.flatnonzero(np.diff(times) <= 0)
+    if len(falling):
+        raise NeecoError(f"{table_path}: line {table.lines[falling[0] + 1]}: {column} does not increase; sort the rows")
+    return files, times

@@ -1,0 +1,1 @@
+"""Finding instruments and their joints from training frames alone."""

@@ -1,0 +1,248 @@
+"""What each ablation changes, run once however many tables need it, and read off into tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.evaluation.truth import load_reference
+from neeco.experiments import ablation_run, jobs
+from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
+from neeco.experiments.ablation_run import AblationPlan, chosen_ablations, distinct_variants, run_ablations
+from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
+from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, Derived
+from neeco.experiments.derived import derive_capture
+from neeco.training import train as train_module
+from neeco.training.run import read_config
+
+SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
+NEVER = "labels were not asked for"
+
+
+def no_labels(path: Path, splits) -> dict:
+    raise AssertionError(NEVER)
+
+
+@pytest.fixture
+def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
+    monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
+    return AblationPlan(capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL)
+
+
+def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
+    told: set[str] = set()
+    ablation = run_ablations(plan, no_labels, progress=lambda news: told.add(news.job.name))
+    names = ["neeco-no-uniform-motion", "neeco", "neeco-no-density"]
+    assert [run["name"] for run in ablation["runs"]] == names
+    assert told == set(names)
+    configs = {name: read_config(plan.output / "runs" / name) for name in names}
+    for config in configs.values():
+        assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
+        assert config["deformation"]["warm_up"] == 0.25
+        assert (config["iterations"], config["initial_points"], config["tissue_budget"]) == (12, 30, 120)
+    changed = {key for key, value in configs["neeco-no-uniform-motion"].items() if value != configs["neeco"][key]}
+    assert changed == {"schedule"}
+    schedule = configs["neeco-no-uniform-motion"]["schedule"]
+    assert {key for key in schedule if schedule[key] != configs["neeco"]["schedule"][key]} == {"frame_order"}
+    assert json.loads((plan.output / "ablation.json").read_text()) == ablation
+    uniform = ablation["tables"][0]
+    off, on = uniform["rows"]
+    assert (off["paper"], on["paper"]) == ({"psnr.test": 22.26}, {"psnr.test": 28.31})
+    assert off["difference"]["psnr.test"] == pytest.approx(
+        off["values"]["psnr.test"] - on["values"]["psnr.test"], abs=1e-4
+    )
+    assert off["values"]["psnr.test"] == ablation["runs"][0]["splits"]["test"]["psnr"]
+    assert off["agrees"]["psnr.test"] == verdict(off["difference"]["psnr.test"], 22.26 - 28.31)
+    assert {row["label"] for row in uniform["curves"]} == {"off", "on"}
+
+
+def test_a_second_start_trains_nothing_and_says_the_same(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run_ablations(plan, no_labels)
+    monkeypatch.setattr(jobs, "train", lambda *_, **__: pytest.fail("trained again"))
+    assert run_ablations(plan, no_labels) == first
+
+
+def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = jobs.train
+
+    def fails(capture, folder, *rest, **more):
+        if folder.name == "neeco-no-density":
+            raise NeecoError("the loss became nan")
+        return real(capture, folder, *rest, **more)
+
+    monkeypatch.setattr(jobs, "train", fails)
+    ablation = run_ablations(plan, no_labels)
+    assert ablation["failures"] == [{"run": "neeco-no-density", "error": "the loss became nan"}]
+    off, on = ablation["tables"][1]["rows"]
+    assert (off["values"], off["agrees"]) == ({}, {"psnr.test": None})
+    assert on["values"]["psnr.test"] > 5
+    assert "| off | worse | - | - |" in markdown(ablation["tables"][1])
+
+
+def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def score(path: Path, splits) -> dict:
+        asked.append(path.name)
+        return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
+
+    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL)
+    monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
+    monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
+    for _ in range(2):
+        table = run_ablations(labels, score)["tables"][0]
+    assert asked == ["neeco"]
+    assert table["rows"][0]["values"] == {"mask_iou.test": 0.6, "mask_iou.unseen": 0.6}
+    assert table["rows"][0]["difference"]["mask_iou.test"] == pytest.approx(-0.3)
+    assert table["rows"][2]["values"] == {}  # the run that is not there
+
+
+def _neeco(job) -> bool:
+    return job.config.method == "neeco"
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"tables": ("density", "colour")}, "--tables: 'colour' is unknown; choose of paper, ours, density,"),
+        ({"tables": ()}, "--tables: names none"),
+        ({"iterations": 0}, "--iterations: 0 is no training"),
+        ({"kinematic_iterations": -1}, "--kinematic-iterations: -1 is no training"),
+        ({"settings": ("minutes=3",)}, "--set minutes: use the budget"),
+        ({"settings": ("sed=3",)}, "--set: unknown field 'sed'"),
+        ({"settings": ("deformation.wide=3",)}, "--set deformation.wide: no such field in the methods"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_written(changes: dict, named: str, plan) -> None:
+    with pytest.raises(NeecoError, match=named.replace("(", r"\(")):
+        run_ablations(AblationPlan(**{**vars(plan), **changes}), no_labels)
+    assert not plan.output.exists()
+
+
+def test_a_damaged_capture_is_refused_before_anything_is_written(plan: AblationPlan) -> None:
+    image = next((plan.capture / "images").iterdir())
+    image.write_bytes(b"no image")
+    with pytest.raises(NeecoError, match=rf"{image.name}: not an image file"):
+        run_ablations(plan, no_labels)
+    assert not plan.output.exists()
+
+
+def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
+    run_ablations(plan, no_labels)
+    with pytest.raises(NeecoError, match="12 iterations, not 13 iterations; give another --output"):
+        run_ablations(AblationPlan(**{**vars(plan), "iterations": 13}), no_labels)
+
+
+def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_meanings() -> None:
+    for table in ABLATIONS.values():
+        for comparison in table.comparisons:
+            labels = [entry.label for entry in comparison.entries]
+            assert comparison.reference in labels
+            assert len(set(labels)) == len(labels)
+    variants = distinct_variants(chosen_ablations(("paper", "ours")))
+    assert len({variant.name for variant in variants}) == len(variants) == 22
+    published = [entry.paper for table in PAPER for item in table.comparisons for entry in item.entries]
+    assert sum(map(len, published)) == 9 + 4 * len(CHECKPOINTS) + 2
+
+
+@pytest.mark.parametrize(
+    ("ours", "paper", "told"),
+    [(-3.0, -1.0, "yes"), (0.5, -1.0, "no"), (0.05, -1.0, "even"), (-0.09, -1.0, "even"), (None, -1.0, None)],
+)
+def test_directions_agree_when_the_signs_do(ours: float | None, paper: float, told: str | None) -> None:
+    assert verdict(ours, paper) == told
+
+
+def test_phase_1_ends_at_two_fifths_of_the_run_and_its_last_quarter_counts(tmp_path: Path) -> None:
+    rows = [{"iteration": i, "psnr": i / 100} for i in range(50, 1001, 50)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert phase_1_psnr(tmp_path, 1000) == pytest.approx((3.5 + 4.0) / 2)
+    assert phase_1_psnr(tmp_path, 150) == pytest.approx(0.5)
+    assert phase_1_psnr(tmp_path, 100) is None
+
+
+def test_a_checkpoint_is_the_nearest_row_of_its_split() -> None:
+    curve = [{"split": "test", "progress": p, "psnr": 100 * p} for p in (0.1, 0.2017, 1.0)]
+    curve.append({"split": "unseen", "progress": 0.2, "psnr": 1.0})
+    assert psnr_at(curve, "test", 0.2) == pytest.approx(20.17)
+    assert psnr_at(curve, "test", 0.4) is None
+
+
+def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> None:
+    table = table_of(ABLATIONS["sh-compensation"], {}, {}, {}, ("test",))
+    for row, psnr in zip(table["rows"], (20.0, 21.0, 23.0, 22.0), strict=True):
+        row["values"] = {key: psnr for key in table["judged"]}
+        if not row["reference"]:
+            row["difference"] = {key: psnr - 22.0 for key in table["judged"]}
+            row["agrees"] = {key: verdict(psnr - 22.0, -1.0) for key in table["judged"]}
+    table["measures"] = table["judged"]
+    assert agreement(table) == "8 of 12 as in the paper, 4 the other way"
+    rows = list(csv.DictReader(io.StringIO(csv_text(table))))
+    assert len(rows) == 4 * 4
+    assert rows[0] | {"difference": float(rows[0]["difference"])} == {
+        "table": "sh-compensation",
+        "comparison": "SH order x compensation",
+        "setting": "none",
+        "run": "neeco-no-sh-no-compensation",
+        "measure": "psnr_at_20.test",
+        "paper": "15.21",
+        "ours": "20.0",
+        "difference": -2.0,
+        "agrees": "yes",
+    }
+    assert "\n| both | 16.82 | 22.00 |  |" in markdown(table)
+    assert r"test PSNR at 20 \%: paper" in latex(table)
+    written = write_tables(tmp_path, {"tables": [table]})
+    assert [path.suffix for path in written] == [".csv", ".md", ".tex"]
+
+
+def test_fewer_frames_are_spread_over_the_recording_and_all_others_stay(capture: Path, tmp_path: Path) -> None:
+    made = derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "half")
+    before, after = read_capture(capture), read_capture(made)
+    train = [frame.name for frame in before.split("train")]
+    assert [frame.name for frame in after.split("train")] == [train[0], train[2], train[5]]
+    assert [frame.name for frame in after.frames if frame.split != "train"] == ["002", "005", "007"]
+    for frame in after.frames:
+        reference = load_reference(after, frame)
+        assert (reference is None) == (frame.split == "train")  # training has no masks to look at
+
+
+def test_noise_is_seeded_grows_with_its_level_and_spares_held_out_frames(capture: Path, tmp_path: Path) -> None:
+    def moved(level: float, seed: int) -> dict[str, torch.Tensor]:
+        recipe = Derived(f"noise-{level}", noise_mm=level)
+        made = derive_capture(capture, "transforms.json", recipe, seed, tmp_path / f"{level}-{seed}")
+        pairs = zip(read_capture(capture).frames, read_capture(made).frames, strict=True)
+        return {
+            f"{old.split} {old.name}": new.state.instruments["bar"].pose - old.state.instruments["bar"].pose
+            for old, new in pairs
+        }
+
+    one, two, other = moved(1.0, 0), moved(2.0, 0), moved(1.0, 1)
+    for name, change in one.items():
+        assert bool(change.any()) == name.startswith("train")
+        torch.testing.assert_close(two[name][:3, 3], 2 * change[:3, 3])
+    shifts = torch.stack([change[:3, 3] for name, change in one.items() if name.startswith("train")])
+    turns = torch.stack([change[:3, :3] for name, change in one.items() if name.startswith("train")])
+    assert 0.4 < float(shifts.std()) < 2
+    assert 0.0005 < float(turns.square().sum((1, 2)).mean().sqrt()) < 0.02  # 0.2 degrees per axis are 0.0035 rad
+    assert any(bool((one[name] != other[name]).any()) for name in one)
+
+
+def test_a_derived_capture_is_kept_and_another_recipe_refused(capture: Path, tmp_path: Path) -> None:
+    made = derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "made")
+    written = (made / "transforms.json").stat().st_mtime_ns
+    assert derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, made) == made
+    assert (made / "transforms.json").stat().st_mtime_ns == written
+    with pytest.raises(NeecoError, match=r"derived.json: train_share: is 0.5, not 0.25; give another --output"):
+        derive_capture(capture, "transforms.json", Derived("half", 0.25), 0, made)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.txt").write_text("all of it")
+    with pytest.raises(NeecoError, match="not empty, and not made by ablate"):
+        derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "taken")

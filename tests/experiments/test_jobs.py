@@ -1,0 +1,289 @@
+"""Jobs stand on their own: done once, resumed, refused, and one that fails leaves the others alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.experiments import cluster
+from neeco.experiments import jobs as module
+from neeco.experiments.cluster import threads_per_worker
+from neeco.experiments.jobs import UNLIMITED, Budget, run_job
+from neeco.experiments.memory import peak_memory_mb, reset_peak_memory
+from neeco.experiments.running import run_jobs
+from neeco.experiments.watching import HeldOut
+from neeco.training import train as train_module
+from neeco.training.options import training_config
+from neeco.training.session import Session
+
+TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
+
+
+def without_times(value):
+    """Numbers that the same seed must repeat."""
+    if isinstance(value, dict):
+        return {key: without_times(item) for key, item in value.items() if key not in TIMES}
+    return [without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def curve_of(job) -> list[dict]:
+    return [json.loads(line) for line in (job.folder / "curve.jsonl").read_text().splitlines()]
+
+
+def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
+    job = make_job()
+    told: list[tuple[str, float]] = []
+    result = run_job(job, lambda stage, share, text: told.append((stage, share)))
+    assert result == json.loads((job.folder / "job.json").read_text())
+    assert result["schema"] == "neeco-job/1"
+    assert (result["name"], result["method"], result["seed"], result["iterations"]) == ("3dgs", "3dgs", 0, 12)
+    assert result["budget"] == {"minutes": None, "iterations": 12, "clock": "wall"}
+    assert result["seconds"] > 0
+    assert result["processor_seconds"] > 0
+    assert result["num_gaussians"] > 50
+    assert list(result["splits"]) == ["test", "unseen"]
+    assert result["splits"]["test"]["frames"] == 2
+    assert 5 < result["splits"]["test"]["psnr"] < 60
+    assert result["splits"]["test"]["lpips"] is None
+    assert {"training", "evaluating"} <= {stage for stage, _ in told}
+    assert {"config.yaml", "scene.safetensors", "evaluation.json"} <= {path.name for path in job.folder.iterdir()}
+    rows = curve_of(job)
+    assert {row["split"] for row in rows} == {"test", "unseen"}
+    assert [row["iteration"] for row in rows if row["split"] == "test"] == [1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12]
+    final = next(row["psnr"] for row in rows if row["iteration"] == 12 and row["split"] == "test")
+    assert final == pytest.approx(result["splits"]["test"]["psnr"], abs=1e-3)  # every frame is in the curve here
+
+
+def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run_job(make_job())
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
+    monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
+    assert run_job(make_job()) == first
+
+
+def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run_job(make_job())
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
+    again = run_job(make_job(splits=("unseen",)))
+    assert list(again["splits"]) == ["unseen"]
+    assert without_times(again["splits"]["unseen"]) == without_times(first["splits"]["unseen"])
+    assert again["seconds"] == first["seconds"]
+
+
+@pytest.mark.parametrize("stop", [1, 7, 12])
+def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
+    stop: int, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = make_job(folder=tmp_path / "whole")
+    expected = run_job(whole)
+    cut = make_job(folder=tmp_path / "cut")
+    step = Session.step
+
+    def interrupted(session: Session):
+        result = step(session)
+        if session.iteration == stop:
+            os.kill(os.getpid(), signal.SIGINT)
+        return result
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Session, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match=rf"job 1 of 1 \(3dgs, seed 0\), at iteration {stop}; run the same"):
+            run_jobs([cut])
+    assert not (cut.folder / "job.json").exists()
+    result = run_jobs([cut])[0]
+    assert without_times(result) == without_times(expected)
+    assert result["seconds"] > 0 or stop == 1
+    assert (cut.folder / "scene.safetensors").read_bytes() == (whole.folder / "scene.safetensors").read_bytes()
+    iterations = [row["iteration"] for row in curve_of(cut) if row["split"] == "test"]
+    assert iterations == sorted(set(iterations))
+    assert iterations[-1] == 12
+    assert [row["psnr"] for row in curve_of(cut)[-2:]] == [row["psnr"] for row in curve_of(whole)[-2:]]
+
+
+def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_module, "CHECKPOINT_INTERVAL", 5)
+    whole, cut = make_job(folder=tmp_path / "whole"), make_job(folder=tmp_path / "cut")
+    expected = run_job(whole)
+    step = Session.step
+
+    def killed(session: Session):
+        if session.iteration == 8:
+            raise MemoryError("killed")
+        return step(session)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Session, "step", killed)
+        assert "MemoryError" in run_jobs([cut])[0]["error"]
+    assert without_times(run_job(cut)) == without_times(expected)
+    assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
+
+
+def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
+    from neeco.training.run import load_run
+
+    job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
+    result = run_job(job)
+    assert float(load_run(job.folder).scene.deformation.hinges[0].wrist_start) == float("-inf")
+    assert result["splits"]["test"]["psnr"] > 5
+
+
+def test_drawing_the_curve_changes_no_bit_of_the_scene(make_job, tmp_path) -> None:
+    job = make_job()
+    run_job(job)
+    plain = train_module.train(job.capture, tmp_path / "plain", job.train_config)
+    assert (plain / "scene.safetensors").read_bytes() == (job.folder / "scene.safetensors").read_bytes()
+
+
+def test_minutes_end_a_run_whatever_its_iterations(make_job) -> None:
+    config = training_config("3dgs", {"iterations": 2})
+    job = make_job(config=config, budget=Budget(0.005, None, "processor"))
+    assert job.train_config.iterations == UNLIMITED
+    result = run_job(job)
+    assert result["iterations"] > 2
+    assert result["processor_seconds"] == pytest.approx(0.3, abs=0.25)
+
+
+def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.experiments.watching import HeldOut
+
+    score = HeldOut.score
+
+    def slow(self, scene):
+        time.sleep(0.1)
+        return score(self, scene)
+
+    monkeypatch.setattr(HeldOut, "score", slow)
+    result = run_job(make_job())
+    assert result["seconds"] < 1.0  # eleven drawings took 1.1 s
+
+
+def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Session.step
+
+    def diverging(session: Session):
+        if session.config.seed == 1:
+            raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
+        return step(session)
+
+    monkeypatch.setattr(Session, "step", diverging)
+    told: list[str] = []
+    results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda news: told.append(news.stage))
+    assert [("error" in result) for result in results] == [False, True, False]
+    assert "loss became nan" in results[1]["error"]
+    assert results[1]["splits"] == {}
+    assert not (make_job(seed=1).folder / "job.json").exists()
+    assert [stage for stage in told if stage in ("done", "failed")] == ["done", "failed", "done"]
+
+
+def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = make_job()
+    with monkeypatch.context() as patched:
+        patched.setattr(Session, "step", lambda session: 1 // 0)
+        error = run_jobs([job])[0]["error"]
+    record = job.folder.with_name("3dgs-seed0.error.txt")
+    assert error.startswith("ZeroDivisionError")
+    assert str(record) in error
+    assert "Traceback" in record.read_text()
+    assert "error" not in run_jobs([job])[0]
+    assert not record.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"budget": Budget(None, 13)}, "budget: this run has 12 iterations, not 13 iterations"),
+        (
+            {"budget": Budget(None, 12, "processor")},
+            "budget: this run has 12 iterations, not 12 iterations, processor time",
+        ),
+        ({"config": training_config("3dgs", {"tissue_budget": 99})}, "tissue_budget: this run has 20000, not 99"),
+    ],
+)
+def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, told, monkeypatch) -> None:
+    run_job(make_job())
+    monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
+    with pytest.raises(NeecoError, match=f"{told}; give another --output"):
+        run_jobs([make_job(seed=1), make_job(**changes)])
+
+
+def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
+    job = make_job()
+    run_job(job)
+    with pytest.raises(NeecoError, match="capture: this run was trained on"):
+        run_jobs([replace(job, capture=tmp_path / "other")])
+
+
+@pytest.mark.parametrize(
+    ("budget", "told"),
+    [
+        (Budget(None, None), "give minutes or iterations"),
+        (Budget(1.0, 5), "one of them"),
+        (Budget(0.0, None), "more than 0"),
+        (Budget(float("inf"), None), "more than 0"),
+        (Budget(None, 0), "at least 1"),
+        (Budget(1.0, None, "sun"), "clock 'sun' is unknown"),  # type: ignore[arg-type]
+    ],
+)
+def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, told: str, make_job) -> None:
+    with pytest.raises(NeecoError, match=told):
+        run_jobs([make_job(budget=budget)])
+
+
+def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(NeecoError, match=r"install neeco\[cluster\]"):
+        run_jobs([make_job()], workers=2)
+
+
+def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        closed = server.getsockname()[1]
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
+    with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
+        run_jobs([make_job()], workers=2)
+
+
+def test_workers_share_the_cores() -> None:
+    assert [threads_per_worker(workers, 8) for workers in (1, 2, 3, 16)] == [8, 4, 2, 1]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a mark that can be reset")
+def test_peak_memory_is_of_the_work_since_the_reset() -> None:
+    assert reset_peak_memory()
+    before = peak_memory_mb()
+    block = bytearray(b"x" * (64 << 20))
+    during = peak_memory_mb()
+    del block
+    assert reset_peak_memory()
+    after = peak_memory_mb()
+    assert before is not None
+    assert during is not None
+    assert after is not None
+    assert during > before + 50
+    assert after < during - 50
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
+    pytest.importorskip("ray")
+    here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
+    there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
+    assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
+
+
+def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
+    gaussians, field = (HeldOut(read_capture(capture), ("train",), field=kind) for kind in (False, True))
+    assert len(field.frames["train"]) < len(gaussians.frames["train"])
+    assert len(field.moments) < len(gaussians.moments)
+    assert field.moments[-1] == gaussians.moments[-1] == 1  # both end with the finished scene

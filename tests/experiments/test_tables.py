@@ -1,0 +1,108 @@
+"""What the tables say of known numbers."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from neeco.cli.compare import fitting
+from neeco.experiments.summary import RUN_METRICS, SPLIT_METRICS, spread, summarise
+from neeco.experiments.tables import csv_text, latex_escape, latex_text, markdown_text, tables_of
+
+PSNR = {"a_b": (20.0, 22.0), "c|d": (20.5, 21.5), "lost": ()}
+
+
+def job(name: str, seed: int, psnr: float) -> dict[str, Any]:
+    numbers = dict.fromkeys(SPLIT_METRICS) | {"psnr": psnr, "lpips": 0.1 if name == "a_b" else 0.2, "frames": 3}
+    return {"name": name, "method": "3dgs", "seed": seed, "splits": {"test": numbers}} | dict.fromkeys(RUN_METRICS, 60)
+
+
+@pytest.fixture
+def comparison() -> dict[str, Any]:
+    jobs = [job(name, seed, value) for name, values in PSNR.items() for seed, value in enumerate(values)]
+    jobs.append({"name": "lost", "method": "3dgs", "seed": 0, "error": "loss is 100% nan_", "splits": {}})
+    return {
+        "capture": "/data/my_capture",
+        "budget": {"minutes": 2.5, "iterations": None, "clock": "processor"},
+        "seeds": [0, 1],
+        "splits": ["test"],
+        "methods": [{"name": name, "method": "3dgs", "source": "train", "folder": "runs"} for name in PSNR],
+        "jobs": jobs,
+        "summary": summarise(list(PSNR), ["test"], jobs),
+        "machine": {"cpu": "C & U_1", "cores": 2, "threads": 2, "torch": "2", "workers": 1, "threads_per_worker": None},
+        "notes": ["lpips: a note with 5% in it"],
+    }
+
+
+def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
+    assert spread([20.0, 22.0]) == {"mean": 21.0, "std": pytest.approx(2**0.5), "n": 2}
+    assert spread([20.0, None, float("nan")]) == {"mean": 20.0, "std": None, "n": 1}
+    assert spread([]) == {"mean": None, "std": None, "n": 0}
+
+
+def test_equal_means_are_both_best_and_lower_lpips_is_better(comparison) -> None:
+    split, own = tables_of(comparison)
+    assert [column.key for column in split.columns] == ["psnr", "lpips"]  # nobody knows the others
+    cells = dict(split.rows)
+    assert [cell.best for cell in cells["a_b"]] == [True, True]
+    assert [cell.best for cell in cells["c|d"]] == [True, False]
+    assert (cells["a_b"][0].mean, cells["a_b"][0].std) == ("21.00", "1.41")
+    assert dict(own.rows)["a_b"][1].mean == "1.00"  # 60 s in minutes
+
+
+def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
+    page = markdown_text(comparison)
+    assert "| a\\_b | **21.00** ± 1.41 | **0.100** ± 0.000 |" in page
+    assert "| c\\|d | **21.00** ± 0.71 | 0.200 ± 0.000 |" in page
+    assert "| lost | failed: loss is 100% nan\\_ |" in page
+    assert "2.5 minutes, processor time each, 2 seeds" in page
+    assert "- lpips: a note" in page
+
+
+def test_latex_escapes_everything_and_stays_balanced(comparison) -> None:
+    text = latex_text(comparison)
+    assert r"a\_b & \textbf{21.00} $\pm$ 1.41 & \textbf{0.100} $\pm$ 0.000 \\" in text
+    assert r"c\textbar{}d & " in text
+    assert r"lost & \multicolumn{2}{l}{failed: loss is 100\% nan\_} \\" in text
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 2
+    body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    assert body.count("{") == body.count("}")
+    assert r"my\_capture" in body
+
+
+@pytest.mark.parametrize(
+    ("text", "escaped"),
+    [
+        ("3dgs+dta", "3dgs+dta"),
+        ("a_b & 5% #1 $x {y}", r"a\_b \& 5\% \#1 \$x \{y\}"),
+        (r"C:\x~^", r"C:\textbackslash{}x\textasciitilde{}\textasciicircum{}"),
+    ],
+)
+def test_latex_escaping(text: str, escaped: str) -> None:
+    assert latex_escape(text) == escaped
+
+
+def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
+    rows = list(csv.DictReader(io.StringIO(csv_text(comparison))))
+    assert [row["name"] for row in rows] == ["a_b", "c|d", "lost"]
+    assert float(rows[0]["psnr_std"]) == 2**0.5
+    assert rows[2]["psnr_mean"] == ""
+    assert rows[2]["failed"] == "1"
+
+
+@pytest.mark.parametrize("width", [40, 200])
+def test_the_terminal_shows_every_number_whole(comparison: dict[str, Any], width: int) -> None:
+    console = Console(width=width, record=True, file=io.StringIO())
+    tables = tables_of(comparison)
+    parts = [part for table in tables for part in fitting(table, width)]
+    for part in parts:
+        console.print(part)
+    shown = console.export_text()
+    assert "…" not in shown
+    assert all(text in shown for text in ("21.00 ± 1.41", "0.100 ± 0.000", "1.00 ± 0.00", "failed"))
+    assert max(map(len, shown.splitlines())) <= width
+    assert (len(parts) > len(tables)) == (width < 100)

@@ -1,0 +1,124 @@
+"""A lens is the same from whichever file, and straight lines are straight once it is taken out."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from neeco.errors import NeecoError
+from neeco.ingest.lens import Lens, read_lens
+
+OPENCV = """%YAML:1.0
+---
+image_width: 320
+image_height: 240
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 300.5, 0., 159.5, 0., 301.5, 119.5, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -0.3, 0.1, 0.001, -0.002, 0. ]
+"""
+ROS = """image_width: 320
+image_height: 240
+distortion_model: plumb_bob
+camera_matrix: {rows: 3, cols: 3, data: [300.5, 0, 159.5, 0, 301.5, 119.5, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.3, 0.1, 0.001, -0.002, 0.0]}
+"""
+LENS = Lens(300.5, 301.5, 160.0, 120.0, (-0.3, 0.1, 0.001, -0.002, 0.0), (320, 240))
+
+
+def test_the_same_lens_from_opencv_ros_and_nerfstudio(world):
+    nerfstudio = {"fl_x": 300.5, "fl_y": 301.5, "cx": 160, "cy": 120, "w": 320, "h": 240}
+    nerfstudio |= {"k1": -0.3, "k2": 0.1, "p1": 0.001, "p2": -0.002}
+    assert read_lens(world.text(OPENCV, "opencv.yaml")) == LENS
+    assert read_lens(world.text(ROS, "ros.yaml")) == LENS
+    assert read_lens(world.text(json.dumps(nerfstudio), "transforms.json")) == LENS
+
+
+def test_four_numbers_or_nothing():
+    assert read_lens((290, 291, 160, 128)) == Lens(290.0, 291.0, 160.0, 128.0)
+    assert read_lens(None) is None
+
+
+def test_a_field_of_view_is_a_focal_length(world):
+    lens = read_lens(world.text(json.dumps({"camera_angle_x": np.pi / 2, "w": 200, "h": 100}), "transforms.json"))
+    assert lens is not None
+    assert (lens.fl_x, lens.cx, lens.cy) == (pytest.approx(100), 100, 50)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.yaml", "", "expected camera_matrix"),
+        ("a.yaml", "x: [1, 2", "line 1: not valid YAML"),
+        ("a.yaml", "<?xml version='1.0'?>", "is XML"),
+        ("a.yaml", "distortion_coefficients: [0, 0, 0, 0]", "camera_matrix: missing"),
+        ("a.yaml", OPENCV.replace("300.5", "-300.5"), "two positive focal lengths"),
+        ("a.yaml", OPENCV.replace("0.1, ", ""), "has 4 coefficients"),
+        ("a.yaml", OPENCV.replace("-0.3", ".nan"), "nan is not a usable number"),
+        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant lenses are not supported"),
+        ("a.json", "{}", "fl_x: missing"),
+        ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
+        ("a.json", '{"camera_model": "OPENCV_FISHEYE", "fl_x": 1}', "opencv_fisheye lenses are not supported"),
+        ("a.yaml", "!!python/object/apply:os.system [ls]", "not valid YAML"),
+    ],
+)
+def test_calibrations_that_are_none(world, name, text, message):
+    if "4 coefficients" in message:
+        text = OPENCV.replace("0.1, 0.001, ", "")
+        message = "has 3 coefficients"
+    with pytest.raises(NeecoError, match=rf"{name}: .*{message}") as caught:
+        read_lens(world.text(text, name))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lens_of_another_video_is_refused():
+    with pytest.raises(NeecoError, match=r"lens\.yaml: calibrated on 320x240 images, the video is 640x480"):
+        LENS.check_size((640, 480), "lens.yaml")
+    with pytest.raises(NeecoError, match="principal point"):
+        Lens(300, 300, 900, 100).check_size((320, 240), "--intrinsics")
+
+
+def test_undistorting_moves_points_to_where_the_pinhole_sees_them():
+    cv2 = pytest.importorskip("cv2")
+    points = np.array([[-40.0, -30, 100], [35, 25, 100], [0, 20, 100], [30, -28, 100]])
+    camera = LENS._matrix()
+    seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera, np.array(LENS.distortion))
+    image = np.zeros((240, 320, 3), dtype=np.uint8)
+    for x, y in seen.reshape(-1, 2):
+        cv2.circle(image, (round(float(x) * 16), round(float(y) * 16)), 4 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4)
+    straight = LENS.undistort(image)
+    pinhole = LENS.pinhole((320, 240))
+    assert pinhole.distortion == ()
+    rows, columns = np.indices((240, 320)) + 0.5
+    for x, y, z in points:
+        u, v = pinhole.fl_x * x / z + pinhole.cx, pinhole.fl_y * y / z + pinhole.cy
+        near = straight[..., 0] * (np.hypot(columns - u, rows - v) < 8.0)
+        found = np.array([(columns * near).sum(), (rows * near).sum()]) / near.sum()
+        np.testing.assert_allclose(found, [u, v], atol=0.3)
+
+
+def test_every_undistorted_pixel_shows_something():
+    pytest.importorskip("cv2")
+    assert LENS.undistort(np.full((240, 320, 3), 200, dtype=np.uint8)).min() > 150
+    assert LENS.undistort_mask(np.ones((240, 320), dtype=bool)).mean() > 0.99
+
+
+def test_a_pinhole_changes_nothing():
+    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    lens = Lens(30, 30, 16, 12)
+    assert lens.undistort(image) is image
+    assert lens.pinhole((32, 24)).size == (32, 24)
+
+
+def test_distortion_that_folds_the_image_is_refused():
+    pytest.importorskip("cv2")
+    with pytest.raises(NeecoError, match="folds the image over"):
+        Lens(300, 300, 160, 120, (-9.0, -40.0, 0.0, 0.0)).pinhole((320, 240))

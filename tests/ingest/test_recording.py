@@ -1,0 +1,222 @@
+"""recording.yaml says what was recorded; mistakes in it are told with their key, and `--init` writes a right one."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neeco.errors import NeecoError
+from neeco.ingest.columns import Units
+from neeco.ingest.logs import read_pose_log, read_reading_log
+from neeco.ingest.recording import Splits, read_recording, recording_from_flags
+from neeco.ingest.template import write_template
+
+HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
+
+
+@pytest.fixture
+def folder(world):
+    """video.mp4, logs/ of instrument, camera and jaw with its table, and sync.json."""
+    (world.folder / "video.mp4").write_bytes(b"film")
+    world.write(HEADER, world.rows(), "logs/instrument.csv")
+    world.write(HEADER, world.rows(), "logs/camera.csv")
+    world.write("t_s,hall_raw", np.column_stack([world.times, 1000 + world.times]), "logs/jaw.csv")
+    world.write("hall_raw,angle_rad", [[900, 0.0], [1500, 0.5], [2000, 1.0]], "logs/jaw_calibration.csv")
+    world.text(json.dumps({"note": "pulse", "em_minus_video_s": 0.038, "jaw_minus_video_s": -0.01}), "logs/sync.json")
+    return world.folder
+
+
+def flags(folder, **more):
+    given = {
+        "instrument": folder / "logs/instrument.csv",
+        "laparoscope": folder / "logs/camera.csv",
+        "joints": [("jaw_angle", folder / "logs/jaw.csv", folder / "logs/jaw_calibration.csv")],
+        "intrinsics": (290, 290, 160, 128),
+        "sync": folder / "logs/sync.json",
+    }
+    return recording_from_flags(folder / "video.mp4", **(given | more))
+
+
+def test_flags(folder):
+    recording = flags(folder, frames=120)
+    assert recording.clocks == ("em", "jaw_angle")
+    assert recording.sync == {"em": 0.038, "jaw_angle": -0.01}
+    assert recording.intrinsics == (290.0, 290.0, 160.0, 128.0)
+    assert recording.frames == 120
+    [instrument] = recording.instruments
+    assert len(read_pose_log(instrument.poses).times) == 200
+    assert len(read_reading_log(instrument.joints["jaw_angle"]).times) == 200
+
+
+def test_init_writes_what_the_flags_say(folder):
+    (folder / "recording.yaml").write_text(write_template(folder))
+    recording = read_recording(folder / "recording.yaml")
+    same = flags(folder)
+    assert (recording.sync, recording.clocks) == (same.sync, same.clocks)
+    for mine, theirs in zip(recording.instruments, same.instruments, strict=True):
+        assert mine.name == theirs.name
+        np.testing.assert_array_equal(read_pose_log(mine.poses).quats, read_pose_log(theirs.poses).quats)
+        for joint in theirs.joints:
+            np.testing.assert_array_equal(
+                read_reading_log(mine.joints[joint]).values, read_reading_log(theirs.joints[joint]).values
+            )
+    assert recording.laparoscope.path.name == "camera.csv"
+
+
+def test_init_asks_for_what_no_header_says(world):
+    (world.folder / "clip.MOV").write_bytes(b"film")
+    world.write("Frame,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz", [[1, "OK", 1, 0, 0, 0, 1, 2, 3]] * 9, "aurora tool.csv")
+    world.write("time,x,y,z,roll,pitch,yaw", [[1, 2, 3, 4, 5, 6, 7]] * 9, "scope.csv")
+    world.write("t_s,gripper", [[1, 2]] * 9, "gripper.csv")
+    world.text("%PDF nonsense", "notes.txt")
+    text = write_template(world.folder)
+    (world.folder / "recording.yaml").write_text(text)
+    recording = read_recording(world.folder / "recording.yaml")
+    assert "this rate is a guess" in text
+    assert "# units: {time: s, length: mm}   # nothing says them" in text
+    assert "# columns: rotation is not clear" in text
+    assert "# units: {angle: rad}" in text
+    [instrument] = recording.instruments
+    assert instrument.name == "aurora tool"
+    assert list(instrument.joints) == ["gripper_angle"]
+    assert instrument.poses.rate_hz == 40
+
+
+def test_init_of_images_alone(world):
+    for number in range(12):
+        path = world.folder / "frames" / f"{number}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (8, 6)).save(path)
+    (world.folder / "recording.yaml").write_text(write_template(world.folder))
+    recording = read_recording(world.folder / "recording.yaml")
+    assert (recording.images, recording.fps) == (world.folder / "frames", 25)
+    assert recording.instruments == ()
+    assert len(recording.open().frame_times()) == 12
+
+
+def test_init_of_a_folder_without_frames(world):
+    with pytest.raises(NeecoError, match="no video and no folder of images"):
+        write_template(world.folder)
+
+
+FULL = """
+video: {file: video.mp4, fps: 50}
+intrinsics: [290, 291, 160, 128]
+instruments:
+  - name: grasper
+    poses:
+      file: logs/instrument.csv
+      columns: {time: t_s, position: [x_mm, y_mm, z_mm], quaternion: [qw, qx, qy, qz]}
+      units: {length: millimetres}
+    joints:
+      jaw: {file: logs/jaw.csv, calibration: logs/jaw_calibration.csv, limits: [0, 1.5]}
+      wrist: {file: logs/instrument.csv, columns: {value: qx}, units: {angle: deg}}
+laparoscope: logs/camera.csv
+sync: {em: 0.04, jaw: -1}
+frames: 100
+splits: {test_every: 0, unseen_fraction: 0.1, unseen_by: jaw, unseen: [3, 10-12]}
+"""
+
+
+def test_everything_at_once(world, folder):
+    recording = read_recording(world.text(FULL, "recording.yaml"))
+    assert recording.fps == 50
+    [instrument] = recording.instruments
+    assert instrument.poses.form == "quaternion_wxyz"
+    assert instrument.poses.units == Units(length="mm")
+    assert instrument.joints["jaw"].limits == (0.0, 1.5)
+    assert instrument.joints["wrist"].clock == "em"  # in the file of the poses
+    assert recording.clocks == ("em", "jaw")
+    assert recording.sync == {"em": 0.04, "jaw": -1.0}
+    assert recording.splits == Splits(0, 0.1, "jaw", (), ((3, 3), (10, 12)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("frames:", "frmes:", r"frmes: unknown key; did you mean frames\?"),
+        ("quaternion:", "quaternions:", r"instruments\[0\]\.poses\.columns\.quaternions: unknown key; did you mean"),
+        ("file: video.mp4", "file: vide.mp4", r"video\.file: no such file: 'vide\.mp4'"),
+        ("fps: 50", "fps: -1", r"video\.fps: -1 is out of range; give a number above 0"),
+        ("fps: 50", "fps: fast", r"video\.fps: 'fast' is not a usable number"),
+        ("[290, 291, 160, 128]", "[290, 291, 160]", r"intrinsics: expected 4 numbers"),
+        ("[290, 291, 160, 128]", "lens.yaml", r"intrinsics: no such file: 'lens\.yaml'"),
+        ("- name: grasper", "- name:", r"instruments\[0\]\.name: missing"),
+        ("[x_mm, y_mm, z_mm]", "[x_mm, y_mm]", r"columns\.position: expected 3 names of columns"),
+        ("[x_mm, y_mm, z_mm]", "[x_mm, y_mm, x_mm]", r"columns\.position: names a column twice"),
+        ("[qw, qx, qy, qz]", "[a, b, c, d]", "the names do not say the order"),
+        ("quaternion: [qw, qx, qy, qz]", "euler: [qx, qy, qz]", r"euler_convention: missing"),
+        ("quaternion:", "euler_convention: XXY, quaternion:", r"'XXY' is none"),
+        ("quaternion:", "rotation_vector: [a, b, c], quaternion:", "keep one of them"),
+        ("millimetres", "inches", r"units\.length: 'inches' is no unit of length; use mm, cm, m"),
+        ("[0, 1.5]", "[1.5, 0]", r"joints\.jaw\.limits: 1\.5 is not below 0"),
+        ("laparoscope: logs/camera.csv", "laparoscope: 3", r"laparoscope\.file: no such file: '3'"),
+        ("jaw: -1}", "jaww: -1}", r"sync\.jaww: no log has the clock 'jaww'; did you mean jaw\?"),
+        ("jaw: -1}", "jaw: soon}", r"sync\.jaw: 'soon' is not an offset in seconds"),
+        ("frames: 100", "frames: 1.5", r"frames: 1\.5 is out of range; give a whole number"),
+        (
+            "unseen_by: jaw",
+            "unseen_by: elbow",
+            r"splits\.unseen_by: no joint is called 'elbow'; the joints are jaw, wrist",
+        ),
+        ("10-12", "12-10", r"splits\.unseen: '12-10' is no range of frames"),
+        ("video: {file: video.mp4, fps: 50}", "", "give either `video: FILE` or `images:"),
+        ("video: {file: video.mp4, fps: 50}", "images: {folder: logs}", r"images\.fps: when were the images taken\?"),
+        ("instruments:\n", "instruments: 3\nx:\n", r"unknown key"),
+        ("frames: 100", "frames: [100", r"line \d+: not valid YAML"),
+    ],
+)
+def test_mistakes_are_told_with_their_key(world, folder, old, new, message):
+    assert old in FULL
+    path = world.text(FULL.replace(old, new), "recording.yaml")
+    with pytest.raises(NeecoError, match=r"recording\.yaml: .*" + message) as caught:
+        read_recording(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "offsets"),
+    [
+        ({"clocks": {"em": 0.5, "jaw_angle": 2}}, {"em": 0.5, "jaw_angle": 2.0}),
+        ({"em_minus_video_s": 1.0}, {"em": 1.0}),
+        ({"jaw_angle_minus_video_s": 1.0, "note": "x"}, {"jaw_angle": 1.0}),
+    ],
+)
+def test_sync_files(world, folder, content, offsets):
+    assert flags(folder, sync=world.text(json.dumps(content), "sync.json")).sync == offsets
+
+
+def test_an_offset_of_a_log_that_was_not_given_is_noted(folder):
+    recording = flags(folder, joints=())
+    assert recording.sync == {"em": 0.038}
+    assert any("'jaw_minus_video_s' belongs to no log" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("[]", "expected clock offsets"), ("{}", "clocks: missing"), ('{"clocks": {"em": "x"}}', "'x' is not an offset")],
+)
+def test_sync_files_that_are_none(world, folder, content, message):
+    with pytest.raises(NeecoError, match=rf"sync\.json: .*{message}"):
+        flags(folder, sync=world.text(content, "sync.json"))
+
+
+def test_flags_that_cannot_be(folder):
+    with pytest.raises(NeecoError, match=r"--laparoscope: .*absent\.csv: no such file"):
+        flags(folder, laparoscope=folder / "absent.csv")
+    with pytest.raises(NeecoError, match="--joint jaw_angle: needs --instrument"):
+        flags(folder, instrument=None)
+    with pytest.raises(NeecoError, match="--frames: 1 is too few"):
+        flags(folder, frames=1)
+    joint = ("jaw_angle", folder / "logs/jaw.csv", None)
+    with pytest.raises(NeecoError, match="--joint jaw_angle: given twice"):
+        flags(folder, joints=[joint, joint])
+
+
+def test_two_instruments_with_one_joint_name_have_two_clocks(world, folder):
+    text = "video: video.mp4\ninstruments:\n"
+    text += "".join(f"  - name: {name}\n    joints: {{jaw: logs/jaw.csv}}\n" for name in ("left", "right"))
+    assert read_recording(world.text(text, "recording.yaml")).clocks == ("left.jaw", "right.jaw")

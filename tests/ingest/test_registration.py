@@ -1,0 +1,141 @@
+"""SfM cameras find their place in the tracker's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neeco.errors import NeecoError
+from neeco.ingest.clocks import correlate, offset_from_instrument
+from neeco.ingest.logs import PoseLog
+from neeco.ingest.registration import register_with_laparoscope
+
+HAND_EYE = np.eye(4)
+HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
+HAND_EYE[:3, 3] = [14.0, -9.0, -38.0]
+
+
+def scope_path(times: np.ndarray, turn: float = 1.0) -> np.ndarray:
+    """[N, 4, 4] world_from_camera of a scope that sweeps and turns about two axes; `turn` scales its rotation."""
+    angles = np.stack(
+        [0.15 * np.sin(1.3 * times), 0.12 * np.sin(0.9 * times + 1), 0.2 * np.sin(0.5 * times + 2) ** 3], -1
+    )
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(turn * angles).as_matrix()
+    poses[:, :3, 3] = np.stack([18 * np.sin(0.8 * times), 12 * np.cos(1.1 * times), 9 * np.sin(0.4 * times)], -1)
+    return poses
+
+
+def recorded(offset: float, noise: float = 1.0, turn: float = 1.0, drift: float = 0.0) -> tuple[np.ndarray, PoseLog]:
+    """(video times, what the tracker of the scope logged, its clock `offset` s ahead of the video's)."""
+    rng = np.random.default_rng(3)
+    ticks = np.arange(-0.4, 12.4, 0.025) + rng.normal(0, 0.001, 512)
+    sensors = scope_path(ticks, turn) @ HAND_EYE
+    slow = drift * np.stack([np.sin(0.5 * ticks), np.sin(0.45 * ticks + 2), np.cos(0.4 * ticks)], -1)
+    positions = sensors[:, :3, 3] + slow + rng.normal(0, 0.3 * noise, (len(ticks), 3))
+    turns = Rotation.from_matrix(sensors[:, :3, :3]) * Rotation.from_rotvec(rng.normal(0, 0.002 * noise, (512, 3)))
+    log = PoseLog(Path("scope.csv"), "em", ticks + offset, positions, turns.as_quat(scalar_first=True))
+    return np.arange(0, 12, 0.04), log
+
+
+def in_sfm(world_from_camera: np.ndarray) -> np.ndarray:
+    """The same cameras in a frame and unit of SfM's own."""
+    turn = Rotation.from_euler("xyz", [70, 20, -130], degrees=True).as_matrix()
+    moved = world_from_camera.copy()
+    moved[:, :3, :3] = turn @ moved[:, :3, :3]
+    moved[:, :3, 3] = (moved[:, :3, 3] @ turn.T + [30.0, -20.0, 5.0]) / 17.0
+    return moved
+
+
+def test_exact_cameras_are_placed_exactly_and_the_clock_is_found() -> None:
+    times, log = recorded(offset=0.037, noise=0.0)
+    truth = scope_path(times)
+    found = register_with_laparoscope(in_sfm(truth), times, log, None)
+    assert found.scale == pytest.approx(17.0, rel=2e-3)
+    assert found.clock.seconds == pytest.approx(0.037, abs=1e-3)
+    assert np.abs(found.cameras(in_sfm(truth)) - truth).max() < 0.1
+    assert np.allclose(found.camera_from_sensor, HAND_EYE, atol=0.2)
+
+
+def test_a_noisy_drifting_tracker_bends_the_scale_by_less_than_its_stated_uncertainty() -> None:
+    times, log = recorded(offset=-1.81, drift=0.3)
+    truth = scope_path(times)
+    found = register_with_laparoscope(in_sfm(truth), times, log, None)
+    assert abs(found.scale / 17.0 - 1) < max(3 * found.scale_sd, 0.005)
+    assert found.clock.seconds == pytest.approx(-1.81, abs=0.005)
+    error = found.cameras(in_sfm(truth))[:, :3, 3] - truth[:, :3, 3]
+    assert np.sqrt((error**2).sum(1).mean()) < 1.0
+
+
+def test_a_clock_that_counts_from_1970_is_found_too() -> None:
+    times, log = recorded(offset=1.7e9)
+    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, None)
+    assert found.clock.seconds == pytest.approx(1.7e9, abs=0.005)
+
+
+def test_a_given_offset_is_kept() -> None:
+    times, log = recorded(offset=0.05)
+    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, 0.048)
+    assert found.clock.seconds == 0.048
+    assert found.clock.source == "given"
+
+
+def test_a_scope_that_does_not_turn_cannot_be_calibrated() -> None:
+    times, log = recorded(offset=0.0, turn=0.02)
+    with pytest.raises(NeecoError, match=r"scope\.csv: .*turned"):
+        register_with_laparoscope(in_sfm(scope_path(times, turn=0.02)), times, log, 0.0)
+
+
+def test_a_log_of_another_recording_is_refused() -> None:
+    times, log = recorded(offset=0.0)
+    other = replace(log, quats=np.roll(log.quats[::-1], 101, axis=0))
+    with pytest.raises(NeecoError, match="its clock cannot be told"):
+        register_with_laparoscope(in_sfm(scope_path(times)), times, other, None)
+
+
+def test_correlation_peaks_where_a_signal_was_cut_out() -> None:
+    rng = np.random.default_rng(0)
+    long = np.convolve(rng.normal(size=700), np.ones(9) / 9, "same")
+    lags, scores = correlate(long[200:450], long)
+    assert lags[scores.argmax()] == 200
+    assert scores.max() == pytest.approx(1.0)
+
+
+def swing(times: np.ndarray) -> np.ndarray:
+    """[N, 3] mm: strokes that grow faster and rest now and then, so that no two seconds are alike."""
+    phase = 0.7 * times + 0.1 * times**2
+    pace = phase + 0.9 * np.sin(1.7 * times) + 0.6 * np.sin(0.61 * times**1.3)
+    return np.stack([25 * np.sin(pace), 12 * np.sin(0.53 * pace + 1), 7 * np.cos(0.31 * pace)], -1)
+
+
+def instrument_log(offset: float, seed: int = 0) -> PoseLog:
+    rng = np.random.default_rng(seed)
+    ticks = np.arange(0.0, 12.5, 0.025)
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(ticks), 1))
+    return PoseLog(Path("tool.csv"), "em", ticks + offset, swing(ticks) + rng.normal(0, 0.3, (len(ticks), 3)), quats)
+
+
+def motion_seen(times: np.ndarray) -> np.ndarray:
+    """[N-1] px between frames: the instrument's motion from a distance that varies, and flow that errs."""
+    rng = np.random.default_rng(1)
+    moved = np.linalg.norm(np.diff(swing(times), axis=0), axis=1)
+    return 2.4 * moved * (1 + 0.3 * np.sin(times[1:])) + np.abs(rng.normal(0, 0.4, len(moved)))
+
+
+def test_the_instruments_clock_is_told_by_how_fast_it_moves_in_the_images() -> None:
+    times = np.arange(0.4, 12, 0.04)
+    found = offset_from_instrument(motion_seen(times), times, instrument_log(0.237))
+    assert found.seconds == pytest.approx(0.237, abs=0.015)
+    assert 0 < found.sd < 0.1
+    assert found.source == "instrument motion"
+
+
+def test_motion_of_something_else_tells_no_clock() -> None:
+    times = np.arange(0, 11, 0.04)
+    other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
+    with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
+        offset_from_instrument(other, times, instrument_log(0.0))

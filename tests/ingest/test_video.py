@@ -1,0 +1,132 @@
+"""Frames come with their own times, from films and folders, as far as they can be read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neeco.errors import NeecoError
+from neeco.ingest.video import open_images, open_video
+
+pytest.importorskip("av")
+
+
+def left_edge(image):
+    return int(np.argmax(image[12:18].mean(axis=(0, 2)) > 130))
+
+
+def test_frames_are_read_by_index_in_order(world):
+    video = open_video(world.video())
+    assert video.size == (64, 48)
+    assert video.notes == ()
+    np.testing.assert_allclose(video.frame_times(), np.arange(30) / 25, atol=1e-9)
+    frames = list(video.read([20, 3, 3, 11]))
+    assert [index for index, _ in frames] == [3, 11, 20]
+    assert all(image.shape == (48, 64, 3) and image.dtype == np.uint8 for _, image in frames)
+    assert all(abs(left_edge(image) - index) <= 1 for index, image in frames)
+
+
+def test_a_variable_rate_is_kept(world):
+    stamps = np.cumsum([0, 40, 40, 120, 20, 40, 200, *[33] * 23])
+    video = open_video(world.video(stamps=lambda i: int(stamps[i])))
+    np.testing.assert_allclose(video.frame_times(), stamps / 1000, atol=1e-6)
+    np.testing.assert_allclose(open_video(video.path, fps=10).frame_times(), np.arange(30) / 10)
+
+
+def test_a_truncated_film_gives_its_beginning_and_a_note(world):
+    whole = world.video("whole.mp4", frames=40).read_bytes()
+    path = world.folder / "cut.mp4"
+    path.write_bytes(whole[: len(whole) * 9 // 10])
+    video = open_video(path)
+    count = len(video.frame_times())
+    assert 5 < count < 40
+    assert any(f"{count} of 40 frames are there" in note or "damaged" in note for note in video.notes)
+    assert [index for index, _ in video.read(range(count))] == list(range(count))
+
+
+def test_damage_inside_reads_the_same_twice(world):
+    content = bytearray(world.video(frames=40).read_bytes())
+    for place in np.random.default_rng(0).integers(200, len(content) - 2500, 12):
+        content[place] ^= 255
+    path = world.folder / "damaged.mp4"
+    path.write_bytes(content)
+    first, second = open_video(path), open_video(path)
+    np.testing.assert_array_equal(first.frame_times(), second.frame_times())
+    count = len(first.frame_times())
+    assert [index for index, _ in first.read(range(count))] == list(range(count))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 4000, bytes(range(256)) * 20, b"t_s,x\n1,2\n"])
+def test_what_is_no_film_is_refused_in_a_line(world, content):
+    path = world.folder / "video.mp4"
+    path.write_bytes(content)
+    with pytest.raises(NeecoError, match=r"video\.mp4: .*video") as caught:
+        open_video(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_file_or_a_folder(world):
+    with pytest.raises(NeecoError, match="no such file"):
+        open_video(world.folder / "absent.mp4")
+    with pytest.raises(NeecoError, match="is a folder"):
+        open_video(world.folder)
+
+
+@pytest.fixture
+def images(world):
+    folder = world.folder / "frames"
+    folder.mkdir()
+    for number in range(12):
+        Image.fromarray(np.full((6, 8, 3), 20 * number, dtype=np.uint8)).save(folder / f"frame{number}.png")
+    return folder
+
+
+def test_images_are_ordered_by_number(images):
+    video = open_images(images, fps=10)
+    np.testing.assert_allclose(video.frame_times(), np.arange(12) / 10)
+    assert [(index, int(image[0, 0, 0])) for index, image in video.read([10, 2])] == [(2, 40), (10, 200)]
+
+
+def test_images_at_the_times_of_a_table(world, images):
+    times = world.write("file,t_ms", [[f"frame{i}.png", 100 * i + (i > 5)] for i in range(2, 10)], "times.csv")
+    video = open_images(images, times=times)
+    np.testing.assert_allclose(video.frame_times()[:5], [0.2, 0.3, 0.4, 0.5, 0.601])
+    assert [int(image[0, 0, 0]) for _, image in video.read([0])] == [40]
+    bare = world.write("t_s", [[i / 7] for i in range(12)], "bare.csv")
+    np.testing.assert_allclose(open_images(images, times=bare).frame_times(), np.arange(12) / 7, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "message"),
+    [
+        ("t_s", [[i] for i in range(5)], "has 5 times for 12 images"),
+        ("t_s", [[-i] for i in range(12)], "line 3: t_s does not increase"),
+        ("t", [[i] for i in range(12)], r"in which time unit\?"),
+        ("t_s", [["x"]] * 12, "line 2: t_s: no time"),
+        (
+            "file,t_s",
+            [*[[f"frame{i}.png", i] for i in range(11)], ["other.png", 12]],
+            r"line 13: 'other\.png' is not in",
+        ),
+    ],
+)
+def test_tables_of_times_that_do_not_fit(world, images, header, rows, message):
+    with pytest.raises(NeecoError, match=r"times\.csv: .*" + message):
+        open_images(images, times=world.write(header, rows, "times.csv"))
+
+
+def test_damaged_images_are_left_out_and_noted(images):
+    (images / "frame4.png").write_bytes(b"\x89PNG broken")
+    video = open_images(images, fps=10)
+    np.testing.assert_allclose(video.frame_times(), np.delete(np.arange(12), 4) / 10)
+    assert "1 images cannot be read" in video.notes[0]
+    assert "frame4.png" in video.notes[0]
+
+
+def test_images_that_do_not_belong_together(images):
+    with pytest.raises(NeecoError, match=r"Give fps, or a CSV"):
+        open_images(images)
+    Image.new("RGB", (9, 6)).save(images / "frame11.png")
+    with pytest.raises(NeecoError, match=r"frame11\.png: is 9x6, the images before it 8x6"):
+        open_images(images, fps=25)

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from pycocotools import mask as coco_mask
+
+from neeco.labels.geometry import (
+    bounding_box,
+    joined_polygon,
+    minimum_rectangle,
+    outer_polygons,
+    signed_area,
+    without_speckle,
+)
+
+masks = hnp.arrays(bool, st.tuples(st.integers(1, 14), st.integers(1, 14))).filter(lambda mask: mask.any())
+
+
+def pixel_corners(mask: np.ndarray) -> np.ndarray:
+    rows, columns = np.nonzero(mask)
+    return np.concatenate([np.stack([columns + dx, rows + dy], 1) for dx in (0, 1) for dy in (0, 1)])
+
+
+def rectangle_area(corners: np.ndarray) -> float:
+    return float(np.linalg.norm(corners[1] - corners[0]) * np.linalg.norm(corners[2] - corners[1]))
+
+
+def ellipse(width: int = 80, height: int = 60, angle: float = 0.5) -> np.ndarray:
+    rows, columns = np.mgrid[:height, :width]
+    u, v = columns + 0.5 - width / 2, rows + 0.5 - height / 2
+    a, b = u * np.cos(angle) + v * np.sin(angle), -u * np.sin(angle) + v * np.cos(angle)
+    return (a / 25) ** 2 + (b / 8) ** 2 < 1
+
+
+def iou_with(polygons: list[np.ndarray], mask: np.ndarray) -> float:
+    encoded = coco_mask.frPyObjects([np.ravel(polygon).tolist() for polygon in polygons], *mask.shape)
+    drawn = coco_mask.decode(coco_mask.merge(encoded)).astype(bool)
+    return float((drawn & mask).sum() / (drawn | mask).sum())
+
+
+def test_the_box_of_known_pixels():
+    mask = np.zeros((10, 12), bool)
+    mask[3:6, 4:9] = True
+    assert bounding_box(mask) == (4, 3, 5, 3)
+
+
+def test_an_empty_mask_has_no_shape():
+    empty = np.zeros((5, 5), bool)
+    assert bounding_box(empty) == (0, 0, 0, 0)
+    assert minimum_rectangle(empty) is None
+    assert outer_polygons(empty) == []
+
+
+@given(masks)
+@settings(max_examples=80, deadline=None)
+def test_the_minimum_rectangle_encloses_every_pixel_and_is_no_larger_than_the_box(mask):
+    rectangle = minimum_rectangle(mask)
+    center = rectangle.mean(0)
+    for start, end in zip(rectangle, np.roll(rectangle, -1, axis=0), strict=True):
+        normal = np.array([-(end - start)[1], (end - start)[0]]) / np.linalg.norm(end - start)
+        inward = np.sign((center - start) @ normal)
+        assert ((pixel_corners(mask) - start) @ normal * inward > -1e-6).all()
+    _, _, width, height = bounding_box(mask)
+    assert rectangle_area(rectangle) <= width * height + 1e-6
+
+
+def test_the_minimum_rectangle_follows_a_slanted_bar():
+    mask = ellipse()
+    _, _, width, height = bounding_box(mask)
+    assert rectangle_area(minimum_rectangle(mask)) < 0.75 * width * height
+
+
+@given(masks)
+@settings(max_examples=80, deadline=None)
+def test_polygons_have_the_area_of_their_pieces_with_holes_filled(mask):
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(mask)
+    filled = [ndimage.binary_fill_holes(pieces == k + 1, ndimage.generate_binary_structure(2, 2)) for k in range(count)]
+    polygons = outer_polygons(mask)
+    assert len(polygons) == count
+    areas = sorted((float(piece.sum()) for piece in filled), reverse=True)
+    assert [signed_area(polygon) for polygon in polygons] == pytest.approx(areas, rel=0.03)
+
+
+def test_a_polygon_drawn_again_is_the_mask_with_few_corners():
+    mask = ellipse()
+    polygons = outer_polygons(mask)
+    assert iou_with(polygons, mask) > 0.95
+    assert len(polygons[0]) < 40
+
+
+def test_pieces_joined_for_yolo_cover_the_same_pixels():
+    mask = ellipse()
+    mask[:, 35:42] = False
+    polygons = outer_polygons(mask)
+    assert len(polygons) == 2
+    assert abs(signed_area(joined_polygon(polygons))) == pytest.approx(sum(map(signed_area, polygons)))
+
+
+def test_speckle_goes_and_large_pieces_stay():
+    mask = ellipse()
+    mask[:, 35:42] = False
+    with_speck = mask.copy()
+    with_speck[1, 1] = True
+    assert (without_speckle(with_speck, 0.01) == mask).all()
+    assert without_speckle(with_speck, 0.0)[1, 1]

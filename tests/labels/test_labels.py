@@ -1,0 +1,201 @@
+import numpy as np
+import pytest
+import torch
+
+from neeco.errors import NeecoError
+from neeco.labels.annotation import annotate, project, visibility
+from neeco.labels.drawing import (
+    CompositedLabels,
+    DeltaThresholds,
+    ThresholdLabels,
+    draw,
+    find_thresholds,
+    otsu_of_magnitudes,
+)
+from neeco.raster.types import Camera
+from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, buried_depth, find_tolerance
+
+ACCEPTANCE = Acceptance(min_share=0.005, tolerance_mm=2.0)
+
+
+def labelled(scene, state, camera, labeller=None):
+    labeller = labeller or CompositedLabels(scene)
+    drawing = draw(scene, labeller, state, camera, 0.01)
+    (label,) = annotate(scene, drawing, labeller.names)
+    return drawing, label
+
+
+def test_the_mask_lies_where_the_instrument_projects(scene, state, camera):
+    drawing, label = labelled(scene, state(), camera)
+    # shaft along x = 0, from above the image down to the hinge at its middle row
+    assert set(np.unique(drawing.parts)) == {0, 1, 2}
+    assert (drawing.parts[2:22, 31:33] == 1).all()
+    assert (drawing.parts[27:31, 31:33] == 2).all()
+    x, y, width, _ = label.shape.box
+    assert y == 0
+    assert 28 <= x < 32
+    assert x + width / 2 == pytest.approx(32, abs=1)
+    assert label.parts["shaft"].area + label.parts["jaw"].area == label.shape.area
+    assert label.visibility > 0.95
+
+
+def test_depth_is_that_of_what_is_seen(scene, state, camera):
+    drawing, _ = labelled(scene, state(z=70.0), camera)
+    assert drawing.depth[10, 32] == pytest.approx(70, abs=3)
+    assert drawing.depth[40, 8] == pytest.approx(100, abs=1)
+    assert drawing.tissue_depth[10, 32] == pytest.approx(100, abs=1)
+
+
+def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
+    tilted = state(z=98.0)
+    # the jaw end dips behind the wall, the shaft stays before it
+    from scipy.spatial.transform import Rotation
+
+    tilted.instruments["rod"].pose[:3, :3] = torch.from_numpy(Rotation.from_euler("x", 35, degrees=True).as_matrix())
+    drawing, label = labelled(scene, tilted, camera)
+    assert (drawing.parts == 1).any()
+    assert 0.4 < label.visibility < 0.95
+    assert drawing.alone["rod"].mask.sum() > (drawing.parts > 0).sum()
+    assert label.keypoints["tip_left"].visibility == 1
+    assert label.keypoints["shaft_near"].visibility == 2
+
+
+def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera):
+    _, label = labelled(scene, state(z=130.0), camera)
+    assert label.shape is None
+    assert label.visibility == 0
+    assert {point.visibility for name, point in label.keypoints.items() if name != "shaft_far"} == {1}
+
+
+def test_an_instrument_of_which_the_scene_has_nothing_has_no_keypoints(scene, state, camera, monkeypatch):
+    faint = scene.canonical.map(torch.clone)
+    faint.opacity_logits[faint.body(1)] = -8.0
+    monkeypatch.setattr(scene, "canonical", faint)
+    _, label = labelled(scene, state(), camera)
+    assert label.shape is None
+    assert {(point.x, point.y, point.visibility) for point in label.keypoints.values()} == {(0, 0, 0)}
+
+
+def test_keypoints_outside_the_image_say_so(scene, state, camera):
+    _, label = labelled(scene, state(), camera)
+    assert label.keypoints["shaft_far"].visibility == 0
+    assert label.keypoints["hinge"].visibility == 2
+    assert (label.keypoints["hinge"].x, label.keypoints["hinge"].y) == pytest.approx((32, 24))
+
+
+def test_projection_agrees_with_the_pinhole_formula_from_a_moved_camera():
+    world_from_camera = torch.eye(4, dtype=torch.float64)
+    world_from_camera[:3, 3] = torch.tensor([10.0, 0, -50])
+    camera = Camera(world_from_camera, 60, 50, 32, 24, 64, 48)
+    assert project(np.array([20.0, 5.0, 50.0]), camera) == pytest.approx((32 + 60 * 0.1, 24 + 50 * 0.05, 100))
+
+
+def test_the_pose_is_given_in_the_camera_frame(scene, state, camera):
+    _, label = labelled(scene, state(x=4.0, z=75.0, roll=0.3), camera)
+    pose = np.array(label.camera_from_instrument)
+    assert pose[:3, 3] == pytest.approx([4, 0, 75])
+    assert pose[:2, 0] == pytest.approx([np.cos(0.3), np.sin(0.3)], abs=1e-5)
+
+
+def test_visibility_counts_hidden_pixels():
+    alone, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    alone[:, :2] = True
+    seen[:, 0] = True
+    assert visibility(seen, alone) == 0.5
+    assert visibility(seen & False, alone & False) == 0.0
+
+
+def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, camera):
+    labeller = ThresholdLabels(scene)
+    posed = scene.at(state())
+    owners = labeller.owners(state(), posed)
+    tissue = scene.canonical.counts[0]
+    assert (owners[:tissue] == -1).all()
+    assert (owners[tissue:] == 0).all()
+    assert labeller.thresholds.means is not None
+    assert 1e-3 < labeller.thresholds.means < 70
+    assert labeller.thresholds.quats is None  # this scene turns no Gaussian: says nothing
+    by_motion, _ = labelled(scene, state(), camera, labeller)
+    by_compositing, _ = labelled(scene, state(), camera)
+    one, other = by_motion.parts > 0, by_compositing.parts > 0
+    assert (one & other).sum() / (one | other).sum() > 0.7
+
+
+def test_thresholds_given_are_used(scene, state):
+    labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
+    assert (labeller.owners(state(), scene.at(state())) == -1).all()
+
+
+def test_otsu_falls_between_two_clusters_orders_of_magnitude_apart():
+    rng = np.random.default_rng(0)
+    low, high = 1e-3 * rng.lognormal(0, 0.5, 900), 5.0 * rng.lognormal(0, 0.3, 100)
+    limit = otsu_of_magnitudes(np.concatenate([low, high]))
+    assert low.max() < limit < high.min()
+    assert otsu_of_magnitudes(np.concatenate([np.zeros(900), high])) < high.min()
+    assert otsu_of_magnitudes(np.zeros(10)) is None
+    assert otsu_of_magnitudes(np.ones(10)) is None
+
+
+def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monkeypatch):
+    from neeco.scene.deformations.base import Deltas
+
+    count = len(scene.canonical)
+    still = Deltas(torch.zeros(count, 3), torch.zeros(count, 4), torch.zeros(count, 3))
+    monkeypatch.setattr(scene.deformation, "deltas", lambda canonical, state: still)
+    with pytest.raises(NeecoError, match="moves nothing"):
+        find_thresholds(scene)
+
+
+def test_recorded_states_are_acceptable(scene, camera):
+    for recorded in scene.recorded.states[:4]:
+        drawing, _ = labelled(scene, recorded, camera)
+        assert ACCEPTANCE.why_refused(scene, drawing) is None
+
+
+@pytest.mark.parametrize(
+    ("placed", "reason"),
+    [
+        ({"x": 60.0}, LEAVES_IMAGE),
+        ({"y": 60.0}, LEAVES_IMAGE),  # the shaft crosses the image, the working end is below it
+        ({"z": 110.0}, ENTERS_TISSUE),  # wholly behind the wall
+        ({"z": 99.0}, None),  # touching
+    ],
+)
+def test_states_out_of_the_image_or_behind_the_tissue_are_refused(scene, state, camera, placed, reason):
+    drawing, _ = labelled(scene, state(**placed, jaw=0.0), camera)
+    assert ACCEPTANCE.why_refused(scene, drawing) == reason
+
+
+def test_a_tip_in_the_tissue_is_refused_unless_the_check_is_off(scene, state, camera):
+    dipping = state(z=97.0, jaw=0.8)  # the jaw turns its tips away from the camera, 7 mm deeper than the hinge
+    drawing, _ = labelled(scene, dipping, camera)
+    assert ACCEPTANCE.why_refused(scene, drawing) == ENTERS_TISSUE
+    assert Acceptance(0.005, None).why_refused(scene, drawing) is None
+    assert Acceptance(0.005, 20.0).why_refused(scene, drawing) is None
+
+
+def test_buried_depth_is_how_far_the_tip_lies_behind_the_surface(scene, state, camera):
+    drawing, _ = labelled(scene, state(z=97.0, jaw=0.8), camera)
+    assert buried_depth(scene, drawing) == pytest.approx(97 + 10 * np.sin(0.8) - 100, abs=0.5)
+    drawing, _ = labelled(scene, state(z=70.0), camera)
+    assert buried_depth(scene, drawing) == 0
+
+
+def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camera, monkeypatch):
+    labeller = CompositedLabels(scene)
+    assert find_tolerance(scene, labeller) == 2.0
+    from neeco.scene import Recording
+
+    dipping = (state(z=96.0, jaw=0.8),) * 3
+    monkeypatch.setattr(scene, "recorded", Recording(("0",) * 3, ("train",) * 3, dipping, (camera,) * 3))
+    tolerance = find_tolerance(scene, labeller)
+    assert 2.5 < tolerance < 4.5
+    drawing, _ = labelled(scene, dipping[0], camera)
+    assert Acceptance(0.005, tolerance).why_refused(scene, drawing) is None
+
+
+def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camera):
+    labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
+    drawing, label = labelled(scene, state(), camera, labeller)
+    assert not drawing.parts.any()
+    assert label.shape is None
