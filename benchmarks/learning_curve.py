@@ -30,8 +30,8 @@ from neeco.files import write_text
 from neeco.raster.threads import set_threads
 from neeco.report.axes import nice_ticks
 from neeco.scene import Drawable
+from neeco.scene.learning import Session
 from neeco.training.options import training_config
-from neeco.training.protocol import TrainingSession
 from neeco.training.run import load_run
 from neeco.training.train import train
 
@@ -94,7 +94,7 @@ class Recorder:
         self.due = list(MINUTES)
         self.rows: list[Row] = []
 
-    def watch(self, session: TrainingSession) -> None:
+    def watch(self, session: Session) -> None:
         """After a step: score when it is time to; raises Enough at `stop` minutes."""
         minutes = session.seconds / 60
         if minutes < self.due[0] and session.progress < 1:
@@ -105,7 +105,7 @@ class Recorder:
         if self.stop is not None and minutes >= self.stop:
             raise Enough
 
-    def add(self, session: TrainingSession, scores: dict[str, tuple[float, float]]) -> None:
+    def add(self, session: Session, scores: dict[str, tuple[float, float]]) -> None:
         for split, (whole, inside) in scores.items():
             row = Row(
                 self.name,

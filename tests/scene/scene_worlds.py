@@ -9,7 +9,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recording, Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS
-from neeco.scene.methods import make_deformation
+from neeco.scene.methods import make_deformation, method_settings
 from neeco.scene.rotations import rigid_from_vector
 
 TISSUE, INSTRUMENT = 20, 40
@@ -61,7 +61,8 @@ def make_scene(method: str) -> Scene:
     names = tuple(f"{k:06d}" for k in range(8))
     recorded = Recording(names, ("train",) * 8, states, (CAMERA,) * 8)
     torch.manual_seed(0)
-    deformation = make_deformation(method, instruments, SMALL.get(method, {}))
+    deformation = make_deformation(method, instruments, method_settings(method, SMALL.get(method, {})))
+    canonical = canonical.with_extras(**deformation.initial_extras(canonical) | dict(canonical.extras))
     scene = Scene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
     scene.sh_degree = 2
     if method == "kinematic":

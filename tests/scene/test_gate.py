@@ -14,7 +14,7 @@ from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_can
 from neeco.errors import NeecoError
 from neeco.scene import Scene
 from neeco.scene.deformations._moving import mark_moving
-from neeco.scene.deformations.nps import NPS
+from neeco.scene.deformations.nps import NPS, NPSSettings
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.swept import SweptVolume
 
@@ -29,7 +29,7 @@ def path_points() -> torch.Tensor:
 
 def gated(scene: Scene) -> Scene:
     """The same scene, network included, with its gate about `path_points`."""
-    network = NPS(scene.instruments, gate_mm=MARGIN_MM)
+    network = NPS(scene.instruments, NPSSettings(gate_mm=MARGIN_MM))
     network.load_state_dict(scene.deformation.state_dict(), strict=False)
     network.gate.cover(path_points())
     return Scene("neeco", scene.canonical, network, scene.instruments, scene.recorded, scene.center)
@@ -103,7 +103,7 @@ def test_what_the_gate_holds_still_does_not_shift_the_labels() -> None:
             deltas.means.copy_(share * state.instruments["grasper"].pose[:3, 3].float())
             return deltas
 
-    network = Moves((GRASPER,), depth=2, width=8)
+    network = Moves((GRASPER,), NPSSettings(depth=2, width=8))
     canonical = random_canonical(torch.Generator().manual_seed(0))
     states = [grasper_state(pose_of(0, 0, 0, 5.0 * k, 0, 0)) for k in range(5)]
     network.fit_ranges(states, canonical.means)
@@ -115,4 +115,4 @@ def test_what_the_gate_holds_still_does_not_shift_the_labels() -> None:
 @pytest.mark.parametrize("margin", [0, -3.0])
 def test_a_margin_that_is_none_is_refused(margin: float) -> None:
     with pytest.raises(NeecoError, match="gate_mm"):
-        NPS((GRASPER,), gate_mm=margin)
+        NPSSettings(gate_mm=margin)

@@ -14,8 +14,7 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene import Scene
-from neeco.scene.deformations.base import Perturbation
-from neeco.scene.deformations.kinematic import PART_LOGITS
+from neeco.scene.deformations.kinematic import PART_LOGITS, Spin
 from neeco.scene.rotations import quat_to_matrix, rotate_about
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
@@ -84,7 +83,7 @@ def test_the_hinge_crosses_the_shaft_at_a_right_angle(kinematic: Scene) -> None:
 
 def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene) -> None:
     state, hinges = grasper_state(POSE), kinematic.deformation.hinges_of(0)
-    still, spun = kinematic.at(state).means, kinematic.at(state, Perturbation(shaft_roll=1.0)).means
+    still, spun = kinematic.at(state).means, kinematic.at(state, Spin(shaft_roll=1.0)).means
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
     moved = (spun - still).norm(dim=1)
     assert moved[:TISSUE].max() == 0

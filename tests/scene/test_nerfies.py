@@ -11,14 +11,15 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.scene.drawable import gaussian_scene
+from neeco.scene.encoding import encode_by_octave, window
 from neeco.scene.nerfies.render import composite, even_depths, finer_depths
 from neeco.scene.nerfies.scene import NerfScene
-from neeco.scene.nerfies.settings import PUBLISHED, Nerfies
-from neeco.scene.nerfies.warp import WarpField, encode, move_by_screw, window
+from neeco.scene.nerfies.session import elastic_loss, robust
+from neeco.scene.nerfies.settings import PUBLISHED, NerfiesSettings
+from neeco.scene.nerfies.warp import WarpField, move_by_screw
+from neeco.scene.recording import Recording
 from neeco.scene.rotations import skew
-from neeco.scene.scene import Recording
-from neeco.training.nerfies import elastic_loss, robust
+from neeco.scene.scene import gaussian_scene
 
 SMALL = {"rays": 16, "coarse_samples": 6, "width": 8, "depth": 2, "warp_width": 8, "warp_depth": 3, "chunk": 7}
 TIMES = (0.0, 1.0, 3.0)
@@ -32,7 +33,7 @@ def make_nerf(**changes) -> NerfScene:
     camera = Camera(torch.eye(4, dtype=torch.float64), 9.0, 9.0, 4.0, 3.0, 8, 6)
     recorded = Recording(("a", "b", "c"), ("train",) * 3, states, (camera,) * 3)
     instruments = (Instrument("rod"),)
-    scene = NerfScene("nerfies", Nerfies(instruments, **SMALL | changes), instruments, recorded)
+    scene = NerfScene("nerfies", NerfiesSettings(**SMALL | changes), instruments, recorded)
     scene.center.copy_(torch.tensor([0.0, 0.0, 50.0]))
     scene.scale.fill_(40.0)
     scene.bounds.copy_(torch.tensor([20.0, 80.0]))
@@ -94,18 +95,20 @@ def test_frequencies_open_one_after_the_other() -> None:
     torch.testing.assert_close(window(torch.tensor(1.5), 4), torch.tensor([1.0, 0.5, 0.0, 0.0]))
     assert window(torch.tensor(4.0), 4).tolist() == [1, 1, 1, 1]
     values = torch.tensor([[0.25, -0.5]])
-    coded = encode(values, 2, torch.tensor(1.0))
+    coded = encode_by_octave(values, 2, torch.tensor(1.0))
     assert coded.shape == (1, 10)
     assert torch.equal(coded[:, :2], values)
     waves = torch.tensor([[math.sin(math.pi / 4), -1.0, math.cos(math.pi / 4), 0.0]])
     torch.testing.assert_close(coded[:, 2:6], waves, atol=1e-6, rtol=1e-6)
     assert not coded[:, 6:].any()
-    torch.testing.assert_close(encode(values, 2)[:, 6:], torch.tensor([[1.0, 0.0, 0.0, -1.0]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        encode_by_octave(values, 2)[:, 6:], torch.tensor([[1.0, 0.0, 0.0, -1.0]]), atol=1e-6, rtol=0
+    )
 
 
 def test_a_slab_of_known_density_absorbs_as_it_must() -> None:
     """Density 0.02 / mm from 30 to 60 mm before nothing: alpha 1 - exp(-0.6); depth by integrating it."""
-    depths = even_depths(3000, 20.0, 80.0, 1, None).double()
+    depths = even_depths(3000, torch.tensor([20.0, 80.0]), 1, None).double()
     inside = (depths > 30) & (depths < 60)
     colors = torch.ones(1, 3000, 3, dtype=torch.float64) * torch.tensor([1.0, 0.5, 0.0])
     drawn = composite(inside * 0.01, colors, depths, torch.tensor([2.0], dtype=torch.float64))
@@ -124,7 +127,7 @@ def test_the_last_sample_stands_for_all_behind_it_in_colour_alone() -> None:
 
 
 def test_finer_samples_lie_where_the_weight_is() -> None:
-    depths = even_depths(20, 0.0, 20.0, 2, None)
+    depths = even_depths(20, torch.tensor([0.0, 20.0]), 2, None)
     weights = torch.zeros(2, 20)
     weights[:, 7] = 1.0
     for generator in (None, torch.Generator().manual_seed(0)):
@@ -187,11 +190,11 @@ def test_what_needs_gaussians_is_refused_in_one_line() -> None:
 )
 def test_a_setting_that_cannot_be_is_refused_by_name(field: str, value: float) -> None:
     with pytest.raises(NeecoError, match=f"deformation.{field}: "):
-        Nerfies((), **{field: value})
+        NerfiesSettings(**{field: value})
 
 
 def test_the_published_sizes_are_settings() -> None:
-    scene = NerfScene("nerfies", Nerfies((), **PUBLISHED), (), Recording(states=(State({}, 0.0),)))
+    scene = NerfScene("nerfies", NerfiesSettings(**PUBLISHED), (), Recording(states=(State({}, 0.0),)))
     assert len(scene.coarse.trunk.layers) == len(scene.fine.trunk.layers) == 8
     assert len(scene.warp.trunk.layers) == 6
     assert (scene.coarse.trunk.skip, scene.warp.trunk.skip) == (4, 4)

@@ -15,8 +15,9 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene import Scene
 from neeco.scene.deformations._moving import mark_moving, otsu
-from neeco.scene.deformations.nps import NPS, encode
-from neeco.scene.methods import make_deformation
+from neeco.scene.deformations.nps import NPS, NPSSettings
+from neeco.scene.encoding import encode
+from neeco.scene.methods import make_deformation, method_settings
 
 
 def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: Scene) -> None:
@@ -43,7 +44,7 @@ def test_a_resting_network_is_not_evaluated(neeco: Scene, monkeypatch: pytest.Mo
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_a_warm_up_is_a_share_of_the_training(share: float) -> None:
     with pytest.raises(NeecoError, match=r"deformation\.warm_up: .* is not a share"):
-        make_deformation("neeco", (GRASPER,), {"warm_up": share})
+        method_settings("neeco", {"warm_up": share})
 
 
 def test_encoding_by_hand() -> None:
@@ -51,13 +52,15 @@ def test_encoding_by_hand() -> None:
     root = 0.5**0.5
     # sin, then cos, of pi/4, pi/2, pi
     assert torch.allclose(encoded, torch.tensor([root, 1.0, 0.0, root, 0.0, -1.0]), atol=1e-6)
-    assert torch.allclose(encode(torch.tensor([0.25]), 3, identity=True)[-1], torch.tensor(0.25))
+    kept = NPS((GRASPER,), NPSSettings(identity=True, depth=2, width=8))._encode(torch.tensor([0.25]), 3)
+    assert torch.equal(kept, torch.cat([encoded, torch.tensor([0.25])]))
 
 
 @pytest.mark.parametrize(("identity", "expected"), [(False, 60), (True, 63)])
 def test_a_position_becomes_sixty_numbers(identity: bool, expected: int) -> None:
-    assert encode(torch.zeros(5, 3), 10, identity=identity).shape == (5, expected)
-    assert NPS((GRASPER,), identity=identity).mean_in.in_features == expected
+    network = NPS((GRASPER,), NPSSettings(identity=identity))
+    assert network._encode(torch.zeros(5, 3), 10).shape == (5, expected)
+    assert network.mean_in.in_features == expected
 
 
 def test_the_network_has_the_papers_size() -> None:
@@ -123,7 +126,7 @@ class HalfMoves(NPS):
 
 
 def test_what_moves_is_told_from_what_does_not() -> None:
-    network = HalfMoves((GRASPER,), depth=2, width=8)
+    network = HalfMoves((GRASPER,), NPSSettings(depth=2, width=8))
     network.generator = torch.Generator().manual_seed(0)
     canonical = random_canonical(torch.Generator().manual_seed(0))
     states = [grasper_state(pose_of(0, 0, 0, 5.0 * k, 0, 0)) for k in range(5)]
@@ -137,7 +140,7 @@ def test_what_moves_is_told_from_what_does_not() -> None:
 
 def test_an_unknown_method_is_refused() -> None:
     with pytest.raises(NeecoError, match="'telepathy' is unknown"):
-        make_deformation("telepathy", (), {})
+        make_deformation("telepathy", ())
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,10 +19,10 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.scene import Scene
 from neeco.scene.deformations._moving import mark_moving
-from neeco.scene.deformations.base import Deformation, Perturbation
-from neeco.scene.deformations.hexplane import HexPlane
-from neeco.scene.deformations.time_mlp import TimeMLP, octaves
-from neeco.scene.methods import make_deformation
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation
+from neeco.scene.deformations.hexplane import HexPlane, HexPlaneSettings
+from neeco.scene.deformations.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
+from neeco.scene.methods import make_deformation, method_settings
 
 METHODS = ("deformable-3dgs", "4dgs")
 
@@ -53,7 +54,7 @@ def test_the_gradient_reaches_every_parameter(scene: Scene) -> None:
     woken(scene.deformation)
     posed = scene.at(scene.recorded.states[3])
     loss = posed.means.square().sum() + posed.quats[:, 0].sum() + posed.scales.sum()
-    own = scene.deformation.regularisation(scene.canonical)
+    own = scene.deformation.regularisation(scene.canonical, None, 1)
     (loss if own is None else loss + own).backward()
     for name, parameter in scene.deformation.named_parameters():
         assert parameter.grad is not None, name
@@ -74,9 +75,16 @@ def test_the_state_of_the_instrument_plays_no_part_but_its_time_does(scene: Scen
     assert not torch.allclose(scene.at(State(later.instruments, first.time)).means, scene.at(later).means)
 
 
+def test_noise_on_the_state_comes_from_torchs_generator_and_only_when_asked_for(scene: Scene) -> None:
+    assert_noise_is_drawn(scene, Perturbation(state_noise=0.3))
+
+
+def test_noise_on_the_time_comes_from_torchs_generator_and_only_when_asked_for() -> None:
+    assert_noise_is_drawn(make_scene("deformable-3dgs"), NoisyTime(time_noise=0.1))
+
+
 @torch.no_grad()
-@pytest.mark.parametrize("noise", [Perturbation(state_noise=0.3), Perturbation(time_noise=0.1)])
-def test_noise_comes_from_torchs_generator_and_only_when_asked_for(scene: Scene, noise: Perturbation) -> None:
+def assert_noise_is_drawn(scene: Scene, noise: Perturbation) -> None:
     woken(scene.deformation)
     state = scene.recorded.states[2]
     untouched = torch.get_rng_state()
@@ -94,22 +102,25 @@ def test_noise_comes_from_torchs_generator_and_only_when_asked_for(scene: Scene,
 def test_the_noise_on_the_time_is_the_published_share_of_an_interval() -> None:
     network = make_scene("deformable-3dgs").deformation
     assert isinstance(network, TimeMLP)
-    state, noise = grasper_state(pose_of(0, 0, 0, 0, 0, 0), time=0.14), Perturbation(time_noise=0.1)
-    drawn = torch.stack([network.times.share(state, noise) for _ in range(2000)])
+    state, noise = grasper_state(pose_of(0, 0, 0, 0, 0, 0), time=0.14), NoisyTime(time_noise=0.1)
+    drawn = torch.stack([network.time_of(state, noise) for _ in range(2000)])
     assert float(drawn.mean()) == pytest.approx(0.5, abs=2e-3)
     assert float(drawn.std()) == pytest.approx(0.1 / 8, rel=0.1)  # eight frames
-    assert [network.time_noise(share) for share in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.1, 0.05, 0, 0])
-    assert TimeMLP((), synthetic=True).time_noise(0.0) == 0
+    rng = np.random.default_rng(0)
+    disturbed = [network.disturbed(UNPERTURBED, 1, share, rng) for share in (0.0, 0.25, 0.5, 1.0)]
+    assert [given.time_noise for given in disturbed[:2]] == pytest.approx([0.1, 0.05])
+    assert disturbed[2:] == [UNPERTURBED] * 2
+    assert TimeMLP((), TimeMLPSettings(synthetic=True)).disturbed(UNPERTURBED, 1, 0.0, rng) is UNPERTURBED
 
 
 def test_the_networks_have_their_published_sizes_and_rates() -> None:
-    real, synthetic = TimeMLP(()), TimeMLP((), synthetic=True)
+    real, synthetic = TimeMLP(()), TimeMLP((), TimeMLPSettings(synthetic=True))
     assert [layer.in_features for layer in real.layers] == [84, *(256,) * 4, 340, 256, 256]
     assert next(layer.in_features for layer in synthetic.layers) == 63 + 30
     assert [layer.in_features for layer in synthetic.time_net if hasattr(layer, "in_features")] == [13, 256]
     assert real.learning_rates(0.0)["head.weight"] == pytest.approx(8e-4)
     assert real.learning_rates(1.0)["head.weight"] == pytest.approx(1.6e-6)
-    planes = HexPlane((), rate_scale=1.0)
+    planes = HexPlane((), HexPlaneSettings(rate_scale=1.0))
     assert [tuple(plane.shape) for plane in planes.space] == [(3, 16, 64, 64), (3, 16, 128, 128)]
     assert [tuple(plane.shape) for plane in planes.time] == [(3, 16, 25, 64), (3, 16, 25, 128)]
     assert planes.learning_rates(0.0)["time.1"] == pytest.approx(1.6e-3)
@@ -123,7 +134,7 @@ def test_encoding_by_hand() -> None:
 
 @torch.no_grad()
 def test_a_layer_split_between_place_and_time_is_the_layer() -> None:
-    network = TimeMLP((), width=12)
+    network = TimeMLP((), TimeMLPSettings(width=12))
     torch.nn.init.normal_(network.head.weight)
     places, time = torch.rand(5, 3), torch.rand(21)
     given = torch.cat([octaves(places, 10), time.expand(5, -1)], 1)
@@ -148,7 +159,7 @@ def test_every_gaussian_has_a_place_a_turn_and_a_size(
     method: str, tissue: int, instrument: int, time: float, state_noise: float
 ) -> None:
     """Whatever the time, also far outside of the recording, and however many Gaussians there are."""
-    deformation = woken(make_deformation(method, (), SMALL[method]))
+    deformation = woken(make_deformation(method, (), method_settings(method, SMALL[method])))
     canonical = random_canonical(torch.Generator().manual_seed(0), (tissue, instrument))
     deformation.fit_ranges([State(time=0.1 * k) for k in range(5)], 10 * torch.randn(40, 3))
     posed = deformation.pose(canonical, State(time=time), Perturbation(state_noise=state_noise))
@@ -161,7 +172,7 @@ def test_every_gaussian_has_a_place_a_turn_and_a_size(
 
 
 def test_what_moves_with_time_is_the_instrument() -> None:
-    deformation = make_deformation("4dgs", (GRASPER,), SMALL["4dgs"])
+    deformation = make_deformation("4dgs", (GRASPER,), method_settings("4dgs", SMALL["4dgs"]))
     canonical = random_canonical(torch.Generator().manual_seed(0))
     states = [grasper_state(pose_of(0, 0, 0, 0, 0, 0), time=0.1 * k) for k in range(6)]
     deformation.fit_ranges(states, canonical.means)
@@ -184,7 +195,7 @@ def test_what_moves_with_time_is_the_instrument() -> None:
 @pytest.mark.parametrize(("field", "value"), [("resolution", 2), ("moments", 1), ("levels", 0), ("warm_up", 1.0)])
 def test_a_field_that_makes_no_planes_is_refused_by_name(field: str, value: float) -> None:
     with pytest.raises(NeecoError, match=rf"deformation\.{field}: "):
-        HexPlane((), **{field: value})
+        HexPlaneSettings(**{field: value})
 
 
 # --- the planes against their definition ---
@@ -219,7 +230,7 @@ def features_by_hand(planes: HexPlane, places: Tensor, time: Tensor) -> Tensor:
 @pytest.mark.parametrize("time", [-0.5, 0.0, 0.37, 0.5, 1.0, 1.5])
 def test_planes_give_what_their_definition_says_with_the_same_gradients(time: float) -> None:
     generator = torch.Generator().manual_seed(2)
-    planes = HexPlane((), **SMALL["4dgs"]).double()
+    planes = HexPlane((), HexPlaneSettings(**SMALL["4dgs"])).double()
     with torch.no_grad():
         for plane in planes.time:
             plane.copy_(torch.rand(plane.shape, generator=generator))
@@ -238,13 +249,13 @@ def test_planes_give_what_their_definition_says_with_the_same_gradients(time: fl
 
 def test_regularisation_by_hand() -> None:
     """A ramp bends nowhere; a kink of 1 in one row of the planes of space and of time counts by its weight."""
-    planes = HexPlane((), channels=1, resolution=4, levels=1, moments=5)
+    planes = HexPlane((), HexPlaneSettings(channels=1, resolution=4, levels=1, moments=5))
     canonical = random_canonical(torch.Generator().manual_seed(0))
     with torch.no_grad():
         planes.space[0].copy_(torch.arange(4.0)[:, None].expand(3, 1, 4, 4))
         planes.time[0].fill_(1.0)
-        assert float(planes.regularisation(canonical)) == pytest.approx(0.0, abs=1e-12)
+        assert float(planes.regularisation(canonical, None, 1)) == pytest.approx(0.0, abs=1e-12)
         planes.space[0][0, 0, 3] += 1  # one second difference of 1 among the two of each column of one plane
-        assert float(planes.regularisation(canonical)) == pytest.approx(1e-4 / 2)
+        assert float(planes.regularisation(canonical, None, 1)) == pytest.approx(1e-4 / 2)
         planes.time[0][1, 0, 4] = 2  # one of three in every column, and one fifth of that plane's numbers 1 away from 1
-        assert float(planes.regularisation(canonical)) == pytest.approx(1e-4 / 2 + 1e-2 / 3 + 1e-4 / 5)
+        assert float(planes.regularisation(canonical, None, 1)) == pytest.approx(1e-4 / 2 + 1e-2 / 3 + 1e-4 / 5)

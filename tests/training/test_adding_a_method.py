@@ -22,6 +22,7 @@ from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.scene import deformations, methods
 from neeco.scene.io import load_scene
+from neeco.settings import plain
 from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
@@ -48,11 +49,16 @@ def test_it_trains_and_comes_back_from_disk_as_it_was(tmp_path: Path) -> None:
     first, again = (train(capture, tmp_path / name, config) / "scene.safetensors" for name in ("run", "again"))
     scene, same = load_scene(first), load_scene(again)
     assert scene.method == "breathing"
-    assert scene.deformation.config() == {"period": 3.0}
+    assert plain(scene.settings) == {"period": 3.0, "steadiness": 1e-4}
     for name, parameter in scene.deformation.named_parameters():
-        start = {"waves": 0.0, "log_period": math.log(3)}.get(name)
+        start = {"waves": 0.0, "log_period": math.log(3)}[name]
         assert torch.equal(parameter, same.deformation.get_parameter(name)), name
-        assert start is None or bool((parameter != start).all()), name
+        assert bool((parameter != start).all()), name
+    share = scene.canonical.extras["breathing_share"]
+    assert torch.equal(share, same.canonical.extras["breathing_share"])
+    distance = (scene.canonical.means - scene.canonical.means.mean(0)).norm(dim=1)
+    assert float(torch.corrcoef(torch.stack([share, distance]))[0, 1]) < -0.8  # as `begin` had it
+    assert scene.diagnostics["breathing_period_s"] == pytest.approx(float(scene.deformation.log_period.exp()), abs=1e-3)
     state, camera = scene.recorded.states[3], scene.recorded.cameras[3]
     with torch.no_grad():
         drawn = rasterize(scene.at(state), camera).color
@@ -66,6 +72,21 @@ def test_its_setting_is_checked_and_other_fields_are_refused() -> None:
         training_config("breathing", {}, ["deformation.perod=3"])
     with pytest.raises(NeecoError, match=r"deformation.period: 'slow' is not a number"):
         training_config("breathing", {}, ["deformation.period=slow"])
+    with pytest.raises(NeecoError, match=r"deformation.period: -1 s is no time to breathe"):
+        training_config("breathing", {}, ["deformation.period=-1"])
+
+
+def test_its_share_is_learned_and_its_end_is_told(tmp_path: Path) -> None:
+    told: list[str] = []
+    capture = write_capture(tmp_path / "capture", instruments=False)
+    config = training_config("breathing", {"iterations": 12}, ["deformation.steadiness=1.0e4", "density_start=100"])
+    run = train(capture, tmp_path / "run", config, progress=lambda row: told.append(row.note))
+    scene = load_scene(run / "scene.safetensors")
+    assert told[-1] == f"breathing: one breath takes {float(scene.deformation.log_period.exp()):.2f} s"
+    distance = (scene.canonical.means - scene.canonical.means.mean(0)).norm(dim=1)
+    began = 2 - 3 * distance / scene.deformation.size
+    fallen = began - scene.canonical.extras["breathing_share"]
+    assert float(fallen.median()) == pytest.approx(12 * 2e-2, rel=0.1)  # Adam's rate, every step
 
 
 def test_it_beats_a_still_scene_where_tissue_breathes(tmp_path: Path) -> None:

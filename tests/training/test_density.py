@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
+from neeco.raster.adam import Adam
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
-from neeco.training.optimizer import Adam
+from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 
 
 def two_bodies(size: float) -> CanonicalGaussians:
@@ -24,15 +24,15 @@ def two_bodies(size: float) -> CanonicalGaussians:
 
 def steep(canonical: CanonicalGaussians, *rows: int) -> GradientStatistics:
     """Only `rows` have a gradient, the first the strongest."""
-    statistics = GradientStatistics(len(canonical))
+    statistics = GradientStatistics(len(canonical), torch.device("cpu"))
     for rank, row in enumerate(rows):
         statistics.total[row], statistics.seen[row] = 10.0 - 0.1 * rank, 1
     return statistics
 
 
 def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None):
-    budgets = [Budget(count, 1.0) for count in most]
-    return control_density(canonical, adam or Adam(), statistics, budgets, threshold, torch.Generator().manual_seed(0))
+    limits = [BodyLimit(count, 1.0) for count in most]
+    return control_density(canonical, adam or Adam(), statistics, limits, threshold, torch.Generator().manual_seed(0))
 
 
 def test_a_small_gaussian_is_cloned_where_it_is() -> None:

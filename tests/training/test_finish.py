@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,18 +13,20 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.deformations._hinges import PART_LOGITS, Hinges
+from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
-from neeco.scene.scene import Recording, Scene
+from neeco.scene.recording import Recording
+from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
-from neeco.training.finish import finish_instruments, place_wrists
-from neeco.training.instruments.discovery import new_session
 from neeco.training.instruments.extend import extend_shaft, shaft_coverage
-from neeco.training.session import Session
+from neeco.training.instruments.finish import conclude
+from neeco.training.instruments.wrist import place_wrists
+from neeco.training.session import GaussianSession, new_session
+from neeco.training.views import TrainingViews
 
 
 @pytest.fixture
-def session(tmp_path: Path) -> Session:
+def session(tmp_path: Path) -> GaussianSession:
     """The grasper's capture with the scene that it was drawn from: nothing is left to learn."""
     capture = read_capture(write_grasper(tmp_path / "capture", frames=18))
     frames = capture.split("train")
@@ -40,28 +43,27 @@ def session(tmp_path: Path) -> Session:
     )
     states, cameras = tuple(f.state for f in frames), tuple(f.camera for f in frames)
     recorded = Recording(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
-    deformation = make_deformation("kinematic", capture.instruments, {})
+    deformation = make_deformation("kinematic", capture.instruments)
     scene = Scene("kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
-    hinges = deformation.hinged.hinges_of(0)
+    hinges = deformation.hinges_of(0)
     with torch.no_grad():
         hinges.hinge_depth.fill_(PIVOT_MM)
         hinges.wrist_start.fill_(-20.0)
-    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
-    session = new_session(scene, frames, images, [None] * len(frames), TrainConfig(method="kinematic"))
+    session = new_session(scene, TrainingViews.read(frames), TrainConfig(method="kinematic"), print)
     scene.requires_grad_(False)
     return session
 
 
-def hinges_of(session: Session) -> Hinges:
-    return session.scene.deformation.hinged.hinges_of(0)
+def hinges_of(session: GaussianSession) -> Hinges:
+    return session.scene.deformation.hinges_of(0)
 
 
-def verdict(session: Session) -> dict:
-    finish_instruments(session, print)
+def verdict(session: GaussianSession) -> dict:
+    conclude(session, session.scene.deformation)
     return session.scene.diagnostics["joints"]["grasper.jaw_angle"]
 
 
-def test_a_true_hinge_is_found(session: Session) -> None:
+def test_a_true_hinge_is_found(session: GaussianSession) -> None:
     told = verdict(session)
     assert told["found"] is True
     assert told["explained"] > 0.8
@@ -71,7 +73,7 @@ def test_a_true_hinge_is_found(session: Session) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["across", "still"])
-def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: Session) -> None:
+def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: GaussianSession) -> None:
     with torch.no_grad():
         if wrong == "across":
             hinges_of(session).hinge_angle.fill_(math.pi / 2)
@@ -82,38 +84,40 @@ def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: Session) ->
     assert "NOT found" in told["verdict"]
 
 
-def test_an_instrument_of_which_nothing_was_learned_is_told_of(session: Session) -> None:
+def test_an_instrument_of_which_nothing_was_learned_is_told_of(session: GaussianSession) -> None:
     told: list[str] = []
-    finish_instruments(session, told.append)
+    session.report = told.append
+    conclude(session, session.scene.deformation)
     assert told == []
     body = session.scene.canonical.body(1)
     assert session.scene.diagnostics["instruments"]["grasper"]["solid_gaussians"] == body.stop - body.start
     canonical = session.scene.canonical.map(lambda tensor: tensor.detach().clone())
     canonical.opacity_logits[canonical.body(1)] = -5.0
     session.scene.canonical = canonical
-    finish_instruments(session, told.append)
+    conclude(session, session.scene.deformation)
     assert len(told) == 1
     assert told[0].startswith("warning: grasper: hardly anything was learned of it (0 solid Gaussians)")
 
 
-def test_masked_pixels_do_not_judge_a_hinge(session: Session) -> None:
+def test_masked_pixels_do_not_judge_a_hinge(session: GaussianSession) -> None:
     before = verdict(session)["explained"]
-    for image in session.images:
+    for image in session.views.images:
         image[:, :40] = 255  # a text overlay, say
     spoilt = verdict(session)["explained"]
-    session.masks = [torch.arange(80).expand(64, 80) >= 40 for _ in session.images]
+    masks = tuple(torch.arange(80).expand(64, 80) >= 40 for _ in session.views.images)
+    session.views = replace(session.views, masks=masks)
     assert verdict(session)["explained"] > 0.7 > spoilt
     assert before > 0.7
 
 
-def test_the_wrist_begins_where_the_colour_changes(session: Session) -> None:
-    place_wrists(session)
+def test_the_wrist_begins_where_the_colour_changes(session: GaussianSession) -> None:
+    place_wrists(session, session.scene.deformation)
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
-    finish_instruments(session, print)
+    conclude(session, session.scene.deformation)
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
 
 
-def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_round(session: Session) -> None:
+def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_round(session: GaussianSession) -> None:
     """From -10 mm on the shaft becomes a flat blade, which shows when it is spun."""
     canonical = session.scene.canonical.map(lambda tensor: tensor.detach().clone())
     rows = canonical.body(1)
@@ -122,16 +126,17 @@ def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_r
     flat[rows] = canonical.means[rows][:, 2] > -10
     canonical.means[flat] *= torch.tensor([3.0, 0.05, 1.0])
     session.scene.canonical = canonical
-    session.images = [
+    images = tuple(
         (rasterize(session.scene.at(frame.state), frame.camera).color * 255).round().to(torch.uint8)
-        for frame in session.frames
-    ]
-    place_wrists(session)
+        for frame in session.views.frames
+    )
+    session.views = replace(session.views, images=images)
+    place_wrists(session, session.scene.deformation)
     assert float(hinges_of(session).wrist_start) == pytest.approx(-10, abs=4)
 
 
-def test_the_extent_is_where_the_solid_is(session: Session) -> None:
-    finish_instruments(session, print)
+def test_the_extent_is_where_the_solid_is(session: GaussianSession) -> None:
+    conclude(session, session.scene.deformation)
     rear, tip = hinges_of(session).extent.tolist()
     assert rear == pytest.approx(-30, abs=3)
     assert tip == pytest.approx(20, abs=3)
@@ -153,7 +158,7 @@ def shaft_of(length: float) -> tuple[CanonicalGaussians, Hinges]:
     return canonical, hinges
 
 
-def recorded_at(session: Session, shift_mm: float) -> Recording:
+def recorded_at(session: GaussianSession, shift_mm: float) -> Recording:
     """The session's recording with each camera looking across the shaft, whose rear leaves the image at `shift_mm`."""
     from neeco.capture.model import Camera, InstrumentState, State
 
@@ -166,13 +171,13 @@ def recorded_at(session: Session, shift_mm: float) -> Recording:
     return Recording(("a",) * 4, ("train",) * 4, (state,) * 4, (camera,) * 4)
 
 
-def test_coverage_counts_the_frames_that_hold_a_place(session: Session) -> None:
+def test_coverage_counts_the_frames_that_hold_a_place(session: GaussianSession) -> None:
     _, hinges = shaft_of(40)
     seen = shaft_coverage(torch.tensor([-30.0, -21.0, -19.0, 0.0]), "tool", hinges, recorded_at(session, -20.0))
     assert seen.tolist() == [0, 0, 1, 1]
 
 
-def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(session: Session) -> None:
+def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(session: GaussianSession) -> None:
     canonical, hinges = shaft_of(40)
     longer = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -20.0), 60.0)
     assert longer.counts[0] == longer.counts[2] == 10
@@ -185,7 +190,7 @@ def test_a_shaft_cut_by_the_image_is_prolonged_by_copies_of_what_was_seen(sessio
     assert float(gaps.max()) < 1.01  # and without a gap
 
 
-def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: Session) -> None:
+def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: GaussianSession) -> None:
     canonical, hinges = shaft_of(40)
     same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -60.0), 60.0)
     assert same is canonical

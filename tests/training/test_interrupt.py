@@ -16,11 +16,10 @@ from pathlib import Path
 import pytest
 
 from neeco.cli import main
-from neeco.training import session as session_module
 from neeco.training import train as module
 from neeco.training.interrupt import hearing_stops
 from neeco.training.options import training_config
-from neeco.training.session import Session
+from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, train
 
 PROGRAM = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())"]
@@ -72,7 +71,7 @@ def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(
         lines = (folder / "metrics.jsonl").read_text().splitlines()
         return [{key: value for key, value in json.loads(line).items() if key != "seconds"} for line in lines]
 
-    def stop_within_the_row(session: Session) -> None:
+    def stop_within_the_row(session: GaussianSession) -> None:
         if session.iteration == 17:
             os.kill(os.getpid(), signal.SIGINT)
 
@@ -97,7 +96,7 @@ def test_ctrl_c_while_finishing_loses_no_step(capture: Path, tmp_path: Path, mon
 
     whole = train(capture, tmp_path / "whole", CONFIG)
     with monkeypatch.context() as patched:
-        patched.setattr(session_module, "finish_gaussians", interrupted)
+        patched.setattr(GaussianSession, "finish", interrupted)
         with pytest.raises(KeyboardInterrupt, match="while finishing; go on with"):
             train(capture, tmp_path / "cut", CONFIG)
     steps: list[int] = []
@@ -112,7 +111,7 @@ def test_ctrl_c_before_the_first_step_leaves_nothing(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "begin_session", interrupted)
+    monkeypatch.setattr(module, "gaussian_session", interrupted)
     assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
     assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
     assert not (tmp_path / "runs").exists()

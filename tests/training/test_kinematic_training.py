@@ -23,10 +23,17 @@ from neeco.training.instruments.evidence import gather_evidence
 from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
+from neeco.training.views import TrainingViews
 
 SIZES = ((80, 64), (64, 72))
 # everything that a long run does happens within 40 iterations
-EARLY = ["density_start=10", "refine.start=8", "refine.cameras=true", "refine.registration=true", "shaft_roll_start=5"]
+EARLY = [
+    "density_start=10",
+    "refine.start=8",
+    "refine.cameras=true",
+    "refine.registration=true",
+    "deformation.shaft_roll_start=5",
+]
 CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
 
 
@@ -67,14 +74,16 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
 
 def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) -> None:
     frames = read_capture(capture).split("train")
-    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
+    views = TrainingViews.read(frames)
     plain = training_config("3dgs", {"iterations": 1})
-    scene = initial_scene(read_capture(capture), frames, images, [None] * len(frames), plain, print)
-    together = gather_evidence(scene, frames, images, [None] * len(frames))
+    scene = initial_scene(read_capture(capture), frames, plain, print)
+    together = gather_evidence(scene, views)
     assert together.hits.shape == (len(frames), 72, 80)
     points = torch.tensor([[0.0, 0.0, 60.0], [38.0, 0.0, 80.0], [0.0, 42.0, 80.0], [10.0, -20.0, 70.0]])
     for index in range(4):
-        alone = gather_evidence(scene, frames[index : index + 1], images[index : index + 1], [None])
+        alone = gather_evidence(
+            scene, TrainingViews(frames[index : index + 1], views.images[index : index + 1], (None,))
+        )
         expected = alone.look_up_camera(points[None])
         found = together.subset(torch.tensor([index])).look_up_camera(points[None])
         assert torch.equal(found[1], expected[1])

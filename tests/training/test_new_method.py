@@ -21,40 +21,48 @@ from neeco.training.options import training_config
 from neeco.training.train import train
 
 FILE = '''
+from dataclasses import dataclass
+
 import torch
 from torch import nn
 
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
 
 
+@dataclass(frozen=True)
+class DriftSettings:
+    """`reach`: mm per unit of the learned direction."""
+
+    reach: float = 1.0
+
+
 class Drift(Deformation):
     """Everything moves with time along one learned direction [3] mm."""
 
     method = "drift"
+    Settings = DriftSettings
     training_defaults = {"schedule.frame_order": "off", "ssim_weight": 0.05}
     needs_instruments = True
     label_names = (("grasper", "instrument"),)
 
-    def __init__(self, instruments, reach: float = 1.0) -> None:
-        super().__init__()
-        self.reach = reach
+    def __init__(self, instruments, settings=None) -> None:
+        super().__init__(instruments, settings)
         self.direction = nn.Parameter(torch.zeros(3))
         self.register_buffer("duration", torch.ones(()))
-
-    def config(self):
-        return {"reach": self.reach}
 
     def fit_ranges(self, states, means):
         self.duration.fill_(max(state.time for state in states))
 
-    def finished(self, canonical, states):
-        return canonical.with_extras(moved=torch.full((len(canonical),), float(len(states))))
+    def finish(self, training):
+        scene = training.scene
+        moved = torch.full((len(scene.canonical),), float(len(scene.recorded.states)))
+        scene.canonical = scene.canonical.with_extras(moved=moved)
 
     def pose(self, canonical, state, perturbation=UNPERTURBED):
-        shift = self.direction * self.reach * (state.time / float(self.duration))
+        shift = self.direction * self.settings.reach * (state.time / float(self.duration))
         return Posed(canonical.means + shift, canonical.quats, canonical.log_scales.exp())
 
-    def regularisation(self, canonical):
+    def regularisation(self, canonical, rendering, iteration):
         return self.WEIGHT * (self.direction - 1).abs().sum()
 
     WEIGHT = 0.0
@@ -77,7 +85,7 @@ def drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_methods_are_found_in_their_files_the_default_one_first() -> None:
-    assert list(methods.METHODS) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco"]
+    assert list(methods.METHODS) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco", "nerfies"]
 
 
 def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:
@@ -104,10 +112,10 @@ def test_a_new_method_trains_is_finished_and_comes_back_from_disk(drift: Any, tm
     run = train(write_capture(tmp_path / "capture"), tmp_path / "run", config)
     scene = load_scene(run / "scene.safetensors")
     assert isinstance(scene.deformation, drift)
-    assert scene.deformation.reach == 3
+    assert scene.settings.reach == 3
     assert float(scene.deformation.duration) == pytest.approx(0.28)  # fit_ranges was asked
     assert bool((scene.deformation.direction != 0).all())  # it was learned
-    assert bool((scene.canonical.extras["moved"] == 8).all())  # finished was asked, with every recorded state
+    assert bool((scene.canonical.extras["moved"] == 8).all())  # finish was asked, with every recorded state
 
 
 def test_a_new_method_that_needs_instruments_says_so(tmp_path: Path) -> None:
@@ -128,22 +136,37 @@ def test_extras_with_a_rate_are_learned_and_others_hold_still(
     class Shared(drift):
         extra_rates: ClassVar[Mapping[str, float]] = {"share": 1e-2}
 
+        def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
+            ones = torch.ones(len(canonical))
+            return {"share": 0 * ones, "still": ones}
+
         def pose(self, canonical, state, perturbation=None) -> Posed:
             posed = super().pose(canonical, state)
             extent = canonical.extras["share"] * canonical.extras["still"]
             return Posed(canonical.means + extent[:, None], posed.quats, posed.scales)
 
-    import neeco.training.initial as initial
-
-    real = initial.seed_gaussians
-
-    def seeded(positions: Tensor, *rest: Any) -> CanonicalGaussians:
-        ones = torch.ones(len(positions))
-        return real(positions, *rest).with_extras(share=0 * ones, still=ones)
-
     monkeypatch.setitem(methods.METHODS, "drift", Shared)
-    monkeypatch.setattr(initial, "seed_gaussians", seeded)
     run = train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 12}))
     extras = load_scene(run / "scene.safetensors").canonical.extras
     assert bool((extras["share"] != 0).any())
     assert bool((extras["still"] == 1).all())
+
+
+def test_hooks_are_called_in_their_order(drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[str] = []
+    hooks = ("fit_ranges", "initial_extras", "begin", "disturbed", "training_channels", "regularisation")
+    for name in (*hooks, "between_steps", "finish"):
+        monkeypatch.setattr(drift, name, noting(called, name, getattr(drift, name)))
+    train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 2}))
+    step = ["training_channels", "disturbed", "regularisation", "between_steps"]
+    assert called == ["fit_ranges", "initial_extras", "begin", *step, *step, "finish"]
+
+
+def noting(called: list[str], name: str, real: Any) -> Any:
+    """`real`, which notes its name when it is called."""
+
+    def hook(*args: Any) -> Any:
+        called.append(name)
+        return real(*args)
+
+    return hook

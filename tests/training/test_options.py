@@ -9,10 +9,10 @@ import yaml
 
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
-from neeco.scene.methods import METHODS, make_deformation
-from neeco.training.config import method_defaults
+from neeco.scene.methods import METHODS, method_settings
+from neeco.training.config import config_from_dict, config_to_dict, method_defaults
 from neeco.training.options import schedule_parts, training_config, variant_config
-from neeco.training.run import config_from_dict, config_to_dict, read_config, write_config
+from neeco.training.run import stored_config, write_config
 
 ROD = (Instrument("rod"),)
 
@@ -23,7 +23,7 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
     assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
     write_config(tmp_path, tmp_path / "capture", config)
-    assert config_from_dict(read_config(tmp_path)) == config
+    assert stored_config(tmp_path) == config
     assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
 
@@ -35,7 +35,7 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
         ("sim_weight=0.2", "unknown field 'sim_weight'"),
         ("schedule.speed=2", "unknown field 'schedule.speed'"),
         ("ssim_weight=much", "is not a number"),
-        ("refine.cameras=3", "does not fit"),
+        ("refine.cameras=3", "is not true or false"),
         ("refine=3", "is a group of fields; give one of registration"),
         ("ssim_weight=[1", "is not a value"),
         ("ssim_weight=.nan", "is not a finite number"),
@@ -67,18 +67,23 @@ def test_a_field_of_a_deformation_is_refused_by_name_when_it_does_not_fit(
     field: str, value: object, named: str
 ) -> None:
     with pytest.raises(NeecoError, match=f"deformation.{field}: .*{named}"):
-        make_deformation("neeco", (), {field: value})
+        method_settings("neeco", {field: value})
 
 
 def test_numbers_of_a_deformation_may_be_whole_and_absent_ones_none() -> None:
-    assert make_deformation("neeco", ROD, {"gate_mm": 20, "depth": 2}).config()["gate_mm"] == 20
-    drafts = make_deformation("neeco", ROD, {"gate_mm": None, "state": "rotation_jaw"})
-    assert drafts.config()["state"] == "rotation_jaw"
+    assert method_settings("neeco", {"gate_mm": 20, "depth": 2}).gate_mm == 20
+    drafts = method_settings("neeco", {"gate_mm": None, "state": "rotation_jaw"})
+    assert drafts.state == "rotation_jaw"
+
+
+@pytest.mark.parametrize("text", ["0.0001", "1e-4", "1.0e-4", "+1E-4"])
+def test_a_number_may_be_written_with_an_exponent(text: str) -> None:
+    assert training_config("3dgs", {}, [f"ssim_weight={text}"]).ssim_weight == 1e-4
 
 
 @pytest.mark.parametrize("steps", ["0", "many", "2.5", "true"])
 def test_a_schedule_is_stated_for_a_whole_number_of_steps(steps: str) -> None:
-    with pytest.raises(NeecoError, match=r"published_steps: .* is not a positive whole number"):
+    with pytest.raises(NeecoError, match=r"published_steps: .* is not a (positive )?whole number"):
         training_config("neeco", {}, [f"schedule.published_steps={steps}"])
 
 

@@ -11,6 +11,7 @@ from neeco.raster.types import Camera
 from neeco.training.config import RefineConfig
 from neeco.training.refinement import Refinement
 
+CPU = torch.device("cpu")
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 32.0, 24.0, 64, 48)
 
 
@@ -25,7 +26,7 @@ def sliding_frames() -> tuple[Frame, ...]:
 
 
 def test_the_mean_correction_is_taken_out_of_the_frames_seen() -> None:
-    refinement = Refinement(RefineConfig(frame_poses=True), sliding_frames(), ("rod",))
+    refinement = Refinement(RefineConfig(frame_poses=True), sliding_frames(), ("rod",), CPU)
     refinement.poses += torch.arange(6.0)[:, None, None]
     refinement.frame_steps[:4] = 1
     refinement.center()
@@ -35,7 +36,7 @@ def test_the_mean_correction_is_taken_out_of_the_frames_seen() -> None:
 
 def test_a_positive_latency_takes_the_pose_of_later() -> None:
     frames = sliding_frames()
-    refinement = Refinement(RefineConfig(latency=True, start=0), frames, ("rod",))
+    refinement = Refinement(RefineConfig(latency=True, start=0), frames, ("rod",), CPU)
     refinement.latency.fill_(0.04)
     state, _, _ = refinement.apply(2, frames[2].state, CAMERA, 1)
     later = frames[3].state.instruments["rod"].pose.float()
@@ -44,7 +45,7 @@ def test_a_positive_latency_takes_the_pose_of_later() -> None:
 
 def test_nothing_is_corrected_before_its_time() -> None:
     frames = sliding_frames()
-    refinement = Refinement(RefineConfig(latency=True, frame_poses=True, start=400), frames, ("rod",))
+    refinement = Refinement(RefineConfig(latency=True, frame_poses=True, start=400), frames, ("rod",), CPU)
     refinement.poses += 1
     assert refinement.apply(2, frames[2].state, CAMERA, 399)[0] is frames[2].state
     assert refinement.apply(2, frames[2].state, CAMERA, 400)[0] is not frames[2].state

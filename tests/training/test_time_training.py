@@ -76,7 +76,9 @@ def test_training_disturbs_the_time_until_half_of_the_run_and_drawing_never_does
     real = TimeMLP.pose
 
     def pose(self, canonical, state, perturbation=UNPERTURBED):
-        asked.append((torch.is_grad_enabled() and canonical.means.requires_grad, perturbation.time_noise))
+        asked.append(
+            (torch.is_grad_enabled() and canonical.means.requires_grad, getattr(perturbation, "time_noise", 0.0))
+        )
         return real(self, canonical, state, perturbation)
 
     monkeypatch.setattr(TimeMLP, "pose", pose)
@@ -93,9 +95,9 @@ def test_planes_are_regularised_from_the_moment_they_wake(tmp_path: Path, monkey
     asked: list[bool] = []
     real = HexPlane.regularisation
 
-    def regularisation(self, canonical):
+    def regularisation(self, canonical, rendering, iteration):
         asked.append(self.resting)
-        return real(self, canonical)
+        return real(self, canonical, rendering, iteration)
 
     monkeypatch.setattr(HexPlane, "regularisation", regularisation)
     config = training_config("4dgs", {"iterations": 34}, SMALL["4dgs"])

@@ -64,7 +64,7 @@ def test_watching_a_run_neither_changes_it_nor_costs_it_time(capture: Path, tmp_
 
     def watch(session) -> None:
         seen.append(session.iteration)
-        session.scene.at(session.frames[0].state)
+        session.scene.at(session.views.frames[0].state)
         for _ in range(1000):
             next(times)
 
@@ -82,7 +82,7 @@ def test_a_network_rests_while_the_scene_takes_shape(share: float, capture: Path
     moved: dict[int, float] = {}
 
     def watch(session) -> None:
-        deltas = session.scene.deltas(session.frames[0].state)
+        deltas = session.scene.deltas(session.views.frames[0].state)
         moved[session.iteration] = float(deltas.means.detach().abs().max())
 
     small = ["deformation.width=16", "deformation.depth=2", f"deformation.warm_up={share}"]

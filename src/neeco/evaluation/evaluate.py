@@ -23,7 +23,7 @@ from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.composited import LABEL_THRESHOLD
 from neeco.raster.types import Camera
-from neeco.scene.drawable import gaussian_scene
+from neeco.scene.scene import gaussian_scene
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable

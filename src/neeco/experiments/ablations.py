@@ -230,7 +230,9 @@ OURS = (
         "What does spinning the shaft about its axis while training bring?",
         (
             Comparison(
-                "shaft roll", "on", (Entry("off", _kinematic("no-shaft-roll", "shaft_roll=0")), Entry("on", KINEMATIC))
+                "shaft roll",
+                "on",
+                (Entry("off", _kinematic("no-shaft-roll", "deformation.shaft_roll=0")), Entry("on", KINEMATIC)),
             ),
         ),
     ),

@@ -15,9 +15,9 @@ from neeco.evaluation.lpips import find_lpips
 from neeco.experiments.memory import reset_peak_memory
 from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
 from neeco.files import read_json, write_json, write_text
-from neeco.scene.methods import is_field
+from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
-from neeco.training.run import config_from_dict, load_run, read_config
+from neeco.training.run import load_run, read_config, stored_config
 from neeco.training.train import ProgressRow, train
 
 JOB_SCHEMA = "neeco-job/1"
@@ -183,9 +183,9 @@ def check_folder(job: Job) -> None:
         for key in (key for key in identity if values[key] != identity[key]):
             raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
     try:
-        old, new = vars(config_from_dict(stored)), vars(job.train_config)
+        old, new = vars(stored_config(folder)), vars(job.train_config)
     except NeecoError as error:  # of another version
-        raise NeecoError(f"{folder / error.args[0].removesuffix('; train again')}; {differs}") from None
+        raise NeecoError(f"{str(error).removesuffix('; train again')}; {differs}") from None
     for field in (name for name in new if old[name] != new[name]):
         raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 
@@ -194,7 +194,7 @@ def _train(job: Job, splits: tuple[str, ...], report: JobProgress) -> dict[str, 
     """Train or go on training; returns what the run took."""
     reset_peak_memory()
     capture = read_capture(job.capture, job.config.transforms)
-    held_out = HeldOut(capture, splits, field=is_field(job.config.method))
+    held_out = HeldOut(capture, splits, field=not method_class(job.config.method).has_gaussians)
     watcher = Watcher(job.folder, held_out, job.budget.clock, job.identity())
 
     def tell(row: ProgressRow) -> None:

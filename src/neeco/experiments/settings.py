@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
+import dataclasses
 from collections.abc import Collection, Sequence
 
 from neeco.errors import NeecoError
@@ -28,4 +28,4 @@ def settings_for(method: str, assignments: Sequence[str]) -> list[str]:
 
 def _takes(method: str, name: str) -> bool:
     group, _, field = name.partition(".")
-    return group != "deformation" or field in list(inspect.signature(method_class(method)).parameters)[1:]
+    return group != "deformation" or field in {own.name for own in dataclasses.fields(method_class(method).Settings)}

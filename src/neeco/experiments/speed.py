@@ -15,7 +15,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.experiments.machine import machine
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.scene.drawable import gaussian_scene
+from neeco.scene.scene import gaussian_scene
 from neeco.training.run import Run
 
 WARM_UP = 3  # draws before any is timed
@@ -47,7 +47,7 @@ def measure_speed(
         (index, backend)
         for backend in backends()
         for index, (_, _, run) in enumerate(runs)
-        if backend == "cpu" or run.scene.num_gaussians is not None  # a field is drawn where it is
+        if backend == "cpu" or run.scene.has_gaussians  # a field is drawn where it is
     ]
     times: dict[tuple[int, str], list[float]] = {case: [] for case in cases}
     for step in range(ROUNDS):

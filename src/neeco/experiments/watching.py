@@ -21,7 +21,7 @@ from neeco.files import read_json, write_json, write_text
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
-    from neeco.training.protocol import TrainingSession
+    from neeco.scene.learning import Session
 
 BEGUN_FILE = "begun.json"
 CURVE_FILE = "curve.jsonl"
@@ -79,7 +79,7 @@ class Watcher:
         self.earlier_peak = self.totals["peak_memory_mb"]
         self.clocks = self._read_clocks()
 
-    def watch(self, session: TrainingSession) -> None:
+    def watch(self, session: Session) -> None:
         """After a step: count its time; at one of the moments also draw the held-out frames, which is not counted."""
         self._count(session.seconds)
         self.totals["iteration"] = session.iteration

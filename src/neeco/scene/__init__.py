@@ -1,7 +1,8 @@
 """The learned model and how it is posed."""
 
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Drawable, gaussian_scene
-from neeco.scene.scene import Recording, Scene
+from neeco.scene.drawable import Drawable
+from neeco.scene.recording import Recording
+from neeco.scene.scene import Scene, gaussian_scene
 
 __all__ = ["CanonicalGaussians", "Drawable", "Recording", "Scene", "gaussian_scene"]

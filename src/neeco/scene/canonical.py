@@ -43,7 +43,9 @@ class CanonicalGaussians:
     @property
     def bodies(self) -> Tensor:
         """[N] int64, the body of each row."""
-        return torch.repeat_interleave(torch.arange(len(self.counts)), torch.tensor(self.counts))
+        device = self.means.device
+        counts = torch.tensor(self.counts, device=device)
+        return torch.repeat_interleave(torch.arange(len(self.counts), device=device), counts, output_size=len(self))
 
     def tensors(self) -> dict[str, Tensor]:
         """Every learned tensor by name; extras as `extras.NAME`."""
@@ -81,11 +83,11 @@ def seed_gaussians(positions: Tensor, colors: Tensor, spacing: Tensor, *, opacit
     count = positions.shape[0]
     return CanonicalGaussians(
         means=positions.float().clone(),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        quats=positions.new_tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float32).repeat(count, 1),
         log_scales=spacing.float().clamp_min(1e-4).log()[:, None].repeat(1, 3),
-        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
+        opacity_logits=positions.new_full((count,), math.log(opacity / (1 - opacity)), dtype=torch.float32),
         sh_dc=((colors.float() - 0.5) / SH_C0)[:, None, :].clone(),
-        sh_rest=torch.zeros(count, SH_COEFFICIENTS - 1, 3),
+        sh_rest=positions.new_zeros(count, SH_COEFFICIENTS - 1, 3, dtype=torch.float32),
         counts=(count,),
     )
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
 
 from neeco.capture.model import Camera, Instrument, State
-from neeco.errors import NeecoError
 from neeco.raster.types import Rendering
-
-if TYPE_CHECKING:
-    from neeco.scene.scene import Recording, Scene
+from neeco.scene.recording import Recording
 
 
 class Drawable(Protocol):
@@ -21,6 +21,7 @@ class Drawable(Protocol):
     instruments: tuple[Instrument, ...]
     recorded: Recording
     diagnostics: dict[str, Any]
+    has_gaussians: bool  # False: nothing to rasterise, pose or label; a drawing takes seconds
 
     @property
     def label_names(self) -> Sequence[tuple[str, str]]:
@@ -40,12 +41,18 @@ class Drawable(Protocol):
         """As many of torch's threads as pay where the scene is drawn."""
 
 
-def gaussian_scene(scene: Drawable, asked_by: str) -> Scene:
-    """`scene` where it is made of Gaussians. Raises NeecoError, in the words of the option or verb `asked_by`, for a
-    field, which has nothing to pose."""
-    if scene.num_gaussians is None:
-        raise NeecoError(
-            f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
-            "such as kinematic"
-        )
-    return cast("Scene", scene)
+class Learned(Drawable, Protocol):
+    """A `Drawable` as training makes it and files hold it: a torch module with its method's settings."""
+
+    @property
+    def settings(self) -> Any:
+        """The method's own."""
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """(tensors, JSON-able fields) that a file needs beside the state of its modules."""
+
+    def named_buffers(self) -> Any: ...
+    def state_dict(self) -> Mapping[str, Tensor]: ...
+    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> Any: ...
+    def requires_grad_(self, requires_grad: bool = True) -> Any: ...
+    def to(self, device: torch.device) -> Any: ...

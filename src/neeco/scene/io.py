@@ -15,23 +15,17 @@ from neeco import __version__
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
-from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
-from neeco.scene.methods import is_field, make_deformation, make_field
-from neeco.scene.nerfies.scene import NerfScene
-from neeco.scene.scene import Recording, Scene
+from neeco.scene.drawable import Learned
+from neeco.scene.method import Stored
+from neeco.scene.methods import method_class, method_settings
+from neeco.scene.recording import Recording
+from neeco.scene.scene import Scene
+from neeco.settings import plain
 
 SCHEMA = "neeco-scene/1"
-CANONICAL_SHAPES = {  # of one Gaussian
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (3,),
-    "opacity_logits": (),
-    "sh_dc": (1, 3),
-    "sh_rest": (SH_COEFFICIENTS - 1, 3),
-}
 
 
-def save_scene(scene: Scene | NerfScene, path: Path) -> None:
+def save_scene(scene: Learned, path: Path) -> None:
     """Write `scene` atomically. The same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
     save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True)}, path)
@@ -49,7 +43,7 @@ def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Pat
     write_atomically(path, write)
 
 
-def load_scene(path: Path) -> Scene | NerfScene:
+def load_scene(path: Path) -> Learned:
     """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
     path = Path(path)
     if not path.is_file():
@@ -70,7 +64,7 @@ def load_scene(path: Path) -> Scene | NerfScene:
         raise NeecoError(f"{path}: damaged scene ({error}); train again") from None
 
 
-def pack_scene(scene: Scene | NerfScene) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """(tensors, JSON-able header) from which `unpack_scene` makes the scene again."""
     recorded = scene.recorded
     tensors = {f"module.{name}": tensor for name, tensor in scene.state_dict().items()}
@@ -102,51 +96,20 @@ def pack_scene(scene: Scene | NerfScene) -> tuple[dict[str, Tensor], dict[str, A
             )
         ],
     }
-    if isinstance(scene, NerfScene):
-        header["deformation"] = scene.settings.config()
-    else:
-        tensors |= {f"canonical.{name}": tensor for name, tensor in scene.canonical.tensors().items()}
-        header["deformation"] = scene.deformation.config()
-        header["counts"] = list(scene.canonical.counts)
-        header["sh_degree"] = scene.sh_degree
-        header["backdrop"] = scene.backdrop
-    return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, header
+    own_tensors, own_fields = scene.pack()
+    tensors |= own_tensors
+    header |= {"deformation": plain(scene.settings)} | own_fields
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, header
 
 
-def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
-    if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
-        raise ValueError(f"{missing[0]} is missing")
-    for name, tensor in tensors.items():
-        found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
-        if found != wanted:
-            raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
-        if not torch.isfinite(tensor).all():
-            raise ValueError(f"{name} contains NaN or infinity")
-    return CanonicalGaussians.from_tensors(tensors, counts)
-
-
-def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Scene | NerfScene:
+def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     """The inverse of `pack_scene`; which kind of scene, the header's method says."""
     instruments, recorded = _recording(tensors, header)
-    module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
-    scene: Scene | NerfScene
-    if is_field(header["method"]):
-        if broken := [name for name, tensor in module.items() if not torch.isfinite(tensor).all()]:
-            raise ValueError(f"{broken[0]} contains NaN or infinity")
-        scene = NerfScene(
-            header["method"], make_field(header["method"], instruments, header["deformation"]), instruments, recorded
-        )
-    else:
-        canonical = _canonical(
-            {name.removeprefix("canonical."): t for name, t in tensors.items() if name.startswith("canonical.")},
-            tuple(header["counts"]),
-        )
-        deformation = make_deformation(header["method"], instruments, header["deformation"])
-        scene = Scene(header["method"], canonical, deformation, instruments, recorded, torch.zeros(3))
-        scene.sh_degree = int(header["sh_degree"])
-        scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
+    method = header["method"]
+    settings = method_settings(method, header["deformation"])
+    scene = method_class(method).load(Stored(settings, instruments, recorded, tensors, header, Scene.load))
     scene.diagnostics = header["diagnostics"]
+    module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
     scene.load_state_dict(module)
     scene.requires_grad_(False)
     return scene

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Headlight, Rendering
-from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
+from neeco.scene.drawable import Drawable
+from neeco.scene.method import Stored
+from neeco.scene.recording import Recording
 from neeco.scene.rotations import rigid_from_vector
 
-
-@dataclass(frozen=True)
-class Recording:
-    """What the scene was learned from: every training frame's name, split, state and camera."""
-
-    names: tuple[str, ...] = ()
-    splits: tuple[str, ...] = ()
-    states: tuple[State, ...] = ()
-    cameras: tuple[Camera, ...] = ()
+CANONICAL_SHAPES = {  # of one Gaussian
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "opacity_logits": (),
+    "sh_dc": (1, 3),
+    "sh_rest": (SH_COEFFICIENTS - 1, 3),
+}
 
 
 class Scene(nn.Module):
@@ -35,6 +38,8 @@ class Scene(nn.Module):
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
     instruments) and `vignette` are the headlight (see `Headlight`). `backdrop` in [0, 1] is the grey behind everything.
     """
+
+    has_gaussians = True
 
     center: Tensor
     registration: Tensor
@@ -62,6 +67,42 @@ class Scene(nn.Module):
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
 
+    @property
+    def settings(self) -> Any:
+        """The method's own."""
+        return self.deformation.settings
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Scene:
+        """What `to` calls: the canonical Gaussians go with the modules."""
+        super()._apply(fn, recurse)
+        self.canonical = self.canonical.map(fn)
+        return self
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """(tensors, JSON-able fields) that `load` makes the scene of, beside the state of its modules."""
+        canonical = self.canonical
+        return {f"canonical.{name}": tensor for name, tensor in canonical.tensors().items()}, {
+            "counts": list(canonical.counts),
+            "sh_degree": self.sh_degree,
+            "backdrop": self.backdrop,
+        }
+
+    @classmethod
+    def load(cls, deformation: Deformation, stored: Stored) -> Scene:
+        """The inverse of `pack`. Raises ValueError or LookupError where what is stored does not fit."""
+        header = stored.header
+        prefix = "canonical."
+        canonical = _canonical(
+            {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
+            tuple(header["counts"]),
+        )
+        scene = cls(
+            header["method"], canonical, deformation, stored.instruments, stored.recorded, canonical.means.new_zeros(3)
+        )
+        scene.sh_degree = int(header["sh_degree"])
+        scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
+        return scene
+
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
         """Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
 
@@ -78,18 +119,21 @@ class Scene(nn.Module):
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
             headlight=Headlight(falloff, self.vignette),
-            backdrop=torch.full((3,), self.backdrop) if self.backdrop else None,
+            backdrop=canonical.means.new_full((3,), self.backdrop) if self.backdrop else None,
         )
 
     def registered(self, state: State) -> State:
         """`state` with the learned tracker-to-world correction applied to its poses."""
-        if not state.instruments or not (self.registration.requires_grad or bool(self.registration.any())):
+        registration = self.registration
+        # a tensor on the device "meta" holds no numbers to ask
+        corrects = registration.requires_grad or registration.is_meta or bool(registration.any())
+        if not state.instruments or not corrects:
             return state
         correction = rigid_from_vector(self.registration[:6])
         scale = self.registration[6].exp()
         moved = {}
         for name, given in state.instruments.items():
-            pose = given.pose.to(correction.dtype)
+            pose = given.pose.to(correction)
             arm = (pose[:3, 3] - self.center) * scale
             rotation = correction[:3, :3] @ pose[:3, :3]
             translation = correction[:3, :3] @ arm + self.center + correction[:3, 3]
@@ -131,3 +175,27 @@ class Scene(nn.Module):
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
         """Named 3D points [3] mm, world frame, per instrument."""
         return self.deformation.keypoints(self.registered(state))
+
+
+def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
+    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
+    if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
+        raise ValueError(f"{missing[0]} is missing")
+    for name, tensor in tensors.items():
+        found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
+        if found != wanted:
+            raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
+        if not torch.isfinite(tensor).all():
+            raise ValueError(f"{name} contains NaN or infinity")
+    return CanonicalGaussians.from_tensors(tensors, counts)
+
+
+def gaussian_scene(scene: Drawable, asked_by: str) -> Scene:
+    """`scene` where it is made of Gaussians. Raises NeecoError, in the words of the option or verb `asked_by`, for a
+    field, which has nothing to pose."""
+    if not scene.has_gaussians:
+        raise NeecoError(
+            f"{asked_by}: method {scene.method} has no Gaussians to pose or label; use a run of another method, "
+            "such as kinematic"
+        )
+    return cast(Scene, scene)

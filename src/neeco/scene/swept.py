@@ -41,14 +41,14 @@ class SweptVolume(nn.Module):
         self.cell.copy_(size / CELLS)
         index = ((points - self.low) / self.cell).long().clamp(0, CELLS - 1)
         holds = np.zeros((CELLS,) * 3, bool)
-        holds[tuple(index.T.numpy())] = True
+        holds[tuple(index.T.cpu().numpy())] = True
         distance = distance_transform_edt(~holds, sampling=self.cell.tolist())
         self.occupied.copy_(torch.from_numpy(distance <= margin))
 
     def contains(self, points: Tensor) -> Tensor:
         """[N] bool for points [N, 3] mm, world frame."""
         if not self.bounded:
-            return torch.ones(len(points), dtype=torch.bool)
+            return torch.ones(len(points), dtype=torch.bool, device=points.device)
         index = ((points - self.low) / self.cell).floor().long()
         inside = ((index >= 0) & (index < CELLS)).all(1)
         x, y, z = index.clamp(0, CELLS - 1).unbind(1)

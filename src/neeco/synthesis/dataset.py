@@ -28,7 +28,7 @@ from neeco.labels.drawing import (
     draw,
     instruments_of,
 )
-from neeco.scene.drawable import gaussian_scene
+from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import Sampler, make_sampler, states_fingerprint

@@ -11,7 +11,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.truth import load_reference
 from neeco.labels.drawing import CompositedLabels, Labeller, ThresholdLabels, draw
-from neeco.scene.drawable import gaussian_scene
+from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.settings import Settings
 from neeco.training.run import load_run
 

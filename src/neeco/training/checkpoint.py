@@ -11,10 +11,10 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.scene.drawable import Learned
 from neeco.scene.io import pack_scene, save_tensors, unpack_scene
-from neeco.scene.nerfies.scene import NerfScene
-from neeco.scene.scene import Scene
-from neeco.training.protocol import StepResult, TrainingSession, members
+from neeco.scene.learning import Session, StepResult
+from neeco.training.session import members
 
 SCHEMA = "neeco-checkpoint/1"
 
@@ -24,7 +24,7 @@ def checkpoint_path(run: Path) -> Path:
     return run / "checkpoint" / "session.safetensors"
 
 
-def save_checkpoint(session: TrainingSession, run: Path) -> None:
+def save_checkpoint(session: Session, run: Path) -> None:
     """Write the session's whole state atomically."""
     of_scene, scene_header = pack_scene(session.scene)
     of_session, fields = session.pack()
@@ -45,7 +45,7 @@ def save_checkpoint(session: TrainingSession, run: Path) -> None:
     )
 
 
-def read_checkpoint(run: Path) -> tuple[Scene | NerfScene, dict[str, Any], dict[str, Tensor]]:
+def read_checkpoint(run: Path) -> tuple[Learned, dict[str, Any], dict[str, Tensor]]:
     """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
     path = checkpoint_path(run)
     try:
@@ -63,7 +63,7 @@ def read_checkpoint(run: Path) -> tuple[Scene | NerfScene, dict[str, Any], dict[
     return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
 
 
-def restore_session(session: TrainingSession, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """Put a fresh session, made around the checkpoint's scene, where the checkpoint was."""
     session.adam.restore(members(tensors, "adam"), header["adam_steps"])
     session.restore(tensors, header)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-from neeco.scene.methods import method_class
+from neeco.errors import NeecoError
+from neeco.scene.methods import DEFAULT, method_class, method_settings
+from neeco.settings import plain, structure, with_fields
 from neeco.training.schedule import ScheduleConfig
 
 
@@ -26,7 +28,7 @@ class RefineConfig:
 class TrainConfig:
     """Settings of one run. Zero or None means: as the method has it."""
 
-    method: str = "kinematic"
+    method: str = DEFAULT
     iterations: int = 6000
     minutes: float | None = None  # stop in time with a finished run
     seed: int = 0
@@ -39,27 +41,41 @@ class TrainConfig:
     refine: RefineConfig = field(default_factory=RefineConfig)
     density_start: int = 500
     density_stop: float = 0.5  # fraction of the run
-    opacity_penalty: float = 0.0  # on the instruments' mean opacity, a tenth of it after iteration 1500
-    label_sharpness: float = 0.0  # weight of l (1 - l) on the drawn instrument label, after iteration 1000
-    shaft_roll: float = 0.0  # probability of spinning the shaft (a surface of revolution) by a random angle
-    shaft_roll_start: int = 600  # iteration
-    deformation: dict[str, Any] = field(default_factory=dict)  # the method's own fields
+    deformation: Any = None  # the method's own settings, an instance of its `Settings`; None: its defaults
     joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
+
+    def __post_init__(self) -> None:
+        if self.deformation is None:
+            object.__setattr__(self, "deformation", method_class(self.method).Settings())
+
+    def done_share(self, iteration: int, seconds: float) -> float:
+        """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
+        done = iteration / self.iterations
+        if self.minutes is not None:
+            done = max(done, seconds / (60 * self.minutes))
+        return min(1.0, done)
 
 
 def method_defaults(method: str) -> TrainConfig:
-    """The config a method starts from: the paper's, changed as its deformation says. Raises NeecoError for an unknown
+    """The config a method starts from: the paper's, changed as the method says. Raises NeecoError for an unknown
     method."""
-    return with_fields(TrainConfig(method=method), method_class(method).training_defaults)
-
-
-def with_fields(config: Any, values: Mapping[str, Any]) -> Any:
-    """The dataclass `config` with fields changed by name; dots reach into nested ones (`refine.latency`)."""
-    for name, value in values.items():
-        field_name, _, rest = name.partition(".")
-        changed = with_fields(getattr(config, field_name), {rest: value}) if rest else value
-        config = replace(config, **{field_name: changed})
+    config: TrainConfig = with_fields(TrainConfig(method=method), method_class(method).training_defaults)
     return config
+
+
+def config_to_dict(config: TrainConfig) -> dict[str, Any]:
+    """Plain dicts, lists and scalars; `config_from_dict` is the inverse."""
+    return plain(config)
+
+
+def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
+    """The TrainConfig that `config_to_dict` wrote. Raises NeecoError naming a field that is unknown or does not fit."""
+    method = values.get("method", DEFAULT)
+    if not isinstance(own := values.get("deformation") or {}, Mapping):
+        raise NeecoError(f"deformation: {own!r} is not a group of fields")
+    settings = method_settings(method, own)
+    config = structure(TrainConfig, {**values, "deformation": None}, owner="the training config")
+    return with_fields(config, {"deformation": settings})
 
 
 def decayed(rate: float, progress: float, final: float = 0.03) -> float:

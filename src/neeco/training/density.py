@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neeco.raster.adam import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.rotations import quat_to_matrix
-from neeco.training.optimizer import Adam
 
 MIN_OPACITY = 0.005
 SPLIT_SHRINK = 1.6
@@ -19,13 +19,13 @@ SPLIT_SHRINK = 1.6
 class GradientStatistics:
     """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images in which it was drawn."""
 
-    def __init__(self, count: int) -> None:
-        self.total = torch.zeros(count)
-        self.seen = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.total = torch.zeros(count, device=device)
+        self.seen = torch.zeros(count, device=device)
 
     def record(self, center_gradients: Tensor, width: int, height: int) -> None:
         """center_gradients [N, 2], d loss / d px."""
-        norm = (center_gradients * torch.tensor([width / 2, height / 2])).norm(dim=1)
+        norm = (center_gradients * center_gradients.new_tensor([width / 2, height / 2])).norm(dim=1)
         self.total += norm
         self.seen += norm > 0
 
@@ -35,12 +35,11 @@ class GradientStatistics:
 
 
 @dataclass(frozen=True)
-class Budget:
+class BodyLimit:
     """How many Gaussians one body may have, and the size (mm) that divides cloning from splitting."""
 
     most: int
     dense_size: float
-    largest: float = math.inf  # mm; greater Gaussians are removed
 
 
 @torch.no_grad()
@@ -48,7 +47,7 @@ def control_density(
     canonical: CanonicalGaussians,
     adam: Adam,
     statistics: GradientStatistics,
-    budgets: list[Budget],
+    limits: list[BodyLimit],
     threshold: float,
     generator: torch.Generator,
 ) -> CanonicalGaussians:
@@ -58,13 +57,12 @@ def control_density(
     """
     gradients, bodies = statistics.mean(), canonical.bodies
     size = canonical.log_scales.max(1).values.exp()
-    dense = torch.tensor([budget.dense_size for budget in budgets])[bodies]
-    largest = torch.tensor([budget.largest for budget in budgets])[bodies]
-    keep = (torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY) & (size < largest)
+    dense = size.new_tensor([limit.dense_size for limit in limits])[bodies]
+    keep = torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY
     grow = keep & (gradients > threshold)
-    for body, budget in enumerate(budgets):
+    for body, limit in enumerate(limits):
         rows = bodies == body
-        room = max(0, budget.most - int((keep & rows).sum()))
+        room = max(0, limit.most - int((keep & rows).sum()))
         wanted = torch.nonzero(grow & rows)[:, 0]
         if len(wanted) > room:
             strongest = gradients[wanted].argsort(descending=True, stable=True)
@@ -72,13 +70,13 @@ def control_density(
     clone, split = grow & (size <= dense), grow & (size > dense)
     kept, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
     index = torch.cat([kept, cloned, halves, halves])
-    fresh = torch.zeros(len(index), dtype=torch.bool)
+    fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
     fresh[len(kept) :] = True
     is_half = torch.zeros_like(fresh)
     is_half[len(kept) + len(cloned) :] = True
     order = bodies[index].argsort(stable=True)  # bodies stay contiguous
     index, fresh, is_half = index[order], fresh[order], is_half[order]
-    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(budgets)))
+    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(limits)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
     _scatter_halves(changed, is_half, generator)
@@ -89,7 +87,7 @@ def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, generator: t
     """Move each half of a split Gaussian to a random place inside its parent and shrink it."""
     rotation = quat_to_matrix(torch.nn.functional.normalize(canonical.quats[is_half], dim=-1))
     scales = canonical.log_scales[is_half].exp()
-    offset = torch.randn(scales.shape, generator=generator) * scales
+    offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales
     canonical.means[is_half] += (rotation @ offset[..., None])[..., 0]
     canonical.log_scales[is_half] -= math.log(SPLIT_SHRINK)
 

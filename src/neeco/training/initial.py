@@ -1,62 +1,59 @@
-"""The scene before the first step, for each method."""
+"""The session before its first step, and the scene it begins with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
-from torch import Tensor
 
 from neeco.capture.images import has_alpha
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State
+from neeco.capture.model import Capture, Frame, Instrument
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
+from neeco.scene.learning import Report
 from neeco.scene.methods import make_deformation
-from neeco.scene.scene import Recording, Scene
+from neeco.scene.recording import Recording
+from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
-from neeco.training.instruments.discovery import find_instruments
-from neeco.training.instruments.gate import close_gate
-from neeco.training.protocol import Report
+from neeco.training.instruments.search import SessionSearch
+from neeco.training.session import GaussianSession, new_session
+from neeco.training.views import TrainingViews
 
 REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
 
 
-def initial_scene(
-    capture: Capture,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
-    report: Report,
-) -> Scene:
-    """Seed Gaussians and deformation of `config.method` from the sparse points and the training frames alone.
+def gaussian_session(
+    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Scene | None = None
+) -> GaussianSession:
+    """A session at iteration 0 of any method that deforms Gaussians, on the device of the views: around `scene`, or
+    around a new one, which the method's hooks have begun."""
+    begins = scene is None
+    if scene is None:
+        scene = initial_scene(capture, views.frames, config, report)
+    session = new_session(scene.to(views.device), views, config, report)
+    session.instruments = SessionSearch(session)
+    if begins:
+        scene.deformation.begin(session)
+    session.start()
+    return session
 
-    images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame. Raises NeecoError when a joint asked for is
-    unknown.
-    """
+
+def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
+    """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
+    alone. Raises NeecoError when a joint asked for is unknown."""
     backdrop = _backdrop(frames)  # first: files may go once training has begun
     instruments = tuple(
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
         for i in capture.instruments
     )
-    recorded = Recording(
-        tuple(frame.name for frame in frames),
-        tuple(frame.split for frame in frames),
-        tuple(_reduced_state(frame.state, instruments) for frame in frames),
-        tuple(frame.camera for frame in frames),
-    )
+    recorded = Recording.of(frames, instruments)
     positions, colors = _thinned_points(capture, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)
+    deformation.fit_ranges(list(recorded.states), tissue.means)
     center = torch.from_numpy(np.median(positions, 0))
+    tissue = tissue.with_extras(**deformation.initial_extras(tissue))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
     scene.backdrop = backdrop
-    deformation.fit_ranges(list(recorded.states), tissue.means)
-    if deformation.gate_volume is not None:
-        close_gate(scene, deformation.gate_volume, frames, images, masks, config, report)
-    if deformation.hinged is not None:
-        find_instruments(scene, deformation.hinged, frames, images, masks, config, report)
     return scene
 
 
@@ -75,15 +72,6 @@ def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, 
         chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
     return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
-
-
-def _reduced_state(state: State, instruments: tuple[Instrument, ...]) -> State:
-    """`state` with only the joints that move parts."""
-    kept = {}
-    for instrument in instruments:
-        given = state.instruments[instrument.name]
-        kept[instrument.name] = InstrumentState(given.pose, {joint: given.joints[joint] for joint in instrument.joints})
-    return State(kept, state.time)
 
 
 def moving_joints(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import math
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,9 +11,9 @@ from typing import Any
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.scene.methods import check_fields, is_field
-from neeco.training.config import TrainConfig, method_defaults, with_fields
-from neeco.training.run import config_from_dict, config_to_dict
+from neeco.scene.methods import method_class
+from neeco.settings import with_fields
+from neeco.training.config import TrainConfig, config_from_dict, config_to_dict, method_defaults
 from neeco.training.schedule import Part, ScheduleConfig
 
 ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
@@ -31,7 +31,7 @@ def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[s
         return training_config(method, values, assignments)
     if not name.endswith(ADJUSTED) or name.count("+") > 1:
         raise NeecoError(f"method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
-    if is_field(method):
+    if not method_class(method).has_gaussians:
         raise NeecoError(
             f"method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
         )
@@ -59,19 +59,15 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
     """`base` changed and checked as `training_config` says."""
     given = {name: value for name, value in values.items() if value is not None}
     config = dataclasses.replace(base, **given)
+    _check_length(config)
     plain = config_to_dict(config)
     for assignment in assignments:
         _assign(plain, assignment)
     try:
         config = config_from_dict(plain)
-        check_fields(config.method, config.deformation)
     except NeecoError as error:
-        told = str(error).removeprefix("config.yaml: ").removesuffix("; train again")
-        raise NeecoError(f"--set: {told}") from None
-    if config.iterations < 1:
-        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
-    if config.minutes is not None and not config.minutes > 0:
-        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+        raise NeecoError(f"--set: {error}") from None
+    _check_length(config)
     _check_published_steps(config)
     if config.initial_points is not None and config.initial_points < 1:
         raise NeecoError(f"--set initial_points: {config.initial_points} is too small; give at least 1")
@@ -81,12 +77,19 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
     return config
 
 
+def _check_length(config: TrainConfig) -> None:
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+
+
 def _check_published_steps(config: TrainConfig) -> None:
     """A schedule scales with the run's length, which has to be known."""
     steps = config.schedule.published_steps
     if steps is None:
         return
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+    if steps < 1:
         raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
     if config.minutes is not None:
         raise NeecoError(
@@ -96,6 +99,7 @@ def _check_published_steps(config: TrainConfig) -> None:
 
 
 def _assign(plain: dict[str, Any], assignment: str) -> None:
+    """Put NAME=VALUE in its place; whether the value fits its type, the types say."""
     name, equals, text = assignment.partition("=")
     if not equals:
         raise NeecoError(f"--set: {assignment!r} is not NAME=VALUE")
@@ -108,20 +112,17 @@ def _assign(plain: dict[str, Any], assignment: str) -> None:
         raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
     if path == [] and last == "method":
         raise NeecoError("--set method: would keep the other method's settings; use --method")
-    if isinstance(target.get(last), str):  # as it stands: YAML takes on and off for truth values
+    old = target.get(last)
+    if isinstance(old, str):  # as it stands: YAML takes on and off for truth values
         target[last] = text
         return
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise NeecoError(f"--set {name}: {text!r} is not a value; quote it as in YAML") from None
-    old = target.get(last)
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):  # 1e-4 is a word to YAML
+            value = float(value)
     if isinstance(old, dict) and not isinstance(value, dict):
         raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise NeecoError(f"--set {name}: {text!r} is not a finite number")
-    if isinstance(old, bool) is not isinstance(value, bool) and old is not None:
-        raise NeecoError(f"--set {name}: {text!r} does not fit a field that holds {old!r}")
-    if isinstance(old, int | float) and not isinstance(value, int | float):
-        raise NeecoError(f"--set {name}: {text!r} is not a number")
     target[last] = value

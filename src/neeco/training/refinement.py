@@ -27,15 +27,20 @@ class Refinement:
     Tensors: `poses` [F, I, 6], `cameras` [F, 6], `latency` [1].
     """
 
-    def __init__(self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> None:
+    def __init__(
+        self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[str, ...], device: torch.device
+    ) -> None:
         self.config = config
         self.instruments = instruments
-        self.poses = torch.zeros(len(frames), len(instruments), 6)
-        self.cameras = torch.zeros(len(frames), 6)
-        self.latency = torch.zeros(1)
-        self.velocities = _velocities(frames, instruments)  # [F, I, 6] per s, body frame
+        self.poses = torch.zeros(len(frames), len(instruments), 6, device=device)
+        self.cameras = torch.zeros(len(frames), 6, device=device)
+        self.latency = torch.zeros(1, device=device)
+        self.velocities = _velocities(frames, instruments).to(device)  # [F, I, 6] per s, body frame
+        self.rates = {"poses": RATES, "cameras": RATES * CAMERA_RATE, "latency": torch.tensor(LATENCY_RATE)}
+        self.rates = {name: rate.to(device) for name, rate in self.rates.items()}
+        self.prior_sigma = PRIOR_SIGMA.to(device)
         self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
-        self.frame_steps = torch.zeros(len(frames))
+        self.frame_steps = torch.zeros(len(frames), device=device)
         self._leaves: dict[str, Tensor] = {}
 
     def _moment_shapes(self) -> dict[str, Tensor]:
@@ -49,24 +54,24 @@ class Refinement:
             return state, camera, None
         penalty = None
         if self.instruments and (self.config.frame_poses or self.config.latency):
-            offset = torch.zeros(len(self.instruments), 6)
+            offset = self.latency.new_zeros(len(self.instruments), 6)
             if self.config.frame_poses:
                 leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
                 offset = offset + leaf
-                penalty = PRIOR_WEIGHT * (leaf / PRIOR_SIGMA).square().mean()
+                penalty = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
                 offset = offset + self.velocities[index] * leaf
             moved = dict(state.instruments)
             for k, name in enumerate(self.instruments):
                 given = state.instruments[name]
-                moved[name] = InstrumentState(given.pose.float() @ rigid_from_vector(offset[k]), given.joints)
+                moved[name] = InstrumentState(given.pose.to(offset) @ rigid_from_vector(offset[k]), given.joints)
             state = replace(state, instruments=moved)
         if self.config.cameras:
             leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
-            corrected = camera.world_from_camera.float() @ rigid_from_vector(leaf)
+            corrected = camera.world_from_camera.to(leaf) @ rigid_from_vector(leaf)
             camera = replace(camera, world_from_camera=corrected)
-            prior = PRIOR_WEIGHT * (leaf / PRIOR_SIGMA).square().mean()
+            prior = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
             penalty = prior if penalty is None else penalty + prior
         return state, camera, penalty
 
@@ -87,8 +92,7 @@ class Refinement:
             first[row] = 0.9 * first[row] + 0.1 * leaf.grad
             second[row] = 0.99 * second[row] + 0.01 * leaf.grad.square()
             update = first[row] / (1 - 0.9**steps) / ((second[row] / (1 - 0.99**steps)).sqrt() + 1e-12)
-            rate = {"poses": RATES, "cameras": RATES * CAMERA_RATE, "latency": torch.tensor(LATENCY_RATE)}[name]
-            getattr(self, name)[row] -= decay * rate * update
+            getattr(self, name)[row] -= decay * self.rates[name] * update
         self._leaves = {}
 
     @torch.no_grad()

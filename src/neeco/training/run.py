@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-import types
-import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,7 @@ from neeco.errors import NeecoError
 from neeco.files import write_text
 from neeco.scene.drawable import Drawable
 from neeco.scene.io import load_scene
-from neeco.training.config import TrainConfig
+from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
 
 SCHEMA = "neeco-run/1"
 
@@ -76,44 +73,11 @@ def write_config(path: Path, capture: Path, config: TrainConfig) -> None:
     write_text(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
 
 
-def config_to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Plain dicts, lists and scalars; `config_from_dict` is the inverse."""
-    plain = _plain(dataclasses.asdict(config))
-    assert isinstance(plain, dict)
-    return plain
-
-
-def config_from_dict(values: dict[str, Any]) -> TrainConfig:
-    """The TrainConfig that `write_config` wrote. Raises NeecoError naming a field it does not know."""
-    known = {key: value for key, value in values.items() if key not in ("schema", "version", "capture")}
+def stored_config(path: Path) -> TrainConfig:
+    """The settings that the run in `path` was started with. Raises NeecoError for a field that is unknown or does not
+    fit."""
+    known = {key: value for key, value in read_config(path).items() if key not in ("schema", "version", "capture")}
     try:
-        config = _build(TrainConfig, known)
-    except (TypeError, ValueError, KeyError) as error:
-        raise NeecoError(f"config.yaml: {error}; train again") from None
-    assert isinstance(config, TrainConfig)
-    return config
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _build(kind: Any, value: Any) -> Any:
-    """`value` from YAML as type `kind`: dataclasses and tuples are rebuilt, the rest stands as it is."""
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        unknown = set(value) - set(hints)
-        if unknown:
-            raise KeyError(f"unknown field {sorted(unknown)[0]}")
-        return kind(**{name: _build(hints[name], item) for name, item in value.items()})
-    if typing.get_origin(kind) in (typing.Union, types.UnionType) and value is not None:
-        return _build(next(arm for arm in typing.get_args(kind) if arm is not type(None)), value)
-    if typing.get_origin(kind) is typing.Literal and value not in typing.get_args(kind):
-        raise ValueError(f"{value!r} is none of {', '.join(map(str, typing.get_args(kind)))}")
-    if typing.get_origin(kind) is tuple and value is not None:
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"{value!r} is not a list; write [{value}]")
-        return tuple(value)
-    return value
+        return config_from_dict(known)
+    except NeecoError as error:
+        raise NeecoError(f"{path / 'config.yaml'}: {error}; train again") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,16 +14,16 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.raster import Rendering, rasterize
+from neeco.raster.adam import Adam
 from neeco.raster.losses import photometric_loss
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation, floored_decay
+from neeco.scene.learning import InstrumentSearch, Report, StepResult
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig, decayed
-from neeco.training.density import Budget, GradientStatistics, control_density, reset_opacity
-from neeco.training.finish import finish_gaussians, place_wrists
-from neeco.training.optimizer import Adam
-from neeco.training.protocol import Report, StepResult, done_share, members
+from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
-from neeco.training.schedule import Schedule
+from neeco.training.schedule import Schedule, order_by_pose
+from neeco.training.views import TrainingViews
 
 POSITION_RATE = 1.6e-4  # times the scene's extent (3DGS)
 GAUSSIAN_RATES = {
@@ -34,20 +35,17 @@ GAUSSIAN_RATES = {
 }
 LIGHT_RATE = 3e-3
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
-WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
 
 
 @dataclass
-class Session:
-    """One training run in memory. `images` [H, W, 3] uint8 and `masks` ([H, W] bool or None), one per training
-    frame."""
+class GaussianSession:
+    """One training run in memory, of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
 
     config: TrainConfig
     scene: Scene
-    frames: tuple[Frame, ...]
-    images: list[Tensor]
-    masks: list[Tensor | None]
+    views: TrainingViews
+    report: Report
     pose_order: np.ndarray
     extent: float  # mm; positions' learning rates and the dense size scale with it
     refinement: Refinement
@@ -56,6 +54,7 @@ class Session:
     adam: Adam = field(default_factory=Adam)
     schedule: Schedule = field(init=False)
     statistics: GradientStatistics = field(init=False)
+    instruments: InstrumentSearch = field(init=False)  # for hooks; a session without hooks to serve has none
     queue: list[int] = field(default_factory=list)
     queue_phase: int = 1
     iteration: int = 0
@@ -64,9 +63,13 @@ class Session:
 
     def __post_init__(self) -> None:
         self.schedule = Schedule(self.config.schedule, self.config.iterations)
-        self.statistics = GradientStatistics(len(self.scene.canonical))
-        self.scene.requires_grad_(True)
-        self.scene.registration.requires_grad_(self.config.refine.registration)
+
+    def start(self) -> None:
+        """Make ready to step, once the canonical Gaussians are there: what is learned a leaf, no gradient counted."""
+        scene = self.scene
+        self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
+        scene.requires_grad_(True)
+        scene.registration.requires_grad_(self.config.refine.registration)
         self.watch_gradients()
 
     def watch_gradients(self) -> None:
@@ -83,7 +86,7 @@ class Session:
     @property
     def progress(self) -> float:
         """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
-        return done_share(self.config, self.iteration, self.seconds)
+        return self.config.done_share(self.iteration, self.seconds)
 
     @property
     def phase(self) -> int:
@@ -100,14 +103,14 @@ class Session:
         self.iteration += 1
         progress = self.progress
         index = self._next_frame()
-        scene, frame = self.scene, self.frames[index]
+        scene, frame, mask = self.scene, self.views.frames[index], self.views.masks[index]
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
         scene.deformation.resting = progress < scene.deformation.warm_up
         state, camera, penalty = self.refinement.apply(index, frame.state, frame.camera, self.iteration)
-        labels = scene.label_channels().sum(1, keepdim=True) if self._sharpens() else None
-        rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=labels)
-        target = self.images[index].float() / 255
-        loss = photometric_loss(rendering.color, target, self.masks[index], ssim_weight=self.config.ssim_weight)
+        channels = scene.deformation.training_channels(scene.canonical, self.iteration)
+        rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=channels)
+        target = self.views.target(index)
+        loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
         if not math.isfinite(float(total.detach())):
             raise NeecoError(
@@ -116,7 +119,7 @@ class Session:
             )
         total.backward()
         self._learn(rendering, index, progress)
-        mse = self._error(rendering.color.detach(), target, self.masks[index])
+        mse = self._error(rendering.color.detach(), target, mask)
         result = StepResult(float(loss.detach()), -10 * math.log10(max(mse, 1e-10)))
         self.schedule.observe(self.iteration, result.loss, result.psnr, progress)
         self._control_density(progress)
@@ -136,38 +139,23 @@ class Session:
 
     def _perturbation(self, progress: float) -> Perturbation:
         noise = self.schedule.state_noise(progress)
-        roll = 0.0
-        if (
-            self.config.shaft_roll > 0
-            and self.iteration > self.config.shaft_roll_start
-            and self.rng.random() < self.config.shaft_roll
-        ):
-            roll = float(self.rng.uniform(-math.pi, math.pi))
-        time_noise = self.scene.deformation.time_noise(progress)
-        return Perturbation(roll, noise, time_noise) if roll or noise or time_noise else UNPERTURBED
+        given = Perturbation(noise) if noise else UNPERTURBED
+        return self.scene.deformation.disturbed(given, self.iteration, progress, self.rng)
 
-    def _sharpens(self) -> bool:
-        return self.config.label_sharpness > 0 and self.iteration > 1000 and bool(self.scene.label_names)
-
-    def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor:
-        """Sparse instruments, sharp labels, small corrections, and what the method adds of its own."""
-        total = torch.zeros(()) if penalty is None else penalty
-        canonical, config = self.scene.canonical, self.config
-        if config.opacity_penalty > 0 and len(canonical.counts) > 1:
-            weight = config.opacity_penalty * (1.0 if self.iteration < 1500 else 0.1)
-            total = total + weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean()
-        if rendering.channels is not None:
-            label = rendering.channels[..., 0]
-            total = total + config.label_sharpness * (label * (1 - label)).mean()
+    def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
+        """Small corrections, and what the method adds of its own."""
         deformation = self.scene.deformation
-        own = None if deformation.resting else deformation.regularisation(canonical)
-        return total if own is None else total + own
+        own = None
+        if not deformation.resting:
+            own = deformation.regularisation(self.scene.canonical, rendering, self.iteration)
+        return sum(term for term in (penalty, own) if term is not None)
 
     def _learn(self, rendering: Rendering, index: int, progress: float) -> None:
         """One optimiser step on everything that has a gradient."""
         gradient = rendering.center_offsets.grad
         assert gradient is not None
-        self.statistics.record(gradient, self.frames[index].camera.width, self.frames[index].camera.height)
+        camera = self.views.frames[index].camera
+        self.statistics.record(gradient, camera.width, camera.height)
         scene, gaussian_rates = self.scene, self.gaussian_rates
         position_rate = POSITION_RATE * self.extent * decayed(1.0, progress)
         for name, tensor in scene.canonical.tensors().items():
@@ -197,7 +185,7 @@ class Session:
             before = registration.detach().clone()
             self.adam.step("registration", registration, 1.0)
             change = registration.detach() - before
-            registration.copy_(before + change * REGISTRATION_RATES * floored_decay(progress))
+            registration.copy_(before + change * REGISTRATION_RATES.to(change) * floored_decay(progress))
 
     def _control_density(self, progress: float) -> None:
         settings, config, scene = self.schedule.density(), self.config, self.scene
@@ -211,24 +199,23 @@ class Session:
                 scene.canonical,
                 self.adam,
                 self.statistics,
-                self._budgets(),
+                self._limits(),
                 settings.threshold if grows else math.inf,
                 self.generator,
             )
-            self.statistics = GradientStatistics(len(scene.canonical))
+            self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
         if settings.opacity_reset and self.iteration % settings.opacity_reset == 0 and progress < config.density_stop:
             reset_opacity(scene.canonical, self.adam)
 
-    def _budgets(self) -> list[Budget]:
+    def _limits(self) -> list[BodyLimit]:
         dense = 0.01 * self.extent
-        tissue = Budget(self.config.tissue_budget, dense)
-        return [tissue] + [Budget(self.config.instrument_budget, dense)] * (len(self.scene.canonical.counts) - 1)
+        instruments = [BodyLimit(self.config.instrument_budget, dense)] * (len(self.scene.canonical.counts) - 1)
+        return [BodyLimit(self.config.tissue_budget, dense), *instruments]
 
     def between_steps(self, before: float) -> None:
-        """Find the wrists once the run has passed its mark."""
-        if before < WRIST_FRACTION <= self.progress:
-            place_wrists(self)
+        """What the method has due."""
+        self.scene.deformation.between_steps(self, before)
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """What a checkpoint needs beside scene, optimiser and random numbers."""
@@ -244,7 +231,7 @@ class Session:
             "queue_phase": self.queue_phase,
         }
 
-    def restore(self, tensors: dict[str, Tensor], fields: dict[str, Any]) -> None:
+    def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
         """The inverse of `pack`."""
         self.refinement.restore(members(tensors, "refinement"))
         self.statistics.total, self.statistics.seen = tensors["statistics/total"], tensors["statistics/seen"]
@@ -252,6 +239,53 @@ class Session:
         self.rng.bit_generator.state = fields["rng"]
         self.queue, self.queue_phase = fields["queue"], fields["queue_phase"]
 
-    def finish(self, report: Report) -> None:
-        """Labels of the paper's method, the shaft's extent, the joints' verdict."""
-        finish_gaussians(self, report)
+    def finish(self) -> None:
+        """Hold everything still, note how it was learned, and let the method find out the rest."""
+        scene = self.scene
+        scene.requires_grad_(False)
+        for tensor in scene.canonical.tensors().values():
+            tensor.requires_grad_(False)
+        scene.diagnostics["iterations"] = self.iteration
+        scene.diagnostics["phase_2_began"] = self.schedule.phase_started
+        scene.diagnostics["phase_2_forced"] = self.schedule.forced
+        scene.deformation.finish(self)
+
+
+def new_session(
+    scene: Scene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
+) -> GaussianSession:
+    """A session at iteration 0, on the device of the views; `start` it before the first step."""
+    names = tuple(instrument.name for instrument in scene.instruments)
+    return GaussianSession(
+        config,
+        scene,
+        views,
+        report,
+        pose_order(views.frames, names),
+        scene_extent(views.frames, scene.center.cpu()),
+        Refinement(config.refine, views.frames, names, views.device),
+        np.random.default_rng(config.seed),
+        torch.Generator(views.device).manual_seed(config.seed),
+    )
+
+
+def scene_extent(frames: tuple[Frame, ...], center: Tensor) -> float:
+    """Half the median distance from the cameras to the scene's middle, mm: scales the positions' learning rate."""
+    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in frames]
+    return 0.5 * float(np.median(distances))
+
+
+def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
+    """Frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
+    if not instruments:
+        return np.arange(len(frames))
+    rows = [
+        np.concatenate([frame.state.instruments[name].pose[:3, 1:].double().numpy().ravel() for name in instruments])
+        for frame in frames
+    ]
+    return order_by_pose(np.stack(rows))
+
+
+def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
+    """The tensors called GROUP/NAME, by NAME."""
+    return {key.removeprefix(f"{group}/"): t for key, t in tensors.items() if key.startswith(f"{group}/")}

@@ -7,6 +7,7 @@ import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -17,13 +18,14 @@ from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_text
 from neeco.scene.io import pack_scene, save_scene
+from neeco.scene.learning import Session, Start
 from neeco.scene.methods import method_class, unmet_need
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
 from neeco.training.config import TrainConfig
+from neeco.training.initial import gaussian_session
 from neeco.training.interrupt import StopRequest, hearing_stops
-from neeco.training.kinds import begin_session, session_around
-from neeco.training.protocol import TrainingSession
-from neeco.training.run import config_from_dict, read_config, write_config
+from neeco.training.run import read_config, stored_config, write_config
+from neeco.training.views import TrainingViews
 
 CHECKPOINT_INTERVAL = 500  # iterations
 ROW_INTERVAL = 50  # iterations averaged into one row of metrics.jsonl
@@ -44,7 +46,7 @@ class ProgressRow:
 
 
 Progress = Callable[[ProgressRow], None]
-Watch = Callable[[TrainingSession], None]  # after every step; may draw the scene, must not change it
+Watch = Callable[[Session], None]  # after every step; may draw the scene, must not change it
 
 
 def train(
@@ -89,7 +91,7 @@ def train(
         try:
             log.note("finishing: labels, shaft, diagnostics")
             _check_finite(session)
-            session.finish(log.note)
+            session.finish()
             save_scene(session.scene, output / "scene.safetensors")
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"while finishing; {go_on}") from None
@@ -104,23 +106,24 @@ def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
         raise NeecoError(
             f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
         )
-    return config_from_dict(stored)
+    return stored_config(output)
 
 
 def _begin(
     capture: Capture, frames: tuple[Frame, ...], output: Path, config: TrainConfig, resume: bool, log: _Log
-) -> TrainingSession:
+) -> Session:
     """The session before its first step, or where the checkpoint in `output` left it."""
-    images = [(frame.load_image() * 255).round().to(torch.uint8) for frame in frames]
-    masks = [frame.load_mask() for frame in frames]
+    views = TrainingViews.read(frames)
     started = log.clock()
     torch.manual_seed(config.seed)
+    start = Start(capture, views, config, log.note, partial(gaussian_session, capture, views, config, log.note))
+    method = method_class(config.method)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
-        session = session_around(scene, capture, frames, images, masks, config)
+        session = method.session(start, scene)
         restore_session(session, header, tensors)
     else:  # interrupted before its first checkpoint, a resumed run begins again
-        session = begin_session(capture, frames, images, masks, config, log.note)
+        session = method.session(start, None)
     log.keep_until(session.iteration)
     session.seconds += log.clock() - started
     return session
@@ -141,7 +144,7 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
     return capture, frames
 
 
-def _run(session: TrainingSession, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
+def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
     """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
     phase = session.phase
     last = log.clock()
@@ -170,7 +173,7 @@ def _run(session: TrainingSession, output: Path, log: _Log, stop: StopRequest, g
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
 
 
-def _check_finite(session: TrainingSession) -> None:
+def _check_finite(session: Session) -> None:
     """Raises NeecoError when a number that was learned is not finite."""
     # buffers may well be infinite: a shaft whose wrist was not found begins its wrist at minus infinity
     buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
@@ -192,7 +195,7 @@ class _Log:
         self.clock = clock
         self.last = ProgressRow(0, 0.0, 0.0, 0, 1, 0.0, 0.0)
 
-    def row(self, session: TrainingSession) -> None:
+    def row(self, session: Session) -> None:
         """Write the means over the session's window, and empty it."""
         loss = sum(step.loss for step in session.window) / len(session.window)
         psnr = sum(step.psnr for step in session.window) / len(session.window)

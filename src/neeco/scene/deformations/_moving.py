@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,21 +11,31 @@ from torch import Tensor
 from neeco.capture.model import Instrument, State
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import Deformation
+from neeco.scene.learning import Training
 
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
 STILL = 1e-6  # mm; what moves less does not move
+EVERY = 4  # recorded states between those looked at
 
 
-def instrument_label(instruments: tuple[Instrument, ...]) -> tuple[tuple[str, str], ...]:
-    """One label column, "instrument", for all instruments together; none without any."""
-    return (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
+class LabelledByMotion(Deformation):
+    """One label column, "instrument", for all instruments together (none without any): what moves once all is
+    learned."""
 
+    def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
+        super().__init__(instruments, settings)
+        self.label_names = (("+".join(i.name for i in instruments), "instrument"),) if instruments else ()
 
-def moving_labels(canonical: CanonicalGaussians, label_names: tuple[tuple[str, str], ...]) -> Tensor:
-    """The moving Gaussians [N, len(label_names)] as found by `mark_moving`; nothing before that."""
-    if MEMBERSHIP not in canonical.extras or not label_names:
-        return torch.zeros(len(canonical), len(label_names))
-    return canonical.extras[MEMBERSHIP][:, None]
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        """The moving Gaussians [N, len(label_names)] as found by `finish`; nothing before that."""
+        if MEMBERSHIP not in canonical.extras or not self.label_names:
+            return super().label_channels(canonical)
+        return canonical.extras[MEMBERSHIP][:, None]
+
+    def finish(self, training: Training) -> None:
+        scene = training.scene
+        if self.instruments:
+            scene.canonical = mark_moving(self, scene.canonical, list(scene.recorded.states[::EVERY]))
 
 
 @torch.no_grad()
@@ -45,7 +56,7 @@ def otsu(values: Tensor, bins: int = 256) -> float:
     if not high > low:
         return high
     counts = torch.histc(values.float(), bins, low, high)
-    centers = low + (torch.arange(bins) + 0.5) * (high - low) / bins
+    centers = low + (torch.arange(bins, device=values.device) + 0.5) * (high - low) / bins
     weight = counts.cumsum(0) / counts.sum()
     mean = (counts * centers).cumsum(0) / counts.sum()
     between = (mean[-1] * weight - mean).square() / (weight * (1 - weight)).clamp_min(1e-9)

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import State
-from neeco.scene.deformations.base import Perturbation
 
 
 class RecordedTimes(nn.Module):
@@ -29,9 +28,6 @@ class RecordedTimes(nn.Module):
         self.duration.fill_(max(max(times) - min(times), 1e-9))
         self.interval.fill_(1 / len(times))
 
-    def share(self, state: State, perturbation: Perturbation) -> Tensor:
-        """The time of `state`, a scalar: 0 and 1 at the first and last training frame; with `time_noise`, disturbed."""
-        share = ((state.time - self.start) / self.duration).float()
-        if perturbation.time_noise > 0:
-            share = share + perturbation.time_noise * self.interval * torch.randn(())
-        return share
+    def share(self, state: State) -> Tensor:
+        """The time of `state`, a scalar: 0 and 1 at the first and last training frame."""
+        return ((state.time - self.start) / self.duration).float()

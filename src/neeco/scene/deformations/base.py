@@ -1,32 +1,22 @@
-"""What every deformation does: map (canonical Gaussians, state) to posed ones."""
+"""What every deformation does: map (canonical Gaussians, state) to posed ones, and what it may ask of training."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
+import numpy as np
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._hinges import Hinged
-from neeco.scene.swept import SweptVolume
-
-# Plain 3DGS: no part of the paper's dynamic training adjustment acts.
-PLAIN_TRAINING: Mapping[str, Any] = {
-    "schedule.density_interval": "off",
-    "schedule.opacity_reset": "off",
-    "schedule.gradient_threshold": "off",
-    "schedule.sh_order": "off",
-    "schedule.frame_order": "off",
-    "schedule.compensation": "off",
-}
+from neeco.scene.drawable import Learned
+from neeco.scene.learning import Session, Start, Training
+from neeco.scene.method import Method, Stored
 
 MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 
@@ -43,17 +33,13 @@ class Posed:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What training may disturb on purpose; drawing never does.
+    """What training may disturb on purpose; drawing never does. A method that disturbs more has a subclass.
 
-    `shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
-    looks the same). `state_noise`: standard deviation added to the encoded state, or the encoded time of a method that
-    knows the state by its time (the paper's compensation). `time_noise`: standard deviation added to the time, in mean
-    intervals between training frames (Deformable-3DGS). Normal numbers come from torch's own generator.
+    `state_noise`: standard deviation added to the encoded state, or to the encoded time of a method that knows the
+    state by its time (the paper's compensation). Normal numbers come from torch's own generator.
     """
 
-    shaft_roll: float = 0.0
     state_noise: float = 0.0
-    time_noise: float = 0.0
 
 
 UNPERTURBED = Perturbation()
@@ -69,64 +55,47 @@ class Deltas:
     scales: Tensor  # [N, 3] mm
 
 
-class Deformation(nn.Module):
-    """Base class. A method is one subclass in one file, with its own small config; `method` is its name.
+class Deformation(nn.Module, Method):
+    """Base class of the methods that deform Gaussians; a subclass is made as `Method(instruments, settings)`.
 
-    It is made as `Method(instruments, **config)`. What training must know of a method, it asks here:
     `label_names` lists (instrument, part) for each label column; a deformation that cannot tell parts returns one part,
-    "instrument", per instrument. `training_defaults` are fields of the training config that differ from the paper's,
-    dotted names as in `neeco train --set`. `extra_rates` are Adam's learning rates of the per-Gaussian parameters that
-    the method adds (`CanonicalGaussians.extras`) by name; an extra without one is not learned.
+    "instrument", per instrument. `extra_rates` are Adam's learning rates of the per-Gaussian parameters that the method
+    adds (`initial_extras`) by name; an extra without one is not learned.
 
     `warm_up` is the share of the training in [0, 1) over which the deformation rests: training then holds its
     parameters still and sets `resting`, which lets `pose` leave out what would change nothing. Before iteration
     `learns_from` it only holds them still.
+
+    Training calls the hooks without knowing whose they are: `fit_ranges` and `initial_extras`, then `begin`,
+    in every step `disturbed`, `training_channels` and `regularisation`, between steps `between_steps`, and `finish`.
     """
 
-    method: ClassVar[str]
     label_names: tuple[tuple[str, str], ...] = ()
-    training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     extra_rates: ClassVar[Mapping[str, float]] = {}
-    needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
-    needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
     learns_from: ClassVar[int] = 0
     warm_up: float = 0.0
     resting: bool = False
-    large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
+
+    def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
+        super().__init__()
+        self.instruments = instruments
+        self.settings = self.Settings() if settings is None else settings
 
     @classmethod
-    def torch_threads(cls) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where scenes are posed and drawn: one, unless the operations are large."""
-        return nullcontext() if cls.large_operations else torch_threads(1)
+    def session(cls, start: Start, scene: Any | None) -> Session:
+        return start.gaussians(scene)
+
+    @classmethod
+    def load(cls, stored: Stored) -> Learned:
+        return stored.gaussians(cls(stored.instruments, stored.settings), stored)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""
         raise NotImplementedError
 
-    def config(self) -> dict[str, Any]:
-        """JSON-able keyword arguments that make an equal deformation."""
-        return {}
-
-    @property
-    def hinged(self) -> Hinged | None:
-        """The shafts and hinges whose place training is to look for; None: the scene starts from the tissue alone."""
-        return None
-
-    @property
-    def gate_volume(self) -> SweptVolume | None:
-        """The volume that bounds where Gaussians can move; covered before training. None: anywhere."""
-        return None
-
-    def fit_ranges(self, states: list[State], means: Tensor) -> None:
-        """Take scales from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
-
-    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-        """`canonical` with whatever the method finds out once learning has ended, from the recorded states."""
-        return canonical
-
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         """Soft membership [N, len(label_names)] in [0, 1]; what is left to 1 is tissue."""
-        return torch.zeros(len(canonical), len(self.label_names))
+        return canonical.means.new_zeros(len(canonical), len(self.label_names))
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
         """Change from canonical to posed."""
@@ -138,17 +107,40 @@ class Deformation(nn.Module):
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
         return {}
 
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Take scales from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
+
+    def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
+        """The per-Gaussian parameters [N, ...] of its own that the first Gaussians, the tissue's, begin with, by name;
+        density control carries them along."""
+        return {}
+
+    def begin(self, training: Training) -> None:
+        """Once, before the first step of a new scene (not when a run goes on); may replace the canonical Gaussians."""
+
+    def disturbed(
+        self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
+    ) -> Perturbation:
+        """What this training step disturbs, beside what the schedule does: `perturbation`, or a subclass."""
+        return perturbation
+
+    def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
+        """Extra channels [N, C] that this step draws for `regularisation`; None: none."""
+        return None
+
+    def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
+        """A term added to the loss of every step, a scalar, or None; not asked while the deformation rests."""
+        return None
+
     def learning_rates(self, progress: float) -> dict[str, float]:
         """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
         return {}
 
-    def regularisation(self, canonical: CanonicalGaussians) -> Tensor | None:
-        """A term added to the loss of every step, a scalar, or None; not asked while the deformation rests."""
-        return None
+    def between_steps(self, training: Training, before: float) -> None:
+        """After every step; `before` is the progress before it: for what is due once a mark has been passed."""
 
-    def time_noise(self, progress: float) -> float:
-        """`Perturbation.time_noise` of a training step; `progress` in [0, 1]."""
-        return 0.0
+    def finish(self, training: Training) -> None:
+        """Find out what is found once learning has ended; may replace the canonical Gaussians."""
 
 
 def log_linear(first: float, last: float, progress: float) -> float:
@@ -162,11 +154,16 @@ def floored_decay(progress: float) -> float:
     return max(math.exp(math.log(0.03) * min(1.0, progress)), MODULE_FLOOR)
 
 
-def checked_warm_up(share: float) -> float:
-    """`share` itself. Raises NeecoError when it is not one of the training in [0, 1)."""
+def check_warm_up(share: float) -> None:
+    """Raises NeecoError when `share` is not one of the training in [0, 1)."""
     if not 0 <= share < 1:
         raise NeecoError(f"deformation.warm_up: {share} is not a share of the training in [0, 1)")
-    return share
+
+
+def point_box(means: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre [3] and greatest half extent [] mm of points [P, 3], without the outermost hundredth at either end."""
+    low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
+    return (low + high) / 2, (high - low).max() / 2
 
 
 def state_of(instrument: Instrument, state: State) -> InstrumentState:

@@ -24,6 +24,7 @@ Where it departs from its source:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -31,30 +32,43 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
+from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations._times import RecordedTimes
-from neeco.scene.deformations.base import (
-    PLAIN_TRAINING,
-    UNPERTURBED,
-    Deformation,
-    Perturbation,
-    Posed,
-    checked_warm_up,
-    log_linear,
-)
+from neeco.scene.deformations.base import UNPERTURBED, Perturbation, Posed, check_warm_up, log_linear, point_box
+from neeco.scene.method import PLAIN_TRAINING
 
 MARGIN = 1.2  # the cube's side, in those of the points' longest
 SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_L1 = 1e-4, 1e-2, 1e-4  # weights of the regularisation
 
 
-class HexPlane(Deformation):
-    """Fields: `channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
+@dataclass(frozen=True)
+class HexPlaneSettings:
+    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
     resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests;
-    `rate_scale` multiplies the learning rates.
-    """
+    `rate_scale` multiplies the learning rates."""
+
+    channels: int = 16
+    resolution: int = 64
+    levels: int = 2
+    moments: int = 25
+    width: int = 64
+    warm_up: float = 3 / 17
+    rate_scale: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("resolution", 3), ("moments", 3), ("levels", 1)):
+            if getattr(self, name) < least:
+                raise NeecoError(f"deformation.{name}: {getattr(self, name)} is too small; give at least {least}")
+        check_warm_up(self.warm_up)
+
+
+class HexPlane(LabelledByMotion):
+    """Six planes in several resolutions, a trunk and a head for each of mean, rotation and scale."""
 
     method = "4dgs"
+    Settings = HexPlaneSettings
     training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.0}
     needs_times = True
     large_operations = True
@@ -62,58 +76,31 @@ class HexPlane(Deformation):
     center: Tensor
     half_extent: Tensor
 
-    def __init__(
-        self,
-        instruments: tuple[Instrument, ...],
-        channels: int = 16,
-        resolution: int = 64,
-        levels: int = 2,
-        moments: int = 25,
-        width: int = 64,
-        warm_up: float = 3 / 17,
-        rate_scale: float = 5.0,
-    ) -> None:
-        super().__init__()
-        for name, value, least in (("resolution", resolution, 3), ("moments", moments, 3), ("levels", levels, 1)):
-            if value < least:
-                raise NeecoError(f"deformation.{name}: {value} is too small; give at least {least}")
-        self.instruments, self.warm_up = instruments, checked_warm_up(warm_up)
-        self._config = {
-            "channels": channels,
-            "resolution": resolution,
-            "levels": levels,
-            "moments": moments,
-            "width": width,
-            "warm_up": warm_up,
-            "rate_scale": rate_scale,
-        }
-        self.rate_scale = rate_scale
+    def __init__(self, instruments: tuple[Instrument, ...], settings: HexPlaneSettings | None = None) -> None:
+        super().__init__(instruments, settings)
+        sizes: HexPlaneSettings = self.settings
+        channels, moments, width = sizes.channels, sizes.moments, sizes.width
+        self.warm_up = sizes.warm_up
         self.times = RecordedTimes()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("half_extent", torch.ones(()))
-        sides = [resolution * 2**level for level in range(levels)]
+        sides = [sizes.resolution * 2**level for level in range(sizes.levels)]
         self.space = nn.ParameterList(torch.empty(3, channels, side, side).uniform_(0.1, 0.5) for side in sides)
         self.time = nn.ParameterList(torch.ones(3, channels, moments, side) for side in sides)
-        self.trunk = nn.Linear(channels * levels, width)
+        self.trunk = nn.Linear(channels * sizes.levels, width)
         self.heads = nn.ModuleList(_head(width, size) for size in (3, 4, 3))
         nn.init.xavier_uniform_(self.trunk.weight)
-        self.label_names = instrument_label(instruments)
-
-    def config(self) -> dict[str, Any]:
-        return dict(self._config)
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Time from 0 to 1 over the recording; the cube about the points [P, 3]."""
         self.times.fit(states)
-        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
-        self.center = (low + high) / 2
-        self.half_extent = (high - low).max() / 2
+        self.center, self.half_extent = point_box(means)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if self.resting:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         places = (canonical.means - self.center) / (MARGIN * self.half_extent)
-        rows = self.rows_at(self.times.share(state, perturbation), perturbation.state_noise)
+        rows = self.rows_at(self.times.share(state), perturbation.state_noise)
         hidden = self.trunk(self.features(places, rows))
         d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()
@@ -126,9 +113,10 @@ class HexPlane(Deformation):
         for plane in self.time:
             last = plane.shape[2] - 1
             place = time.to(plane.dtype).clamp(0, 1) * last
-            below = min(int(place), last - 1)
-            row = torch.lerp(plane[:, :, below], plane[:, :, below + 1], place - below)
-            rows.append(row + noise * torch.randn(*row.shape[:2], 1) if noise > 0 else row)
+            below = place.detach().long().clamp(max=last - 1)  # stays a tensor: no waiting for a GPU
+            lower, upper = plane.index_select(2, torch.stack([below, below + 1])).unbind(2)
+            row = torch.lerp(lower, upper, place - below)
+            rows.append(row + noise * torch.randn(*row.shape[:2], 1, device=row.device) if noise > 0 else row)
         return rows
 
     def features(self, places: Tensor, rows: list[Tensor]) -> Tensor:
@@ -142,23 +130,17 @@ class HexPlane(Deformation):
             found.append(space[0] * space[1] * space[2] * time[0] * time[1] * time[2])
         return torch.cat(found).T
 
-    def regularisation(self, canonical: CanonicalGaussians) -> Tensor:
+    def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor:
         """Second differences squared, of the planes of space and along time, and the distance of time's from 1."""
-        total = torch.zeros(())
+        total = canonical.means.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
             smooth, steady = _curvature(space), _curvature(time)
             near_one = 3 * (1 - time).abs().mean()
             total = total + SPACE_SMOOTHNESS * smooth + TIME_SMOOTHNESS * steady + TIME_L1 * near_one
         return total
 
-    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        return moving_labels(canonical, self.label_names)
-
-    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
-
     def learning_rates(self, progress: float) -> dict[str, float]:
-        network = self.rate_scale * log_linear(1.6e-4, 1.6e-5, progress)
+        network = self.settings.rate_scale * log_linear(1.6e-4, 1.6e-5, progress)
         planes = 10 * network
         return {
             name: planes if name.startswith(("space.", "time.")) else network for name, _ in self.named_parameters()

@@ -6,17 +6,19 @@ parts about hinges that are learned from the images, with soft part assignment p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._hinges import PART_LOGITS, Hinges
 from neeco.scene.deformations.base import (
-    PLAIN_TRAINING,
     UNPERTURBED,
     Deformation,
     Deltas,
@@ -25,13 +27,41 @@ from neeco.scene.deformations.base import (
     floored_decay,
     state_of,
 )
+from neeco.scene.hinges import PART_LOGITS, Hinges
+from neeco.scene.learning import Training
+from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
+
+WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
+SHARPENS_FROM = 1000  # iteration
+RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is left
+
+
+@dataclass(frozen=True)
+class KinematicSettings:
+    """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
+    `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it after iteration 1500;
+    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000."""
+
+    shaft_roll: float = 0.5
+    shaft_roll_start: int = 600
+    opacity_penalty: float = 0.002
+    label_sharpness: float = 0.02
+
+
+@dataclass(frozen=True)
+class Spin(Perturbation):
+    """`shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
+    looks the same)."""
+
+    shaft_roll: float = 0.0
 
 
 class Kinematic(Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
     method = "kinematic"
+    Settings = KinematicSettings
     learns_from = 600  # hinges hold still until Gaussians have taken shape around them, or unformed ones drag them off
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
@@ -43,23 +73,15 @@ class Kinematic(Deformation):
         "refine.frame_poses": True,
         "density_start": 400,
         "density_stop": 0.7,
-        "opacity_penalty": 0.002,
-        "label_sharpness": 0.02,
-        "shaft_roll": 0.5,
     }
     extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
 
-    def __init__(self, instruments: tuple[Instrument, ...]) -> None:
-        super().__init__()
-        self.instruments = instruments
+    def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
+        super().__init__(instruments, settings)
         self.hinges = nn.ModuleList(Hinges(tuple(instrument.joints)) for instrument in instruments)
         self.label_names = tuple(
             (instrument.name, part) for instrument in instruments for part in part_names(tuple(instrument.joints))
         )
-
-    @property
-    def hinged(self) -> Kinematic:
-        return self
 
     def hinges_of(self, index: int) -> Hinges:
         """The shaft and hinges of instrument `index`."""
@@ -75,7 +97,7 @@ class Kinematic(Deformation):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         tissue = canonical.body(0)
         means, quats = [canonical.means[tissue]], [canonical.quats[tissue]]
-        frames = [torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(canonical.counts[0], 4)]
+        frames = [_no_turn(canonical.means).expand(canonical.counts[0], 4)]
         for index, instrument in enumerate(self.instruments):
             moved = self._pose_instrument(canonical, index, instrument, state, perturbation)
             for collected, part in zip((means, quats, frames), moved, strict=True):
@@ -94,15 +116,15 @@ class Kinematic(Deformation):
         given = state_of(instrument, state)
         hinges, rows = self.hinges_of(index), canonical.body(index + 1)
         points, quats = canonical.means[rows], nn.functional.normalize(canonical.quats[rows], dim=-1)
-        turned = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(points.shape[0], 4)  # [M, 4] instrument_from_sh
-        if perturbation.shaft_roll:
+        turned = _no_turn(points).expand(points.shape[0], 4)  # [M, 4] instrument_from_sh
+        if isinstance(perturbation, Spin):
             points, quats = hinges.spin(points, quats, perturbation.shaft_roll)
             _, turned = hinges.spin(points.detach(), turned, perturbation.shaft_roll)
         if hinges.joint_names:
             points, turn = hinges.bend(points, self.part_weights(canonical, index), given.joints)
             assert turn is not None
             quats, turned = quat_multiply(turn, quats), quat_multiply(turn, turned)
-        pose = given.pose.to(points.dtype)
+        pose = given.pose.to(points)
         world_quat = matrix_to_quat(pose[:3, :3])
         means = points @ pose[:3, :3].T + pose[:3, 3]
         return means, quat_multiply(world_quat, quats), quat_multiply(world_quat, turned).detach()
@@ -113,7 +135,7 @@ class Kinematic(Deformation):
         return torch.softmax(logits[:, : self.hinges_of(index).part_count], -1)
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        labels = torch.zeros(len(canonical), len(self.label_names))
+        labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
         column = 0
         for index in range(len(self.instruments)):
             hinges, rows = self.hinges_of(index), canonical.body(index + 1)
@@ -125,8 +147,8 @@ class Kinematic(Deformation):
             wrist = (hinges.along_shaft(canonical.means[rows]) >= hinges.wrist_start).to(weights.dtype)
             parts = [weights[:, 0] * (1 - wrist), weights[:, 0] * wrist]
             for joint in range(len(hinges.joint_names)):
-                left = hinges.left_part(joint)
-                parts += [weights[:, 1 + 2 * joint + left], weights[:, 2 + 2 * joint - left]]
+                pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
+                parts += pair.index_select(1, hinges.left_first(joint)).unbind(1)
             labels[rows, column : column + len(parts)] = torch.stack(parts, -1)
             column += len(parts)
         return labels
@@ -148,19 +170,61 @@ class Kinematic(Deformation):
             points = {"shaft_far": origin + hinges.extent[0] * direction}
             end = hinges.extent[1]
             if hinges.joint_names:
-                points["shaft_near"] = origin + hinges.wrist_start.clamp(min=float(hinges.extent[0])) * direction
+                points["shaft_near"] = origin + torch.maximum(hinges.wrist_start, hinges.extent[0]) * direction
                 pivot, axis = hinges.hinge(0)
                 points["hinge"] = pivot
                 angles = hinges.offsets[0] + hinges.gains[0] * given.joints[hinges.joint_names[0]]
-                left = hinges.left_part(0)
                 tip = (origin + end * direction)[None]  # [1, 3]
-                for name, part in (("tip_left", left), ("tip_right", 1 - left)):
-                    points[name] = rotate_about(tip, axis, pivot, angles[part][None])[0]
+                ordered = angles.index_select(0, hinges.left_first(0))
+                for name, angle in zip(("tip_left", "tip_right"), ordered.split(1), strict=True):
+                    points[name] = rotate_about(tip, axis, pivot, angle)[0]
             else:
                 points["shaft_near"] = origin + end * direction
-            pose = given.pose.to(torch.float32)
+            pose = given.pose.to(origin)
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
+
+    def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
+        return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
+
+    def begin(self, training: Training) -> None:
+        training.instruments.find(self)
+
+    def disturbed(
+        self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
+    ) -> Perturbation:
+        settings = self.settings
+        if settings.shaft_roll > 0 and iteration > settings.shaft_roll_start and rng.random() < settings.shaft_roll:
+            return Spin(perturbation.state_noise, float(rng.uniform(-math.pi, math.pi)))
+        return perturbation
+
+    def spun(self, roll: float) -> Perturbation:
+        """Nothing disturbed but every shaft, by `roll` rad."""
+        return Spin(shaft_roll=roll)
+
+    def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
+        """The whole instruments' label [N, 1]."""
+        if not (self.settings.label_sharpness > 0 and iteration > SHARPENS_FROM and self.label_names):
+            return None
+        return self.label_channels(canonical).sum(1, keepdim=True)
+
+    def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
+        """Sparse instruments and sharp labels."""
+        settings, terms = self.settings, []
+        if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
+            weight = settings.opacity_penalty * (1.0 if iteration < RELAXES_FROM else 0.1)
+            terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
+        if rendering.channels is not None:
+            label = rendering.channels[..., 0]
+            terms.append(settings.label_sharpness * (label * (1 - label)).mean())
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def between_steps(self, training: Training, before: float) -> None:
+        if before < WRIST_FRACTION <= training.progress:
+            training.instruments.place_wrists(self)
+
+    def finish(self, training: Training) -> None:
+        training.instruments.conclude(self)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         rates = {
@@ -174,6 +238,11 @@ class Kinematic(Deformation):
         }
         fall = floored_decay(progress)
         return {name: rates[name.rsplit(".", 1)[-1]] * fall for name, _ in self.named_parameters()}
+
+
+def _no_turn(like: Tensor) -> Tensor:
+    """The quaternion [4] that turns nothing, of the type and device of `like`."""
+    return like.new_tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def part_names(joints: tuple[str, ...]) -> tuple[str, ...]:

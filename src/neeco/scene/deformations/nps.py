@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -18,16 +19,18 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations.base import (
     UNPERTURBED,
-    Deformation,
     Perturbation,
     Posed,
-    checked_warm_up,
+    check_warm_up,
     floored_decay,
+    point_box,
     state_of,
 )
+from neeco.scene.encoding import encode
+from neeco.scene.learning import Training
 from neeco.scene.rotations import matrix_to_quat
 from neeco.scene.swept import SweptVolume
 
@@ -38,26 +41,42 @@ SHAPE_UNIT = 0.1  # of quaternion and log scale
 WARM_UP = 0.075  # share of the training: Deformable-3DGS rests for 3,000 of 40,000 iterations
 
 
-def encode(values: Tensor, frequencies: int, *, identity: bool = False) -> Tensor:
-    """gamma: [..., D] to [..., D * 2L (+ D)], (sin(2^k pi x), cos(2^k pi x)) for k < L (paper; NeRF)."""
-    octaves = math.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype)
-    angles = (values[..., None] * octaves).flatten(-2)
-    parts = [angles.sin(), angles.cos()] + ([values] if identity else [])
-    return torch.cat(parts, -1)
-
-
-class NPS(Deformation):
-    """Fields: depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
+@dataclass(frozen=True)
+class NPSSettings:
+    """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
     `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
     evaluation when no gradient is wanted. `warm_up`: share of the training over which the network rests; without it
     the first steps, whose gradients all ask to fill a half-empty image, may throw the Gaussians out of sight for good.
-    `gate_mm` (None: off, as published): Gaussians farther than this from all
-    that the instruments were recorded to sweep stay canonical without being evaluated; `gate` is that volume.
+    `gate_mm` (None: off, as published): Gaussians farther than this from all that the instruments were recorded to
+    sweep stay canonical without being evaluated.
     """
 
+    depth: int = 12
+    width: int = 256
+    L_mean: int = 10
+    L_state: int = 10
+    identity: bool = False
+    state: Literal["full", "rotation_jaw"] = "full"
+    half: bool = False
+    chunk: int = 65536
+    warm_up: float = WARM_UP
+    gate_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        check_warm_up(self.warm_up)
+        if self.gate_mm is not None and not self.gate_mm > 0:
+            raise NeecoError(
+                f"deformation.gate_mm: {self.gate_mm} is not a positive distance in mm; leave it out for no gate"
+            )
+
+
+class NPS(LabelledByMotion):
+    """The network F; `gate`, where there is one, is the volume within which it is evaluated."""
+
     method = "neeco"
+    Settings = NPSSettings
     training_defaults: ClassVar[Mapping[str, Any]] = {}  # the paper's
     needs_instruments = True
     large_operations = True
@@ -68,49 +87,19 @@ class NPS(Deformation):
     mean_halfwidth: Tensor
     first_quats: Tensor
 
-    def __init__(
-        self,
-        instruments: tuple[Instrument, ...],
-        depth: int = 12,
-        width: int = 256,
-        L_mean: int = 10,
-        L_state: int = 10,
-        identity: bool = False,
-        state: Literal["full", "rotation_jaw"] = "full",
-        half: bool = False,
-        chunk: int = 65536,
-        warm_up: float = WARM_UP,
-        gate_mm: float | None = None,
-    ) -> None:
-        super().__init__()
-        if gate_mm is not None and not gate_mm > 0:
-            raise NeecoError(
-                f"deformation.gate_mm: {gate_mm} is not a positive distance in mm; leave it out for no gate"
-            )
-        self.instruments = instruments
-        self._config = {
-            "depth": depth,
-            "width": width,
-            "L_mean": L_mean,
-            "L_state": L_state,
-            "identity": identity,
-            "state": state,
-            "half": half,
-            "chunk": chunk,
-            "warm_up": warm_up,
-            "gate_mm": gate_mm,
-        }
-        self.gate = None if gate_mm is None else SweptVolume(gate_mm)
-        self.L_mean, self.L_state, self.identity, self.state_kind = L_mean, L_state, identity, state
-        self.half_precision, self.chunk, self.warm_up = half, chunk, checked_warm_up(warm_up)
+    def __init__(self, instruments: tuple[Instrument, ...], settings: NPSSettings | None = None) -> None:
+        super().__init__(instruments, settings)
+        sizes: NPSSettings = self.settings
+        depth, width, self.warm_up = sizes.depth, sizes.width, sizes.warm_up
+        self.gate = None if sizes.gate_mm is None else SweptVolume(sizes.gate_mm)
         size = self.state_size()
         self.register_buffer("state_center", torch.zeros(size))
         self.register_buffer("state_halfwidth", torch.ones(size))
         self.register_buffer("mean_center", torch.zeros(3))
         self.register_buffer("mean_halfwidth", torch.ones(()))
         self.register_buffer("first_quats", torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(max(len(instruments), 1), 1))
-        mean_inputs = 3 * (2 * L_mean + identity)
-        state_inputs = size * (2 * L_state + identity)
+        mean_inputs = 3 * (2 * sizes.L_mean + sizes.identity)
+        state_inputs = size * (2 * sizes.L_state + sizes.identity)
         # gamma(mu) and gamma(p) enter through separate weights of one linear layer: the state's share is computed once
         self.skip = depth // 2 if depth >= 8 else -1
         self.mean_in = nn.Linear(mean_inputs, width)
@@ -121,7 +110,6 @@ class NPS(Deformation):
             self.state_skip = nn.Linear(state_inputs, width, bias=False)
         self.head = nn.Linear(width, 10)
         self._initialise()
-        self.label_names = instrument_label(instruments)
 
     def _initialise(self) -> None:
         """He initialisation throughout, so that twelve layers carry gradient; the head starts at zero."""
@@ -137,17 +125,10 @@ class NPS(Deformation):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def config(self) -> dict[str, Any]:
-        return dict(self._config)
-
     def state_size(self) -> int:
         """Numbers in the state vector p."""
-        per_instrument = 4 if self.state_kind == "rotation_jaw" else 7
+        per_instrument = 4 if self.settings.state == "rotation_jaw" else 7
         return sum(per_instrument + len(instrument.joints) for instrument in self.instruments)
-
-    @property
-    def gate_volume(self) -> SweptVolume | None:
-        return self.gate
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Normalise p by the recorded range and mu by the points' extent, both to [-1, 1]."""
@@ -160,20 +141,22 @@ class NPS(Deformation):
             low, high = vectors.min(0).values, vectors.max(0).values
             self.state_center = (low + high) / 2
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
-        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
-        self.mean_center = (low + high) / 2
-        self.mean_halfwidth = (high - low).max() / 2
+        self.mean_center, self.mean_halfwidth = point_box(means)
+
+    def begin(self, training: Training) -> None:
+        if self.gate is not None:
+            training.instruments.bound(self.gate)
 
     def _raw_state(self, state: State) -> Tensor:
         """p before normalisation [S]: position mm, sign-continuous quaternion, joints rad."""
         parts = []
         for index, instrument in enumerate(self.instruments):
             given = state_of(instrument, state)
-            pose = given.pose.float()
+            pose = given.pose.to(self.first_quats)
             quat = matrix_to_quat(pose[:3, :3])
             quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
-            parts += [quat] if self.state_kind == "rotation_jaw" else [pose[:3, 3], quat]
-            parts.append(torch.tensor([given.joints[name] for name in instrument.joints], dtype=torch.float32))
+            parts += [quat] if self.settings.state == "rotation_jaw" else [pose[:3, 3], quat]
+            parts.append(pose.new_tensor([given.joints[name] for name in instrument.joints]))
         return torch.cat(parts)
 
     def state_vector(self, state: State) -> Tensor:
@@ -190,8 +173,13 @@ class NPS(Deformation):
 
     def _encoded_state(self, state: State, noise: float) -> Tensor:
         """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""
-        encoded = encode(self.state_vector(state), self.L_state, identity=self.identity)
+        encoded = self._encode(self.state_vector(state), self.settings.L_state)
         return encoded + noise * torch.randn_like(encoded) if noise > 0 else encoded
+
+    def _encode(self, values: Tensor, octaves: int) -> Tensor:
+        """gamma of values [..., D], with the values themselves behind where `identity` asks for them."""
+        encoded = encode(values, octaves)
+        return torch.cat([encoded, values], -1) if self.settings.identity else encoded
 
     def _change(self, means: Tensor, encoded_state: Tensor) -> Tensor:
         """The network's output [N, 10]; zero for means [N, 3] outside the gate."""
@@ -203,11 +191,11 @@ class NPS(Deformation):
 
     def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
         """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above)."""
-        if not torch.is_grad_enabled() and means.shape[0] > self.chunk:
-            return torch.cat([self.network(part, encoded_state) for part in means.split(self.chunk)])
-        encoded = encode((means - self.mean_center) / self.mean_halfwidth, self.L_mean, identity=self.identity)
+        if not torch.is_grad_enabled() and means.shape[0] > self.settings.chunk:
+            return torch.cat([self.network(part, encoded_state) for part in means.split(self.settings.chunk)])
+        encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         state = encoded_state[None]
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.half_precision and means.device.type == "cpu"):
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu"):
             features = torch.relu(self.mean_in(encoded) + self.state_in(state))
             for index, layer in enumerate(self.hidden, start=1):
                 summed = layer(features)
@@ -215,12 +203,6 @@ class NPS(Deformation):
                     summed = summed + self.mean_skip(encoded) + self.state_skip(state)
                 features = torch.relu(summed)
         return nn.functional.linear(features.float(), self.head.weight, self.head.bias)
-
-    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        return moving_labels(canonical, self.label_names)
-
-    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         return dict.fromkeys((name for name, _ in self.named_parameters()), 8e-4 * floored_decay(progress))

@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from neeco.capture.model import Instrument, State
+from neeco.capture.model import State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations.base import PLAIN_TRAINING, UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.method import PLAIN_TRAINING
 
 
 class Static(Deformation):
@@ -22,9 +23,6 @@ class Static(Deformation):
 
     method = "3dgs"
     training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2}
-
-    def __init__(self, instruments: tuple[Instrument, ...]) -> None:
-        super().__init__()
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())

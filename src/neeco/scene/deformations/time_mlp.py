@@ -19,24 +19,20 @@ Where it departs from its source:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import instrument_label, mark_moving, moving_labels
+from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations._times import RecordedTimes
-from neeco.scene.deformations.base import (
-    PLAIN_TRAINING,
-    UNPERTURBED,
-    Deformation,
-    Perturbation,
-    Posed,
-    checked_warm_up,
-    log_linear,
-)
+from neeco.scene.deformations.base import UNPERTURBED, Perturbation, Posed, check_warm_up, log_linear, point_box
+from neeco.scene.encoding import encode
+from neeco.scene.method import PLAIN_TRAINING
 
 DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
 FIRST_NOISE, NOISE_SHARE = 0.1, 0.5  # of the frame interval; share of the run at which none is left
@@ -44,17 +40,36 @@ FIRST_NOISE, NOISE_SHARE = 0.1, 0.5  # of the frame interval; share of the run a
 
 def octaves(values: Tensor, count: int) -> Tensor:
     """gamma: [..., D] to [..., D * (1 + 2 count)], (x, sin(2^k x), cos(2^k x)) for k < count."""
-    angles = (values[..., None] * 2.0 ** torch.arange(count, dtype=values.dtype)).flatten(-2)
-    return torch.cat([values, angles.sin(), angles.cos()], -1)
+    return torch.cat([values, encode(values, count, unit=1.0)], -1)
 
 
-class TimeMLP(Deformation):
-    """Fields: `width` and the octaves `L_mean`, `L_time` as published; `synthetic`: the variant for D-NeRF's data.
+@dataclass(frozen=True)
+class TimeMLPSettings:
+    """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
+    `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network rests."""
 
-    `warm_up`: share of the training over which the network rests.
-    """
+    width: int = 256
+    L_mean: int = 10
+    L_time: int | None = None
+    synthetic: bool = False
+    warm_up: float = 0.075
+
+    def __post_init__(self) -> None:
+        check_warm_up(self.warm_up)
+
+
+@dataclass(frozen=True)
+class NoisyTime(Perturbation):
+    """`time_noise`: standard deviation added to the time, in mean intervals between training frames."""
+
+    time_noise: float = 0.0
+
+
+class TimeMLP(LabelledByMotion):
+    """A network of 8 layers over place and time."""
 
     method = "deformable-3dgs"
+    Settings = TimeMLPSettings
     training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2, "density_stop": 0.375}
     needs_times = True
     large_operations = True
@@ -62,47 +77,35 @@ class TimeMLP(Deformation):
     mean_center: Tensor
     mean_halfwidth: Tensor
 
-    def __init__(
-        self,
-        instruments: tuple[Instrument, ...],
-        width: int = 256,
-        L_mean: int = 10,
-        L_time: int | None = None,
-        synthetic: bool = False,
-        warm_up: float = 0.075,
-    ) -> None:
-        super().__init__()
-        self.instruments = instruments
-        self.L_mean, self.L_time = L_mean, (6 if synthetic else 10) if L_time is None else L_time
-        self.synthetic, self.warm_up = synthetic, checked_warm_up(warm_up)
-        self._config = {"width": width, "L_mean": L_mean, "L_time": L_time, "synthetic": synthetic, "warm_up": warm_up}
+    def __init__(self, instruments: tuple[Instrument, ...], settings: TimeMLPSettings | None = None) -> None:
+        super().__init__(instruments, settings)
+        sizes: TimeMLPSettings = self.settings
+        width, self.warm_up = sizes.width, sizes.warm_up
+        self.L_time = (6 if sizes.synthetic else 10) if sizes.L_time is None else sizes.L_time
         self.times = RecordedTimes()
         self.register_buffer("mean_center", torch.zeros(3))
         self.register_buffer("mean_halfwidth", torch.ones(()))
-        self.mean_inputs, time_inputs = 3 * (1 + 2 * L_mean), 1 + 2 * self.L_time
-        if synthetic:
+        self.mean_inputs, time_inputs = 3 * (1 + 2 * sizes.L_mean), 1 + 2 * self.L_time
+        if sizes.synthetic:
             self.time_net = nn.Sequential(nn.Linear(time_inputs, 256), nn.ReLU(), nn.Linear(256, 30))
             time_inputs = 30
         inputs = self.mean_inputs + time_inputs
-        sizes = [inputs] + [width + inputs if index == SKIP + 1 else width for index in range(1, DEPTH)]
-        self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+        fans = [inputs] + [width + inputs if index == SKIP + 1 else width for index in range(1, DEPTH)]
+        self.layers = nn.ModuleList(nn.Linear(fan, width) for fan in fans)
         self.head = nn.Linear(width, 10)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
-        self.label_names = instrument_label(instruments)
-
-    def config(self) -> dict[str, Any]:
-        return dict(self._config)
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Time from 0 to 1 over the recording, mu from -1 to 1 over the points."""
         self.times.fit(states)
-        low, high = means.quantile(0.01, 0), means.quantile(0.99, 0)
-        self.mean_center = (low + high) / 2
-        self.mean_halfwidth = (high - low).max() / 2
+        self.mean_center, self.mean_halfwidth = point_box(means)
 
-    def time_noise(self, progress: float) -> float:
-        return 0.0 if self.synthetic else FIRST_NOISE * max(0.0, 1 - progress / NOISE_SHARE)
+    def disturbed(
+        self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
+    ) -> Perturbation:
+        noise = 0.0 if self.settings.synthetic else FIRST_NOISE * max(0.0, 1 - progress / NOISE_SHARE)
+        return NoisyTime(perturbation.state_noise, noise) if noise else perturbation
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         scales = canonical.log_scales.exp()
@@ -114,16 +117,23 @@ class TimeMLP(Deformation):
         quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
         return Posed(means, quats, (scales + self.mean_halfwidth * change[:, 7:]).abs())
 
+    def time_of(self, state: State, perturbation: Perturbation) -> Tensor:
+        """The time of `state`, a scalar, 0 and 1 at the ends of the recording; disturbed where training asks for it."""
+        time = self.times.share(state)
+        if not isinstance(perturbation, NoisyTime):
+            return time
+        return time + perturbation.time_noise * self.times.interval * torch.randn((), device=time.device)
+
     def encoded_time(self, state: State, perturbation: Perturbation) -> Tensor:
         """gamma(t) [E]; the compensation of the dynamic training adjustment is added to it."""
-        encoded = octaves(self.times.share(state, perturbation)[None], self.L_time)
+        encoded = octaves(self.time_of(state, perturbation)[None], self.L_time)
         if perturbation.state_noise > 0:
             encoded = encoded + perturbation.state_noise * torch.randn_like(encoded)
-        return self.time_net(encoded) if self.synthetic else encoded
+        return self.time_net(encoded) if self.settings.synthetic else encoded
 
     def network(self, places: Tensor, encoded_time: Tensor) -> Tensor:
         """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
-        encoded = octaves(places, self.L_mean)
+        encoded = octaves(places, self.settings.L_mean)
         features = encoded
         for index, layer in enumerate(self.layers):
             assert isinstance(layer, nn.Linear)
@@ -136,12 +146,6 @@ class TimeMLP(Deformation):
                 weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
             features = torch.relu(nn.functional.linear(features, weight, bias))
         return self.head(features)
-
-    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
-        return moving_labels(canonical, self.label_names)
-
-    def finished(self, canonical: CanonicalGaussians, states: list[State]) -> CanonicalGaussians:
-        return mark_moving(self, canonical, states[::4]) if self.instruments else canonical
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         return dict.fromkeys((name for name, _ in self.named_parameters()), log_linear(8e-4, 1.6e-6, progress))

@@ -47,21 +47,26 @@ def directions_of(columns: Tensor, rows: Tensor, intrinsics: Tensor, rotation: T
     return (rotation @ local[..., None])[..., 0]
 
 
-def camera_rays(camera: Camera, time: float) -> Rays:
-    """One ray through the centre of every pixel, row by row."""
-    rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    pose = camera.world_from_camera.detach().float()
-    intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy])
+def camera_rays(camera: Camera, time: float, device: torch.device) -> Rays:
+    """One ray through the centre of every pixel, row by row, on `device`."""
+    pose = camera.world_from_camera.detach().float().to(device)
+    down, across = torch.arange(camera.height, device=device) + 0.5, torch.arange(camera.width, device=device) + 0.5
+    rows, columns = torch.meshgrid(down, across, indexing="ij")
+    intrinsics = pose.new_tensor([camera.fx, camera.fy, camera.cx, camera.cy])
     directions = directions_of(columns.flatten(), rows.flatten(), intrinsics, pose[:3, :3])
-    return Rays(
-        pose[:3, 3].expand_as(directions), directions, torch.full((len(directions),), time, dtype=torch.float64)
-    )
+    times = torch.full((len(directions),), time, dtype=torch.float64, device=device)
+    return Rays(pose[:3, 3].expand_as(directions), directions, times)
 
 
-def even_depths(count: int, near: float, far: float, rays: int, generator: torch.Generator | None) -> Tensor:
-    """Depths [R, S] mm, one in each of `count` equal stretches: anywhere by `generator`, without one in the middle."""
-    edges = torch.linspace(near, far, count + 1)
-    place = torch.full((rays, count), 0.5) if generator is None else torch.rand(rays, count, generator=generator)
+def even_depths(count: int, bounds: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
+    """Depths [R, S] mm, one in each of `count` equal stretches between `bounds` [2]: anywhere by `generator`, without
+    one in the middle."""
+    device = bounds.device
+    edges = torch.linspace(bounds[0], bounds[1], count + 1, device=device)
+    if generator is None:
+        place = torch.full((rays, count), 0.5, device=device)
+    else:
+        place = torch.rand(rays, count, generator=generator, device=device)
     return edges[:-1] + (edges[1:] - edges[:-1]) * place
 
 
@@ -71,12 +76,12 @@ def finer_depths(depths: Tensor, weights: Tensor, count: int, generator: torch.G
     with torch.no_grad():
         middles = (depths[:, 1:] + depths[:, :-1]) / 2  # [R, S-1] edges of the inner samples
         share = weights[:, 1:-1] + 1e-5
-        reached = torch.cat([torch.zeros(len(depths), 1), (share / share.sum(-1, keepdim=True)).cumsum(-1)], -1)
-        even = (torch.arange(count) + 0.5) / count
+        reached = torch.cat([share.new_zeros(len(depths), 1), (share / share.sum(-1, keepdim=True)).cumsum(-1)], -1)
+        even = (torch.arange(count, device=depths.device) + 0.5) / count
         if generator is None:
             wanted = even.expand(len(depths), count)
         else:
-            wanted = torch.rand(len(depths), count, generator=generator)
+            wanted = torch.rand(len(depths), count, generator=generator, device=depths.device)
         above = torch.searchsorted(reached, wanted.contiguous(), right=True).clamp(1, reached.shape[1] - 1)
         low, high = reached.gather(1, above - 1), reached.gather(1, above)
         start, end = middles.gather(1, above - 1), middles.gather(1, above)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +11,11 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
 from neeco.raster.types import Rendering
+from neeco.scene.encoding import encode_by_octave
 from neeco.scene.nerfies.render import Composite, Rays, camera_rays, composite, even_depths, finer_depths
-from neeco.scene.nerfies.settings import Nerfies
-from neeco.scene.nerfies.warp import Mlp, WarpField, encode
-from neeco.scene.scene import Recording
+from neeco.scene.nerfies.settings import NerfiesSettings
+from neeco.scene.nerfies.warp import Mlp, WarpField
+from neeco.scene.recording import Recording
 
 CODE_RANGE = 0.05  # codes start in U(-0.05, 0.05), as in the source
 COLOR_WIDTH = 0.5  # of the trunk's: the layer that sees the direction
@@ -23,7 +24,7 @@ COLOR_WIDTH = 0.5  # of the trunk's: the layer that sees the direction
 class Template(nn.Module):
     """The NeRF in template space: density from the place; colour from place, direction and appearance code."""
 
-    def __init__(self, settings: Nerfies) -> None:
+    def __init__(self, settings: NerfiesSettings) -> None:
         super().__init__()
         self.frequencies, self.view_frequencies = settings.frequencies, settings.view_frequencies
         width = settings.width
@@ -38,7 +39,7 @@ class Template(nn.Module):
 
     def forward(self, places: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
         """places [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
-        features = self.trunk(encode(places, self.frequencies))
+        features = self.trunk(encode_by_octave(places, self.frequencies))
         density = nn.functional.softplus(self.density(features)[..., 0] - 1)
         conditions = conditions[:, None].expand(-1, places.shape[1], -1)
         seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
@@ -47,7 +48,7 @@ class Template(nn.Module):
     def condition(self, directions: Tensor, appearance: Tensor) -> Tensor:
         """What is the same for all samples of a ray [R, V]."""
         unit = nn.functional.normalize(directions, dim=-1)
-        return torch.cat([encode(unit, self.view_frequencies), appearance], -1)
+        return torch.cat([encode_by_octave(unit, self.view_frequencies), appearance], -1)
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Drawn:
 class NerfScene(nn.Module):
     """`Drawable`. Positions inside are (world - center) / scale, so that the sparse points lie in [-1, 1].
 
-    `near` and `far` bound the samples' depth in mm. `opened` counts the warp's frequencies that are in use.
+    `bounds` (near, far) are those of the samples' depth in mm. `opened` counts the warp's frequencies that are in use.
     """
 
     center: Tensor
@@ -75,9 +76,10 @@ class NerfScene(nn.Module):
 
     label_names: tuple[tuple[str, str], ...] = ()
     num_gaussians = None
+    has_gaussians = False
 
     def __init__(
-        self, method: str, settings: Nerfies, instruments: tuple[Instrument, ...], recorded: Recording
+        self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recording
     ) -> None:
         super().__init__()
         self.method = method
@@ -102,8 +104,12 @@ class NerfScene(nn.Module):
         return camera
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay."""
-        return self.settings.torch_threads()
+        """All of torch's threads: a drawing is a few large products."""
+        return nullcontext()
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Nothing beside the state of its modules."""
+        return {}, {}
 
     def codes_at(self, codes: Tensor, times: Tensor) -> Tensor:
         """Codes [R, C] at `times` [R] s: linear between the training moments' codes [T, C], the nearest outside."""
@@ -120,7 +126,6 @@ class NerfScene(nn.Module):
     def trace(self, rays: Rays, generator: torch.Generator | None = None) -> Drawn:
         """Draw rays. With a `generator` samples lie at random in their stretches, as in training."""
         settings = self.settings
-        near, far = self.bounds.tolist()
         codes = self.codes_at(self.codes, rays.times)
         unit = rays.directions.norm(dim=-1) / self.scale
         appearance = self.codes_at(self.appearances, rays.times)
@@ -131,7 +136,7 @@ class NerfScene(nn.Module):
             densities, colors = template(warped, template.condition(rays.directions, appearance))
             return composite(densities, colors, depths, unit)
 
-        depths = even_depths(settings.coarse_samples, near, far, len(rays), generator)
+        depths = even_depths(settings.coarse_samples, self.bounds, len(rays), generator)
         places = self.places(rays, depths)
         coarse = seen(self.coarse, depths, places)
         if self.fine is None:
@@ -142,7 +147,7 @@ class NerfScene(nn.Module):
     @torch.no_grad()
     def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """The image at `state.time`, `settings.chunk` rays at once, without gradients. The field has no labels."""
-        rays = camera_rays(camera, state.time)
+        rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []
         for start in range(0, len(rays), self.settings.chunk):
             drawn = self.trace(rays.part(slice(start, start + self.settings.chunk)))
@@ -153,6 +158,6 @@ class NerfScene(nn.Module):
             alpha=torch.cat([part.alpha for part in parts]).view(shape),
             depth=torch.cat([part.depth for part in parts]).view(shape),
             channels=None,
-            radii=torch.zeros(0),
-            center_offsets=torch.zeros(0, 2),
+            radii=self.bounds.new_zeros(0),
+            center_offsets=self.bounds.new_zeros(0, 2),
         )

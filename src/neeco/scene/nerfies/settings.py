@@ -1,4 +1,4 @@
-"""Method `nerfies`: what `scene/methods.py` and training ask of it, and its sizes.
+"""Settings of method `nerfies`, and where it departs from its source.
 
 Nerfies (Park et al., ICCV 2021): a template NeRF, and for every moment a code from which an SE(3) field warps each
 sample of a ray into the template. Faithful to the source: SE(3) field with a skip at layer 4, heads drawn from
@@ -25,13 +25,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
-from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
-from neeco.scene.deformations.base import PLAIN_TRAINING
 
 # The source's sizes, a GPU's work (some 17 TFLOP a step): pass each as --set deformation.NAME=VALUE.
 PUBLISHED: Mapping[str, int | float] = {
@@ -49,14 +45,12 @@ PUBLISHED: Mapping[str, int | float] = {
 
 
 @dataclass(frozen=True)
-class Nerfies:
-    """Fields: `rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws);
-    template `depth` x `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x
-    `warp_width`, with `warp_frequencies`; numbers per warp `code` and `appearance` code (0: none);
-    `window`: share of the run over which the warp's frequencies open; `chunk`: rays drawn at once.
-    """
+class NerfiesSettings:
+    """`rays` per step; `coarse_samples` and `fine_samples` along each (0 fine: one network draws); template `depth` x
+    `width`, with `frequencies` of points and `view_frequencies` of directions; warp `warp_depth` x `warp_width`, with
+    `warp_frequencies`; numbers per warp `code` and `appearance` code (0: none); `window`: share of the run over which
+    the warp's frequencies open; `chunk`: rays drawn at once."""
 
-    instruments: tuple[Instrument, ...]
     rays: int = 128
     coarse_samples: int = 32
     fine_samples: int = 0
@@ -77,13 +71,9 @@ class Nerfies:
     rate: float = 5e-3
     chunk: int = 512
 
-    training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
-    needs_instruments: ClassVar[bool] = False
-    needs_times: ClassVar[bool] = True
-
     def __post_init__(self) -> None:
         may_be_zero = {"fine_samples", "appearance", "elastic_rays", "elastic_weight", "background_weight"}
-        for field in dataclasses.fields(self)[1:]:
+        for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if value < 0 or (value == 0 and field.name not in may_be_zero | {"background_points", "window"}):
                 raise NeecoError(f"deformation.{field.name}: {value} is too small; give a larger number")
@@ -91,12 +81,3 @@ class Nerfies:
             raise NeecoError("deformation.coarse_samples: a ray needs at least 2 samples")
         if self.window > 1:
             raise NeecoError(f"deformation.window: {self.window} is not a share of the training in [0, 1]")
-
-    @classmethod
-    def torch_threads(cls) -> AbstractContextManager[None]:
-        """All of torch's threads: one step is a few large products."""
-        return nullcontext()
-
-    def config(self) -> dict[str, Any]:
-        """JSON-able keyword arguments that make equal settings."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:]}

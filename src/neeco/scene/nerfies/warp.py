@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
+
+from neeco.scene.encoding import encode_by_octave
 
 HEAD_RANGE = 1e-4  # the heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
 SMALL = 1e-4  # rad^2 below which the series is more exact than the closed form
@@ -36,24 +36,6 @@ def move_by_screw(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     carried = torch.linalg.cross(rotation, velocity)
     moved = points + sine * turned + cosine * torch.linalg.cross(rotation, turned)
     return moved + velocity + cosine * carried + rest * torch.linalg.cross(rotation, carried)
-
-
-def encode(values: Tensor, frequencies: int, opened: Tensor | None = None) -> Tensor:
-    """[..., D] to [..., D (1 + 2L)]: the values, then sin and cos of 2^k pi x for k < L.
-
-    `opened` in [0, L] is how many frequencies let through; the next one in part (see `window`).
-    """
-    octaves = math.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype)
-    angles = values[..., None, :] * octaves[:, None]  # [..., L, D]
-    waves = torch.cat([angles.sin(), angles.cos()], -1)
-    if opened is not None:
-        waves = waves * window(opened, frequencies)[:, None]
-    return torch.cat([values, waves.flatten(-2)], -1)
-
-
-def window(opened: Tensor, frequencies: int) -> Tensor:
-    """Weight [L] of each frequency: (1 - cos(pi clamp(a - k, 0, 1))) / 2 (Nerfies eq. 5)."""
-    return (1 - torch.cos(math.pi * (opened - torch.arange(frequencies)).clamp(0, 1))) / 2
 
 
 class Mlp(nn.Module):
@@ -92,7 +74,7 @@ class WarpField(nn.Module):
 
     def forward(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
         """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; places in the template [M, 3]."""
-        features = self.trunk(torch.cat([encode(points, self.frequencies, opened), codes], -1))
+        features = self.trunk(torch.cat([encode_by_octave(points, self.frequencies, opened), codes], -1))
         return move_by_screw(points, self.rotation(features), self.velocity(features))
 
     def jacobian(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:

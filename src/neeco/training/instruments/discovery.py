@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.deformations._hinges import PART_LOGITS, Hinged, Hinges
+from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
-from neeco.scene.scene import Recording, Scene
+from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
+from neeco.scene.learning import Report
+from neeco.scene.recording import Recording
+from neeco.scene.scene import Scene
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.instruments.carving import MOVES, CarvedShape, carve, score_points, views_of
 from neeco.training.instruments.evidence import Evidence, gather_evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
-from neeco.training.protocol import Report
-from neeco.training.refinement import Refinement
-from neeco.training.schedule import order_by_pose
-from neeco.training.session import Session
+from neeco.training.session import GaussianSession, new_session
+from neeco.training.views import TrainingViews
 
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
 LONGER_STEPS = 1500  # of the one with density control, where the sparse points alone explain too little
@@ -32,24 +29,18 @@ AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
 
 
-def find_instruments(
-    scene: Scene,
-    hinged: Hinged,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
-    report: Report,
-) -> None:
-    """Add every instrument's body to `scene`, whose canonical set holds the tissue alone, and start its hinges.
+def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
+    """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
+    hinges.
 
     `hinged` is the scene's deformation, known to have hinges. Raises NeecoError when an instrument leaves no evidence
     in its own frame: its poses do not match the images.
     """
+    scene, config, report = session.scene, session.config, session.report
     report("looking for the instruments: fitting the tissue alone")
-    evidence = tissue_evidence(scene, frames, images, masks, config)
+    evidence = tissue_evidence(scene, session.views, config)
     generator = torch.Generator().manual_seed(config.seed)
-    bodies = [_with_logits(scene.canonical, hinged.logit_count)]
+    bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
         shape = carve(evidence, instrument.name, generator, SEEDS)
         if shape is None:
@@ -61,8 +52,9 @@ def find_instruments(
             shape = shape_around_frame(shape, evidence.distance, generator)
         hinges = hinged.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
-        body = seed_gaussians(shape.seeds, torch.full((SEEDS, 3), 0.4), torch.full((SEEDS,), 0.4 * shape.radius))
-        logits = seed_logits(hinges, shape.seeds, hinged.logit_count, generator)
+        seeds = shape.seeds.to(scene.center.device)
+        body = seed_gaussians(seeds, seeds.new_full((SEEDS, 3), 0.4), seeds.new_full((SEEDS,), 0.4 * shape.radius))
+        logits = seed_logits(hinges, seeds, hinged.logit_count, generator)
         bodies.append(body.with_extras(**{PART_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
@@ -98,32 +90,20 @@ def shape_around_frame(shape: CarvedShape, distance: float, generator: torch.Gen
     )
 
 
-def tissue_evidence(
-    scene: Scene,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
-) -> Evidence:
+def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig) -> Evidence:
     """Fit a copy of the tissue with nothing moving; what is left over is the evidence.
 
     A few hundred steps of the sparse points do on tissue full of texture. Where much is left over, the points are too
     few, and a longer fit may add Gaussians.
     """
-    evidence = _evidence_after(TISSUE_STEPS, 10**9, scene, frames, images, masks, config)
+    evidence = _evidence_after(TISSUE_STEPS, 10**9, scene, views, config)
     if float(evidence.hits.mean()) <= UNEXPLAINED:
         return evidence
-    return _evidence_after(LONGER_STEPS, 200, scene, frames, images, masks, config)
+    return _evidence_after(LONGER_STEPS, 200, scene, views, config)
 
 
 def _evidence_after(
-    steps: int,
-    density_start: int,
-    scene: Scene,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
+    steps: int, density_start: int, scene: Scene, views: TrainingViews, config: TrainConfig
 ) -> Evidence:
     """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
@@ -136,55 +116,13 @@ def _evidence_after(
         refine=RefineConfig(),
         density_start=density_start,
         density_stop=0.8,
-        opacity_penalty=0.0,
-        label_sharpness=0.0,
-        shaft_roll=0.0,
     )
-    session = new_session(alone, frames, images, masks, short)
+    session = new_session(alone, views, short)
+    session.start()
     while session.iteration < steps:
         session.step()
     alone.requires_grad_(False)
-    return gather_evidence(alone, frames, images, masks)
-
-
-def new_session(
-    scene: Scene,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
-) -> Session:
-    """A session at iteration 0."""
-    names = tuple(instrument.name for instrument in scene.instruments)
-    return Session(
-        config,
-        scene,
-        frames,
-        list(images),
-        list(masks),
-        pose_order(frames, names),
-        scene_extent(frames, scene.center),
-        Refinement(config.refine, frames, names),
-        np.random.default_rng(config.seed),
-        torch.Generator().manual_seed(config.seed),
-    )
-
-
-def scene_extent(frames: tuple[Frame, ...], center: Tensor) -> float:
-    """Half the median distance from the cameras to the scene's middle, mm: scales the positions' learning rate."""
-    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in frames]
-    return 0.5 * float(np.median(distances))
-
-
-def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:
-    """Frames in the order of a walk through instrument positions and directions (see `order_by_pose`)."""
-    if not instruments:
-        return np.arange(len(frames))
-    rows = [
-        np.concatenate([frame.state.instruments[name].pose[:3, 1:].double().numpy().ravel() for name in instruments])
-        for frame in frames
-    ]
-    return order_by_pose(np.stack(rows))
+    return gather_evidence(alone, views)
 
 
 def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> None:
@@ -208,17 +146,13 @@ def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedSha
 
 def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
     """[M, columns] part logits: behind the first hinge the body, beyond it one of the moving parts at random."""
-    logits = 0.3 * torch.randn(len(seeds), columns, generator=generator)
+    logits = 0.3 * torch.randn(len(seeds), columns, generator=generator).to(seeds)
     if not hinges.joint_names:
         return logits
     with torch.no_grad():
         along = hinges.along_shaft(seeds)
         beyond = along > hinges.hinge_depth[0]
         logits[:, 0] += torch.where(beyond, 0.0, BODY_LEAN)
-        side = torch.randint(1, hinges.part_count, (len(seeds),), generator=generator)
+        side = torch.randint(1, hinges.part_count, (len(seeds),), generator=generator).to(seeds.device)
         lean = nn.functional.one_hot(side, columns) * (BODY_LEAN / 2)
-        return logits + torch.where(beyond[:, None], lean, torch.zeros(()))
-
-
-def _with_logits(tissue: CanonicalGaussians, columns: int) -> CanonicalGaussians:
-    return tissue.with_extras(**{PART_LOGITS: torch.zeros(len(tissue), columns)})
+        return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))

@@ -5,7 +5,6 @@ A short static fit explains the tissue; each image's residual is the evidence. N
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.raster import rasterize
 from neeco.scene.scene import Scene
+from neeco.training.views import TrainingViews
 
 FLOOR, RANGE = 0.04, 0.06  # residual at which evidence begins, and over which it saturates (images in [0, 1])
 
@@ -65,30 +65,27 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(
-    scene: Scene,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    most: int = 120,
-) -> Evidence:
-    """Residuals of a tissue-only `scene` against at most `most` training images, evenly picked.
+def gather_evidence(scene: Scene, views: TrainingViews, most: int = 120) -> Evidence:
+    """Residuals of a tissue-only `scene` against at most `most` training images, evenly picked, on the CPU.
 
-    images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame; where a mask is False there is no evidence.
+    Where a mask is False there is no evidence.
     """
+    frames = views.frames
     step = max(1, -(-len(frames) // most))
     picked = list(range(0, len(frames), step))
     hits, depths = [], []
     for index in picked:
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
-        residual = (rendering.color - images[index].float() / 255).abs().mean(-1)
-        mask = masks[index]
+        residual = (rendering.color - views.target(index)).abs().mean(-1)
+        mask = views.masks[index]
         if mask is not None:
             residual = residual * mask
         smooth = torch.nn.functional.avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-        hits.append(((smooth - FLOOR) / RANGE).clamp(0, 1))
-        depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
+        hits.append(((smooth - FLOOR) / RANGE).clamp(0, 1).cpu())
+        depths.append(
+            torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)).cpu()
+        )
     cameras = [frames[i].camera for i in picked]
     return Evidence(
         _stacked(hits, 0.0),

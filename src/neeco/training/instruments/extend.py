@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._hinges import Hinges
-from neeco.scene.scene import Recording
+from neeco.scene.hinges import Hinges
+from neeco.scene.recording import Recording
 
 WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
 ENDS_IN_VIEW = 0.3  # share above which the instrument's rear end is taken for real

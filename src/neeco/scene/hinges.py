@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -59,7 +59,7 @@ class Hinges(nn.Module):
 
     def shaft(self) -> tuple[Tensor, Tensor]:
         """(origin [3] mm, unit direction [3] towards the jaws), instrument frame."""
-        one, zero = torch.ones(1), torch.zeros(1)
+        one, zero = self.shaft_tilt.new_ones(1), self.shaft_tilt.new_zeros(1)
         direction = nn.functional.normalize(self.base[:3, :3] @ torch.cat([self.shaft_tilt, one]), dim=0)
         origin = self.base[:3, :3] @ torch.cat([self.shaft_shift, zero]) + self.base[:3, 3]
         return origin, direction
@@ -72,7 +72,7 @@ class Hinges(nn.Module):
         """
         origin, direction = (part.detach() for part in self.shaft())
         angle = self.hinge_angle[joint]
-        around = self.base[:3, :3] @ torch.stack([angle.cos(), angle.sin(), torch.zeros(())])
+        around = self.base[:3, :3] @ torch.stack([angle.cos(), angle.sin(), angle.new_zeros(())])
         axis = nn.functional.normalize(around - (around @ direction) * direction, dim=0)
         return origin + self.hinge_depth[joint] * direction, axis
 
@@ -103,19 +103,21 @@ class Hinges(nn.Module):
             turn = quat if turn is None else quat_multiply(quat, turn)
         return points, turn
 
-    def left_part(self, joint: int) -> int:
-        """Which of a joint's two parts (0 or 1) is the left one.
+    def left_first(self, joint: int) -> Tensor:
+        """A joint's two parts (0 and 1) as indices [2], the left one first.
 
         The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
         part opens towards (shaft direction x axis).
         """
         _, axis = self.hinge(joint)
-        sign = torch.sign(axis[axis.abs().argmax()])
-        return int((sign * self.gains[joint]).argmin())
+        sign = torch.sign(axis.gather(0, axis.abs().argmax()[None]))
+        left = (sign * self.gains[joint]).argmin()
+        return torch.stack([left, 1 - left])
 
 
 class Hinged(Protocol):
-    """What training asks of a deformation with hinges. Bodies: 0 tissue, then one per instrument in its own frame."""
+    """What the search for instruments asks of a deformation with hinges. Bodies: 0 tissue, then one per instrument in
+    its own frame."""
 
     @property
     def logit_count(self) -> int:
@@ -128,4 +130,8 @@ class Hinged(Protocol):
 
     def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """Part weights [M, part_count] of one instrument's Gaussians."""
+        ...
+
+    def spun(self, roll: float) -> Any:
+        """The perturbation of `Scene.at` that spins everything behind the wrists by `roll` rad about the shafts."""
         ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,14 +12,13 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.scene.methods import make_field
+from neeco.raster.adam import Adam
+from neeco.scene.deformations.base import log_linear
+from neeco.scene.learning import Config, Start, StepResult
+from neeco.scene.nerfies.rays import RayTable
 from neeco.scene.nerfies.scene import Drawn, NerfScene
-from neeco.scene.nerfies.settings import Nerfies
-from neeco.scene.scene import Recording
-from neeco.training.config import TrainConfig, decayed
-from neeco.training.optimizer import Adam
-from neeco.training.protocol import Report, StepResult, done_share
-from neeco.training.rays import RayTable
+from neeco.scene.nerfies.settings import NerfiesSettings
+from neeco.scene.recording import Recording
 
 FINAL_RATE = 0.1  # of the first: 1e-3 to 1e-4, log-linear
 ROBUST_SCALE = 0.03  # c of both losses: log singular values, and template units
@@ -29,17 +28,11 @@ FAR_SHARE = 1.15  # of the farthest one's
 QUANTILES = (0.01, 0.99)  # of the points, against stray ones
 
 
-def initial_field(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig) -> NerfScene:
+def initial_field(capture: Capture, frames: tuple[Frame, ...], config: Config) -> NerfScene:
     """The untrained field, its box and depths taken from the sparse points and the training cameras. Raises NeecoError
     where a setting does not fit."""
-    recorded = Recording(
-        tuple(frame.name for frame in frames),
-        tuple(frame.split for frame in frames),
-        tuple(frame.state for frame in frames),
-        tuple(frame.camera for frame in frames),
-    )
-    settings = make_field(config.method, capture.instruments, config.deformation)
-    scene = NerfScene(config.method, settings, capture.instruments, recorded)
+    recorded = Recording.of(frames, capture.instruments)
+    scene = NerfScene(config.method, config.deformation, capture.instruments, recorded)
     points = torch.from_numpy(capture.points.positions).float()
     near, far = depth_bounds(points, frames)
     eyes = torch.stack([frame.camera.world_from_camera[:3].float() for frame in frames])
@@ -82,7 +75,7 @@ def elastic_loss(jacobians: Tensor) -> Tensor:
 class NerfiesSession:
     """One training run in memory. `points` [P, 3] mm are tissue; empty where none were measured."""
 
-    config: TrainConfig
+    config: Config
     scene: NerfScene
     table: RayTable
     points: Tensor
@@ -94,16 +87,24 @@ class NerfiesSession:
     phase: int = 1
     forced: bool = False
 
+    @classmethod
+    def around(cls, scene: NerfScene, start: Start) -> NerfiesSession:
+        """A session at iteration 0."""
+        cloud, device = start.capture.points, start.views.device
+        points = torch.from_numpy(cloud.positions).float() if cloud.measured else torch.zeros(0, 3)
+        generator = torch.Generator(device).manual_seed(start.config.seed)
+        return cls(start.config, scene, RayTable(start.views), points.to(device), generator)
+
     def __post_init__(self) -> None:
         self.scene.requires_grad_(True)
 
     @property
     def progress(self) -> float:
         """Done share of the run in [0, 1]."""
-        return done_share(self.config, self.iteration, self.seconds)
+        return self.config.done_share(self.iteration, self.seconds)
 
     @property
-    def settings(self) -> Nerfies:
+    def settings(self) -> NerfiesSettings:
         """The method's own."""
         return self.scene.settings
 
@@ -125,7 +126,7 @@ class NerfiesSession:
                 "on the capture, or train anew with another --seed (the last checkpoint is kept)"
             )
         total.backward()
-        rate = decayed(settings.rate, progress, FINAL_RATE)
+        rate = log_linear(settings.rate, FINAL_RATE * settings.rate, progress)
         for name, parameter in scene.named_parameters():
             if parameter.numel():
                 self.adam.step(name, parameter, rate)
@@ -136,7 +137,7 @@ class NerfiesSession:
         settings, scene = self.settings, self.scene
         count = min(settings.elastic_rays, settings.rays)
         if settings.elastic_weight == 0 or count == 0:
-            return torch.zeros(())
+            return self.table.pixels.new_zeros((), dtype=torch.float32)
         reached = drawn.coarse.weights[:count].detach().cumsum(-1)
         median = (reached < 0.5).sum(-1).clamp_max(reached.shape[1] - 1)[:, None]
         places, codes = drawn.places[:count], drawn.codes[:count]
@@ -148,11 +149,12 @@ class NerfiesSession:
         settings, scene = self.settings, self.scene
         count = min(settings.background_points, len(self.points))
         if settings.background_weight == 0 or count == 0:
-            return torch.zeros(())
-        chosen = torch.randint(len(self.points), (count,), generator=self.generator)
-        moments = torch.randint(len(scene.times), (count,), generator=self.generator)
+            return self.table.pixels.new_zeros((), dtype=torch.float32)
+        chosen = torch.randint(len(self.points), (count,), generator=self.generator, device=self.points.device)
+        moments = torch.randint(len(scene.times), (count,), generator=self.generator, device=self.points.device)
         places = (self.points[chosen] - scene.center) / scene.scale
-        places = places + POINT_NOISE * torch.randn(places.shape, generator=self.generator)
+        noise = torch.randn(places.shape, generator=self.generator, device=places.device)
+        places = places + POINT_NOISE * noise
         moved = scene.warp(places, scene.codes[moments], scene.opened) - places
         return settings.background_weight * robust(moved.square().sum(-1)).mean()
 
@@ -163,29 +165,14 @@ class NerfiesSession:
         """Nothing beside what every checkpoint holds."""
         return {}, {}
 
-    def restore(self, tensors: dict[str, Tensor], fields: dict[str, Any]) -> None:
+    def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
         """The inverse of `pack`."""
 
-    def finish(self, report: Report) -> None:
+    def finish(self) -> None:
         """Hold the field still, and note how it was learned."""
         self.scene.requires_grad_(False)
         self.scene.diagnostics["iterations"] = self.iteration
         self.scene.diagnostics["moments"] = len(self.scene.times)
-
-
-def new_nerfies_session(
-    scene: NerfScene,
-    capture: Capture,
-    frames: tuple[Frame, ...],
-    images: Sequence[Tensor],
-    masks: Sequence[Tensor | None],
-    config: TrainConfig,
-) -> NerfiesSession:
-    """A session at iteration 0. images [H, W, 3] uint8 and masks ([H, W] bool or None), one per frame."""
-    points = torch.from_numpy(capture.points.positions).float() if capture.points.measured else torch.zeros(0, 3)
-    return NerfiesSession(
-        config, scene, RayTable(frames, images, masks), points, torch.Generator().manual_seed(config.seed)
-    )
 
 
 def _error(colors: Tensor, wanted: Tensor, counted: Tensor | None) -> Tensor:

@@ -1,0 +1,81 @@
+"""What the rest of the program asks of a method, whatever it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from neeco.capture.model import Instrument
+from neeco.raster.threads import torch_threads
+from neeco.scene.drawable import Learned
+from neeco.scene.learning import Session, Start
+from neeco.scene.recording import Recording
+
+# Plain 3DGS: no part of the paper's dynamic training adjustment acts.
+PLAIN_TRAINING: Mapping[str, Any] = {
+    "schedule.density_interval": "off",
+    "schedule.opacity_reset": "off",
+    "schedule.gradient_threshold": "off",
+    "schedule.sh_order": "off",
+    "schedule.frame_order": "off",
+    "schedule.compensation": "off",
+}
+
+
+@dataclass(frozen=True)
+class NoSettings:
+    """Of a method that has none of its own."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A scene as its file holds it. `gaussians` makes the scene of any method that deforms Gaussians."""
+
+    settings: Any  # the method's own, an instance of its `Settings`
+    instruments: tuple[Instrument, ...]
+    recorded: Recording
+    tensors: Mapping[str, Tensor]  # by name
+    header: Mapping[str, Any]
+    gaussians: Callable[[Any, Stored], Learned]  # of a deformation
+
+
+class Method:
+    """A method is one class in one file under `scene/`, found there by its name, `method`; nothing else names it.
+
+    `Settings` is a frozen dataclass of its own settings (`--set deformation.NAME=VALUE`), each with a type and a
+    default; its docstring describes them. `training_defaults` are fields of the training config that differ from the
+    paper's, dotted names as in `neeco train --set`.
+    """
+
+    method: ClassVar[str]
+    Settings: ClassVar[type[Any]] = NoSettings
+    training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
+    needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
+    needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
+    has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; a drawing takes seconds
+    large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
+
+    @classmethod
+    def torch_threads(cls) -> AbstractContextManager[None]:
+        """As many of torch's threads as pay where scenes are posed and drawn: one, unless the operations are large."""
+        return nullcontext() if cls.large_operations else torch_threads(1)
+
+    @classmethod
+    def session(cls, start: Start, scene: Any | None) -> Session:
+        """A session at iteration 0: around a new scene, or around `scene`, which a checkpoint held.
+
+        Raises NeecoError where the capture does not do.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def load(cls, stored: Stored) -> Learned:
+        """The scene that a file holds, but for the state of its modules, which the reader of files loads into it.
+
+        Raises ValueError, LookupError or RuntimeError where the file does not fit.
+        """
+        raise NotImplementedError

@@ -1,0 +1,135 @@
+"""Settings as frozen dataclasses: read from YAML or JSON by their types, written back, described for help texts.
+
+cattrs structures nested dataclasses, tuples and optional fields. The scalars are ours: a library's would take "3" for a
+number and any text for true.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+from neeco.errors import NeecoError
+
+T = TypeVar("T")
+WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+
+
+def structure(kind: type[T], values: Mapping[str, Any], where: str = "", owner: str = "it") -> T:
+    """The dataclass `kind` with `values`; fields left out keep their defaults. `owner` has them, in messages.
+
+    Raises NeecoError naming the field (`where` and its dotted path) that is unknown or does not fit its type.
+    """
+    from cattrs.errors import BaseValidationError
+
+    try:
+        return _converter().structure(values, kind)
+    except BaseValidationError as error:
+        raise NeecoError(next(_problems(error, where, owner))) from None
+
+
+def plain(settings: Any) -> dict[str, Any]:
+    """`settings` as dicts, lists and scalars; `structure` is the inverse."""
+    value = _plain(dataclasses.asdict(settings))
+    assert isinstance(value, dict)
+    return value
+
+
+def with_fields(settings: Any, values: Mapping[str, Any]) -> Any:
+    """The dataclass `settings` with fields changed by name; dots reach into nested ones (`refine.latency`)."""
+    for name, value in values.items():
+        field, _, rest = name.partition(".")
+        changed = with_fields(getattr(settings, field), {rest: value}) if rest else value
+        settings = dataclasses.replace(settings, **{field: changed})
+    return settings
+
+
+def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
+    """Every field of the dataclass `kind` as (name, type, default), in words."""
+    for field in dataclasses.fields(kind):
+        hint = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+        default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        text = f"{default:.4g}" if isinstance(default, float) else str(default)
+        yield field.name, hint.replace("Literal", ""), text
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+@cache
+def _converter() -> Any:
+    import cattrs
+
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind in WORDS:
+        converter.register_structure_hook(kind, _scalar)
+    converter.register_structure_hook_func(lambda kind: typing.get_origin(kind) is typing.Literal, _word)
+    converter.register_structure_hook_func(_is_optional, lambda value, kind: _optional(converter, value, kind))
+    converter.register_structure_hook_func(
+        lambda kind: typing.get_origin(kind) is tuple, lambda value, kind: _tuple(converter, value, kind)
+    )
+    return converter
+
+
+def _scalar(value: Any, kind: type[Any]) -> Any:
+    allowed = (int, float) if kind is float else (kind,)  # a whole number is a number too
+    if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{value!r} is not {WORDS[kind]}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{value!r} is not a finite number")
+    return value
+
+
+def _word(value: Any, kind: Any) -> Any:
+    allowed = typing.get_args(kind)
+    if value not in allowed:
+        raise ValueError(f"{value!r} is none of {', '.join(map(str, allowed))}")
+    return value
+
+
+def _is_optional(kind: Any) -> bool:
+    return typing.get_origin(kind) in (typing.Union, types.UnionType) and type(None) in typing.get_args(kind)
+
+
+def _optional(converter: Any, value: Any, kind: Any) -> Any:
+    (arm,) = (arm for arm in typing.get_args(kind) if arm is not type(None))
+    return None if value is None else converter.structure(value, arm)
+
+
+def _tuple(converter: Any, value: Any, kind: Any) -> Any:
+    item, *_ = typing.get_args(kind)
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ValueError(f"{value!r} is not a list; write [{value}]")
+    return tuple(converter.structure(entry, item) for entry in value)
+
+
+def _problems(error: BaseException, where: str, owner: str) -> Iterator[str]:
+    """What is wrong, field by field."""
+    from cattrs.errors import AttributeValidationNote, BaseValidationError, ForbiddenExtraKeysError
+
+    if isinstance(error, BaseValidationError):
+        for inner in error.exceptions:
+            notes = [note for note in getattr(inner, "__notes__", []) if isinstance(note, AttributeValidationNote)]
+            yield from _problems(inner, _dotted(where, *(note.name for note in notes)), owner)
+    elif isinstance(error, ForbiddenExtraKeysError):
+        known = ", ".join(field.name for field in dataclasses.fields(error.cl)) or "none"
+        for name in sorted(error.extra_fields):
+            yield f"{_dotted(where, name)}: {owner} has no such field; it has {known}"
+    elif isinstance(error, NeecoError):
+        yield str(error)
+    elif isinstance(error, ValueError):
+        yield f"{where}: {error}"
+    else:
+        yield f"{where}: is a group of fields, each with a value of its own"
+
+
+def _dotted(*names: str) -> str:
+    return ".".join(name for name in names if name)
