@@ -21,8 +21,9 @@ def rasterize_cuda(
 
     n, device = len(gaussians), gaussians.means.device
     empty = torch.zeros(n, 2, device=device, requires_grad=torch.is_grad_enabled())
+    camera = camera.to(device)
     index = usable_gaussians(gaussians, camera, channels).nonzero()[:, 0]
-    pose = camera.world_from_camera.to(device=device, dtype=torch.float32)
+    pose = camera.world_from_camera.float()
     rotation, translation = camera_from_world(pose)
     if len(index) == 0:
         return _nothing(camera, channels, background, empty)
