@@ -10,8 +10,6 @@ struct LossInputs {
     const float* image;         // [H, W, 3]
     const float* target;        // [H, W, 3]
     const float* mask;          // [H, W] 0 or 1, or null
-    const float* target_mean;   // [H, W, 3] blurred target, or null: computed
-    const float* target_square; // [H, W, 3] blurred squared target
     float ssim_weight;
     double pixels;              // unmasked pixels
 };
@@ -22,8 +20,6 @@ struct AdamStep {
     float* mean;                // exp_avg
     float* square;              // exp_avg_sq
     size_t count;
-    size_t row_length;          // elements per row
-    const float* row_lr;        // [rows] factors of the learning rate, or null
     float lr, beta1, beta2, eps, correction1, correction2_root;
 };
 
@@ -36,7 +32,6 @@ struct Kernels {
     void (*composite_backward)(Frame&, const ImageGradients&, int channel_count);
     void (*project_backward)(Frame&, const GaussianInputs&, const GaussianGradients&);
     double (*photometric)(const LossInputs&, Buffer<float>& work, float* gradient);
-    void (*blur_target)(const LossInputs&, Buffer<float>& work, float* mean, float* square);
     void (*adam)(const AdamStep&);
 };
 

@@ -15,8 +15,7 @@ NEECO_INLINE void adam_range(const AdamStep& s, size_t from, size_t to) {
         const float square = s.beta2 * s.square[i] + (1.f - s.beta2) * g * g;
         s.mean[i] = mean;
         s.square[i] = square;
-        const float rate = s.row_lr ? s.lr * s.row_lr[i / s.row_length] : s.lr;
-        s.parameter[i] -= rate / s.correction1 * mean / (__builtin_sqrtf(square) / s.correction2_root + s.eps);
+        s.parameter[i] -= s.lr / s.correction1 * mean / (__builtin_sqrtf(square) / s.correction2_root + s.eps);
     }
 }
 

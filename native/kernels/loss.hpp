@@ -77,7 +77,7 @@ struct Rows {
 NEECO_INLINE void load_rows(const LossInputs& in, int y, const Rows& r, size_t stride) {
     const size_t start = (size_t)y * in.width * 3;
     const float* mask = in.mask ? in.mask + (size_t)y * in.width : nullptr;
-    if (in.image) masked_row(in.image + start, mask, in.width, r.image);
+    masked_row(in.image + start, mask, in.width, r.image);
     masked_row(in.target + start, mask, in.width, r.target);
     for (int x = 0; x < in.width; x++)
         for (int c = 0; c < 3; c++) r.mask[3 * x + c] = mask ? mask[x] : 1.f;
@@ -89,7 +89,7 @@ NEECO_INLINE void copy_row(const float* from, float* to, int length) { std::memc
 // Fields of a band: blurred along rows; rows outside the image are zero.
 enum Field { kImage, kImageSquare, kProduct, kTarget, kTargetSquare, kFields };
 
-NEECO_INLINE void fill_fields(const LossInputs& in, int first, float* fields, float* spare, size_t stride, bool image, bool target) {
+NEECO_INLINE void fill_fields(const LossInputs& in, int first, float* fields, float* spare, size_t stride) {
     const int length = 3 * in.width;
     const Rows rows = {spare + kPad, spare + stride + kPad, spare + 2 * stride + kPad};
     float* product = spare + 3 * stride + kPad;
@@ -107,15 +107,11 @@ NEECO_INLINE void fill_fields(const LossInputs& in, int first, float* fields, fl
             for (int i = 0; i < length; i++) product[i] = a[i] * b[i];
             blur_row(product, out + field * f, length);
         };
-        if (image) {
-            blur_row(rows.image, out + field * kImage, length);
-            blur_product(rows.image, rows.image, kImageSquare);
-            blur_product(rows.image, rows.target, kProduct);
-        }
-        if (target) {
-            blur_row(rows.target, out + field * kTarget, length);
-            blur_product(rows.target, rows.target, kTargetSquare);
-        }
+        blur_row(rows.image, out + field * kImage, length);
+        blur_product(rows.image, rows.image, kImageSquare);
+        blur_product(rows.image, rows.target, kProduct);
+        blur_row(rows.target, out + field * kTarget, length);
+        blur_product(rows.target, rows.target, kTargetSquare);
     }
 }
 
@@ -125,25 +121,19 @@ static double ssim_band(const LossInputs& in, int band, float* maps, size_t map_
     const int length = 3 * in.width, first = band * kBand;
     float* spare = scratch(field * kFields + 8 * stride) + field * kFields;
     float* fields = spare - field * kFields;
-    const bool target_known = in.target_mean != nullptr;
-    fill_fields(in, first, fields, spare, stride, true, !target_known);
+    fill_fields(in, first, fields, spare, stride);
     const Rows rows = {spare + kPad, spare + stride + kPad, spare + 2 * stride + kPad};
-    float *mean = spare + 4 * stride, *square = spare + 5 * stride;
     double total = 0;
     for (int y = first; y < lower(first + kBand, in.height); y++) {
         load_rows(in, y, rows, stride);
         const int r = y - first + kReach;
-        if (target_known) {
-            copy_row(in.target_mean + (size_t)y * length, mean, length);
-            copy_row(in.target_square + (size_t)y * length, square, length);
-        }
         float* out = maps + stride * y + kPad;
         vf sum_row = all(0.f);
         for (int i = 0; i < length; i += W) {
             const vf m = blur_column(fields + field * kImage, stride, r, i), mm = blur_column(fields + field * kImageSquare, stride, r, i);
             const vf mt = blur_column(fields + field * kProduct, stride, r, i);
-            const vf t = target_known ? load(mean + i) : blur_column(fields + field * kTarget, stride, r, i);
-            const vf tt = target_known ? load(square + i) : blur_column(fields + field * kTargetSquare, stride, r, i);
+            const vf t = blur_column(fields + field * kTarget, stride, r, i);
+            const vf tt = blur_column(fields + field * kTargetSquare, stride, r, i);
             const vf a1 = 2.f * m * t + kC1, a2 = 2.f * (mt - m * t) + kC2;
             const vf b1 = m * m + t * t + kC1, b2 = (mm - m * m) + (tt - t * t) + kC2;
             const vf inverse = 1.f / (b1 * b2), ssim = a1 * a2 * inverse;
@@ -213,26 +203,6 @@ static double photometric(const LossInputs& in, Buffer<float>& work, float* grad
         l1 += sums[bands + b];
     }
     return (1.0 - in.ssim_weight) * l1 / values + in.ssim_weight * (1.0 - ssim / values);
-}
-
-// mean, square [H, W, 3]: the blurred masked target and its square.
-static void blur_target(const LossInputs& in, Buffer<float>&, float* mean, float* square) {
-    parallel_for((in.height + kBand - 1) / kBand, [&](int band) {
-        const size_t stride = padded_row(in.width), field = stride * kBandRows;
-        const int length = 3 * in.width, first = band * kBand;
-        float* fields = scratch(field * kFields + 8 * stride);
-        float* spare = fields + field * kFields;
-        fill_fields(in, first, fields, spare, stride, false, true);
-        for (int y = first; y < lower(first + kBand, in.height); y++) {
-            float *a = spare, *b = spare + stride;
-            for (int i = 0; i < length; i += W) {
-                store(a + i, blur_column(fields + field * kTarget, stride, y - first + kReach, i));
-                store(b + i, blur_column(fields + field * kTargetSquare, stride, y - first + kReach, i));
-            }
-            copy_row(a, mean + (size_t)y * length, length);
-            copy_row(b, square + (size_t)y * length, length);
-        }
-    });
 }
 
 }  // namespace NEECO_VARIANT

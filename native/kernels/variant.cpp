@@ -15,7 +15,7 @@ namespace neeco {
 const Kernels& NEECO_JOIN(kernels_, NEECO_VARIANT)() {
     namespace v = NEECO_VARIANT;
     static const Kernels table = {NEECO_TEXT(NEECO_VARIANT), v::W, v::kStrip, v::kTileHeight, v::project, v::composite,
-                                  v::composite_backward, v::project_backward, v::photometric, v::blur_target, v::adam};
+                                  v::composite_backward, v::project_backward, v::photometric, v::adam};
     return table;
 }
 

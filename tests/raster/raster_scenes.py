@@ -92,7 +92,7 @@ def decided_pixels(scene: Scene, tolerance: float = 1e-4) -> Tensor:
     """[H, W] 1 where no cut-off is so close that float32 may decide it otherwise than float64, else 0."""
     _, gaussians, camera = leaves(scene, torch.float64)
     with torch.no_grad():
-        index = usable_gaussians(gaussians, camera, scene.tensors.get("channels"))
+        index = usable_gaussians(gaussians, camera, scene.tensors.get("channels")).nonzero()[:, 0]
         rotation, translation = camera_from_world(camera.world_from_camera)
         means = gaussians.means[index]
         chosen = Gaussians(

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from neeco.errors import NeecoError
+from neeco.raster import kernels
+from neeco.raster.native import Family
 from neeco.raster.optimizer import adam_step
 from neeco.raster.threads import set_threads
 
@@ -25,10 +32,60 @@ def test_steps_equal_torch(simd: str, shape: tuple[int, ...]) -> None:
     assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
-def test_rows_can_have_their_own_rate() -> None:
-    param, moments = torch.zeros(3, 2), torch.zeros(2, 3, 2)
-    adam_step(param, torch.ones(3, 2), *moments, lr=0.1, step=1, row_lr=torch.tensor([0.0, 1.0, 2.0]))
-    assert torch.allclose(param, torch.tensor([[0.0, 0.0], [-0.1, -0.1], [-0.2, -0.2]]))
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    shape=st.lists(st.integers(0, 9), min_size=0, max_size=3).map(tuple),
+    lr=st.sampled_from([1e-5, 0.01, 1.0]),
+    betas=st.sampled_from([(0.9, 0.999), (0.5, 0.9)]),
+    eps=st.sampled_from([1e-15, 1e-8, 0.1]),
+)
+def test_plain_torch_is_the_formula(shape: tuple[int, ...], lr: float, betas: tuple[float, float], eps: float) -> None:
+    g = torch.Generator().manual_seed(2)
+    param = torch.randn(shape, generator=g, dtype=torch.float64)
+    mean, square = torch.zeros_like(param), torch.zeros_like(param)
+    theta, m, v = param.numpy().copy(), 0.0, 0.0
+    for step in range(1, 6):
+        gradient = torch.randn(shape, generator=g, dtype=torch.float64)
+        adam_step(param, gradient, mean, square, lr=lr, step=step, betas=betas, eps=eps)
+        m = betas[0] * m + (1 - betas[0]) * gradient.numpy()
+        v = betas[1] * v + (1 - betas[1]) * gradient.numpy() ** 2
+        theta = theta - lr * (m / (1 - betas[0] ** step)) / (np.sqrt(v / (1 - betas[1] ** step)) + eps)
+    np.testing.assert_allclose(param.numpy(), theta, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(mean.numpy(), np.broadcast_to(m, shape), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(square.numpy(), np.broadcast_to(v, shape), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("shape", [(1,), (501, 16, 3)])
+def test_plain_torch_takes_the_place_of_the_kernel(simd: str, shape: tuple[int, ...]) -> None:
+    start, *gradients = torch.randn(8, *shape, generator=torch.Generator().manual_seed(3))
+    ends = []
+    for family in get_args(Family):
+        param, moments = start.clone(), torch.zeros(2, *shape)
+        with kernels(family):
+            for step, gradient in enumerate(gradients, start=1):
+                adam_step(param, gradient * 10.0 ** (step - 4), *moments, lr=0.01, step=step)
+        ends.append((param, *moments))
+    for native, plain in zip(*ends, strict=True):
+        assert torch.allclose(native, plain, rtol=2e-5, atol=1e-6)  # the kernel's 1 - 0.999 is a float32 too
+
+
+def test_a_step_needs_no_numbers_of_a_device() -> None:
+    tensors = torch.zeros(4, 5, 3, device="meta")
+    adam_step(*tensors, lr=0.1, step=1)
+    with pytest.raises(NeecoError, match=r"exp_avg: float32 .* on cpu; expected float32 .* on meta"):
+        adam_step(tensors[0], tensors[1], torch.zeros(5, 3), tensors[3], lr=0.1, step=1)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_takes_the_same_steps() -> None:
+    here = list(torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(4))) + [torch.zeros(300, 3)] * 2
+    here = [tensor.clone() for tensor in here]
+    there = [tensor.cuda() for tensor in here]
+    for step in range(1, 6):
+        adam_step(*here, lr=0.01, step=step)
+        adam_step(*there, lr=0.01, step=step)
+    assert all(torch.allclose(a, b.cpu(), rtol=1e-5, atol=1e-6) for a, b in zip(here, there, strict=True))
 
 
 def test_threads_and_position_do_not_change_the_bits(simd: str) -> None:
@@ -49,10 +106,12 @@ def test_threads_and_position_do_not_change_the_bits(simd: str) -> None:
     assert torch.equal(tail, results[0][-5:])
 
 
-def test_autograd_notices_the_change() -> None:
+@pytest.mark.parametrize("family", get_args(Family))
+def test_autograd_notices_the_change(family: Family) -> None:
     param = torch.ones(3, requires_grad=True)
     loss = (param**2).sum()
-    adam_step(param, torch.ones(3), torch.zeros(3), torch.zeros(3), lr=0.1, step=1)
+    with kernels(family):
+        adam_step(param, torch.ones(3), torch.zeros(3), torch.zeros(3), lr=0.1, step=1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         loss.backward()
 

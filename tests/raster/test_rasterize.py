@@ -295,6 +295,53 @@ except NeecoError as error:
     assert "NEECO_SIMD: 'altivec' cannot run here" in result.stdout
 
 
+@pytest.mark.parametrize("channels", [0, 3])
+def test_the_reference_needs_no_numbers_of_a_device(channels: int) -> None:
+    scene = make_scene(20, 4, channels)
+    moved = {name: tensor.to("meta") for name, tensor in scene.tensors.items()}
+    t, gaussians, camera = leaves(Scene(moved, scene.width, scene.height), torch.float32)
+    out = rasterize(gaussians, camera, channels=t.get("channels"), background=t["background"])
+    images = [image for image in (out.color, out.alpha, out.depth, out.channels) if image is not None]
+    assert all(image.device.type == "meta" and image.shape[:2] == (37, 45) for image in images)
+    torch.cat([image.flatten() for image in images]).sum().backward()
+    assert {tensor.grad.device.type for name, tensor in t.items() if name != "sh_frames"} == {"meta"}
+    assert out.center_offsets.grad.device.type == "meta"
+
+
+def test_the_reference_refuses_what_was_left_on_another_device() -> None:
+    t, gaussians, camera = leaves(make_scene(20), torch.float32)
+    with pytest.raises(RuntimeError, match="device"):
+        rasterize(gaussians.to("meta"), camera, channels=t["channels"])
+    with pytest.raises(RuntimeError, match="device"):
+        rasterize(replace(gaussians.to("meta"), scales=gaussians.scales), camera)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_reference_keeps_its_type(dtype: torch.dtype) -> None:
+    out, _ = draw(make_scene(20), dtype, "reference", torch.ones(37, 45))
+    images = (out.color, out.alpha, out.depth, out.channels, out.radii, out.center_offsets)
+    assert [image.dtype for image in images if image is not None] == [dtype] * 6
+
+
+def test_gaussians_and_camera_move_whole() -> None:
+    _, gaussians, camera = leaves(make_scene(5), torch.float32)
+    gaussians = replace(gaussians, backdrop=torch.ones(3)).to("meta")
+    assert gaussians.headlight is not None
+    held = [*vars(gaussians).values(), *vars(gaussians.headlight).values(), camera.to("meta").world_from_camera]
+    assert {item.device.type for item in held if isinstance(item, torch.Tensor)} == {"meta"}
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_the_reference_draws_the_same_on_cuda() -> None:
+    t, gaussians, camera = leaves(make_scene(60, 16, 3), torch.float64)
+    here = rasterize(gaussians, camera, channels=t["channels"], backend="reference")
+    there = rasterize(gaussians.to("cuda"), camera, channels=t["channels"].cuda(), backend="reference")
+    assert error(there.color.cpu(), here.color) < 1e-9
+    assert error(there.depth.cpu(), here.depth) < 1e-9
+    assert error(there.channels.cpu(), here.channels) < 1e-9
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(
     not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None, reason="needs CUDA and gsplat"

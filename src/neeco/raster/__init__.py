@@ -1,6 +1,7 @@
-"""Drawing Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU or on CUDA."""
+"""Drawing Gaussians: `rasterize(gaussians, camera)`, differentiable, on the CPU, on CUDA or, slowly, anywhere."""
 
 from neeco.raster.api import rasterize
+from neeco.raster.native import kernels
 from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
 
-__all__ = ["Camera", "Gaussians", "Headlight", "Rendering", "rasterize"]
+__all__ = ["Camera", "Gaussians", "Headlight", "Rendering", "kernels", "rasterize"]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.raster.native import goes_native
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
@@ -26,8 +27,9 @@ def rasterize(
 
     channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
     the Gaussians' backdrop, or black.
-    backend: "cpu" (native, float32), "reference" (plain torch, any float type, slow), "cuda" (gsplat), or "auto":
-    cuda for tensors on a CUDA device, cpu otherwise.
+    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat), or
+    "auto": cuda for tensors on a CUDA device, cpu for those on the CPU, reference on other devices and where
+    `kernels("torch")` asks for it. The camera's pose may stay on the CPU.
 
     Defined by the reference:
     - the projected covariance gets 0.3 px^2 on its diagonal; the projection is linearised at the mean, moved to within
@@ -47,7 +49,8 @@ def rasterize(
         background = gaussians.backdrop
     _check(gaussians, camera, channels, background)
     if backend == "auto":
-        backend = "cuda" if gaussians.means.is_cuda else "cpu"
+        on_cpu = "cpu" if goes_native(gaussians.means) else "reference"
+        backend = "cuda" if gaussians.means.is_cuda else on_cpu
     if backend == "reference":
         from neeco.raster.reference import rasterize_reference
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neeco.raster.reference import camera_from_world, usable_gaussians
 from neeco.raster.sh import headlight_factor, sh_colors
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
 
 
 def rasterize_cuda(
@@ -21,8 +21,9 @@ def rasterize_cuda(
 
     n, device = len(gaussians), gaussians.means.device
     empty = torch.zeros(n, 2, device=device, requires_grad=torch.is_grad_enabled())
-    index = usable_gaussians(gaussians, camera, channels)
-    pose = camera.world_from_camera.to(device=device, dtype=torch.float32)
+    camera = camera.to(device)
+    index = usable_gaussians(gaussians, camera, channels).nonzero()[:, 0]
+    pose = camera.world_from_camera.float()
     rotation, translation = camera_from_world(pose)
     if len(index) == 0:
         return _nothing(camera, channels, background, empty)
@@ -30,7 +31,7 @@ def rasterize_cuda(
     frames = None if gaussians.sh_frames is None else gaussians.sh_frames[index].float()
     values = sh_colors(gaussians.sh[index].float(), means, pose[:3, 3], frames).clamp(min=0)
     if gaussians.headlight is not None:
-        light = type(gaussians.headlight)(gaussians.headlight.falloff[index], gaussians.headlight.vignette)
+        light = Headlight(gaussians.headlight.falloff[index].float(), gaussians.headlight.vignette.float())
         values = values * headlight_factor(light, camera, means @ rotation.T + translation)[:, None]
     if channels is not None:
         values = torch.cat([values, channels[index].float()], dim=-1)

@@ -1,4 +1,4 @@
-"""The photometric loss of 3DGS, (1 - w) L1 + w (1 - SSIM): a fused native kernel and its definition."""
+"""The photometric loss of 3DGS, (1 - w) L1 + w (1 - SSIM): its definition for any device, and a fused native kernel."""
 
 from __future__ import annotations
 
@@ -10,101 +10,75 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from neeco.errors import NeecoError
-from neeco.raster.native import native
+from neeco.raster.native import goes_native, native
 
 WINDOW = 11  # px, side of the Gaussian window
 SIGMA = 1.5  # px
 C1, C2 = 1e-4, 9e-4  # (0.01)^2 and (0.03)^2 for images in [0, 1]
 
 
-class PhotometricTarget:
-    """A target image with what the loss needs of it alone: build it once when a frame is seen many times.
-
-    target [H, W, 3] in [0, 1]; mask [H, W], True where the loss looks, or None. float32, CPU.
-    """
-
-    def __init__(self, target: Tensor, mask: Tensor | None = None) -> None:
-        _check(target, target, mask)
-        self.image = target.detach().to(torch.float32).contiguous()  # [H, W, 3]
-        self.mask = None if mask is None else mask.to(torch.float32).contiguous()  # [H, W] 0 or 1
-        self.pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
-        self.mean = torch.empty_like(self.image)  # [H, W, 3] blurred target
-        self.square = torch.empty_like(self.image)  # [H, W, 3] blurred squared target
-        native().blur_target(self.image, self.mask, self.mean, self.square)
-
-
-def photometric_loss(
-    image: Tensor, target: Tensor | PhotometricTarget, mask: Tensor | None = None, ssim_weight: float = 0.1
-) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.1) -> Tensor:
     """(1 - w) * mean |image - target| + w * (1 - mean SSIM), w = `ssim_weight`; a scalar, differentiable in `image`.
 
     image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where the loss must not look. A mask multiplies both
     images before anything is compared, and both means run over its True pixels; with none of those the loss is 0.
     SSIM (Wang et al. 2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, each
-    colour apart, as in 3DGS. Raises NeecoError where shapes do not fit.
-    A `PhotometricTarget` brings its own mask and saves two blurs.
+    colour apart, as in 3DGS. float32 on the CPU takes the native kernel, everything else the definition; all tensors
+    are on one device. Raises NeecoError where shapes do not fit.
     """
-    if isinstance(target, PhotometricTarget):
-        if mask is not None:
-            raise NeecoError("photometric_loss: mask: given twice; the PhotometricTarget has its own")
-        known: PhotometricTarget | _Plain = target
-    else:
-        known = _Plain(target, mask)
-    _check(image, known.image, None)
-    if known.pixels == 0:
+    if not (goes_native(image) and image.dtype == torch.float32):
+        return photometric_loss_reference(image, target.detach(), mask, ssim_weight)
+    _check(image, target, mask)
+    pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
+    if pixels == 0:
         return 0.0 * image.sum()
-    return _Photometric.apply(image, known, ssim_weight)
+    return _Photometric.apply(image, target, mask, pixels, ssim_weight)
 
 
 def photometric_loss_reference(
     image: Tensor, target: Tensor, mask: Tensor | None = None, ssim_weight: float = 0.1
 ) -> Tensor:
-    """`photometric_loss` in plain torch, any float type."""
+    """`photometric_loss` in plain torch, any float type and device; nothing waits for a device's numbers."""
     _check(image, target, mask)
-    weight = torch.ones_like(image[..., 0]) if mask is None else mask.to(image)  # [H, W]
-    values = 3 * weight.sum().clamp(min=1)
-    x, y = image * weight[..., None], target * weight[..., None]
-    l1 = (x - y).abs().sum() / values
-    ssim = (ssim_map(x, y) * weight[..., None]).sum() / values
-    if mask is not None and not bool(mask.any()):
-        return 0.0 * image.sum()
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+    weight = torch.ones_like(image[..., :1]) if mask is None else mask[..., None].to(image.dtype)  # [H, W, 1]
+    x, y = image * weight, target.to(image.dtype) * weight
+    l1 = (x - y).abs().sum()
+    dissimilarity = ((1 - ssim_map(x, y)) * weight).sum()
+    return ((1 - ssim_weight) * l1 + ssim_weight * dissimilarity) / (3 * weight.sum()).clamp(min=1)
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
     """SSIM at every pixel and colour, [H, W, 3], of images [H, W, 3] in [0, 1]; zero padding outside."""
-    offsets = torch.arange(WINDOW, dtype=x.dtype, device=x.device) - WINDOW // 2
-    row = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    row = row / row.sum()
-    window = (row[:, None] * row[None, :])[None, None]  # [1, 1, 11, 11]
-
-    def blur(t: Tensor) -> Tensor:
-        return conv2d(t.permute(2, 0, 1)[:, None], window, padding=WINDOW // 2)[:, 0].permute(1, 2, 0)
-
-    mx, my = blur(x), blur(y)
-    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    return (2 * mx * my + C1) * (2 * vxy + C2) / ((mx * mx + my * my + C1) * (vx + vy + C2))
+    x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
+    mx, my, mxx, myy, mxy = _blur(torch.cat([x, y, x * x, y * y, x * y])).split(3)
+    vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
+    numerator = (2 * mx * my + C1) * (2 * vxy + C2)
+    return (numerator / ((mx * mx + my * my + C1) * (vx + vy + C2))).permute(1, 2, 0)
 
 
-class _Plain:
-    """A target whose statistics the kernel computes on the way."""
-
-    def __init__(self, target: Tensor, mask: Tensor | None) -> None:
-        _check(target, target, mask)
-        self.image = target.detach().to(torch.float32).contiguous()
-        self.mask = None if mask is None else mask.to(torch.float32).contiguous()
-        self.pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
-        self.mean: Tensor | None = None
-        self.square: Tensor | None = None
+def _blur(planes: Tensor) -> Tensor:
+    """Planes [C, H, W] under the Gaussian window, which is separable: two passes of 11 taps."""
+    offsets = torch.arange(WINDOW, dtype=torch.float64, device=planes.device) - WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    window = (weights / weights.sum()).to(planes.dtype)
+    down = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))
+    return conv2d(down, window.view(1, 1, 1, -1), padding=(0, WINDOW // 2))[:, 0]
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: PhotometricTarget | _Plain, ssim_weight: float) -> Tensor:
-        plain = image.detach().to(torch.float32).contiguous()
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, pixels: float, ssim_weight: float
+    ) -> Tensor:
+        plain = image.detach().contiguous()
         gradient = torch.empty_like(plain) if ctx.needs_input_grad[0] else None
         loss = native().photometric(
-            plain, target.image, target.mask, target.mean, target.square, ssim_weight, target.pixels, gradient
+            plain,
+            target.detach().to(torch.float32).contiguous(),
+            None if mask is None else mask.to(torch.float32).contiguous(),
+            ssim_weight,
+            pixels,
+            gradient,
         )
         if gradient is not None:
             ctx.save_for_backward(gradient)
@@ -114,7 +88,7 @@ class _Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *outer: Tensor) -> Any:
         (gradient,) = ctx.saved_tensors
-        return gradient * outer[0], None, None
+        return gradient * outer[0], None, None, None, None
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

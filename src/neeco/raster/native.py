@@ -1,11 +1,19 @@
-"""The compiled kernels, or a clear word that they are missing."""
+"""The compiled kernels: whether they are there, and whether they are what works on a tensor."""
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Literal, get_args
+
+from torch import Tensor
 
 from neeco.errors import NeecoError
+
+Family = Literal["native", "torch"]
+_family: ContextVar[Family] = ContextVar("family of kernels", default="native")
 
 
 def native() -> Any:
@@ -14,3 +22,24 @@ def native() -> Any:
         return importlib.import_module("neeco._native")
     except ImportError as error:
         raise NeecoError("neeco._native: the compiled kernels are missing; install with `pip install .`") from error
+
+
+@contextmanager
+def kernels(family: Family) -> Iterator[None]:
+    """Until the end of the block, let this thread draw, compare and step CPU tensors by `family` of kernels.
+
+    "native": neeco's own, the default; "torch": the plain torch that works on every device, and is slow. Concerns
+    `rasterize(backend="auto")`, `photometric_loss` and `adam_step`. Raises NeecoError for another family.
+    """
+    if family not in get_args(Family):
+        raise NeecoError(f"kernels: {family!r}: unknown; use one of {', '.join(get_args(Family))}")
+    token = _family.set(family)
+    try:
+        yield
+    finally:
+        _family.reset(token)
+
+
+def goes_native(tensor: Tensor) -> bool:
+    """Whether the native kernels work on `tensor`: it is on the CPU, and `kernels("torch")` is not in force."""
+    return tensor.device.type == "cpu" and _family.get() == "native"

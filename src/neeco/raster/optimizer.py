@@ -1,15 +1,17 @@
-"""Adam in one native pass per tensor.
+"""Adam: one native pass per tensor on the CPU, plain torch elsewhere.
 
 The moments are plain tensors that belong to the caller: density control edits their rows, checkpoints save them.
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.raster.native import native
+from neeco.raster.native import goes_native, native
 
 
 @torch.no_grad()
@@ -23,26 +25,59 @@ def adam_step(
     step: int,
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
-    row_lr: Tensor | None = None,
 ) -> None:
     """One step of Adam (Kingma and Ba 2015), in place, without autograd.
 
-    All tensors have param's shape [N, ...], float32, contiguous, CPU. step counts from 1. row_lr [N] multiplies the
-    learning rate row by row. The same inputs give the same bits, whatever the number of threads. Raises NeecoError
-    where tensors do not fit.
+    All tensors have param's shape [N, ...] and device, the moments its type too. step counts from 1. float32 on the CPU
+    takes the native kernel, needs contiguous tensors, and gives the same bits from the same inputs, whatever the number
+    of threads. Raises NeecoError where tensors do not fit.
     """
     if step < 1:
         raise NeecoError(f"adam_step: step: {step}; counts from 1")
-    for name, tensor in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or not tensor.is_contiguous():
-            raise NeecoError(f"adam_step: {name}: must be a contiguous float32 tensor on the CPU")
-    row = None if row_lr is None else row_lr.detach().to(torch.float32).contiguous()
-    try:
-        native().adam(
-            param.detach(), grad.detach().to(torch.float32).contiguous(), exp_avg, exp_avg_sq, row,
-            lr, step, betas[0], betas[1], eps,
-        )  # fmt: skip
-    except ValueError as error:
-        raise NeecoError(f"adam_step: {error}") from error
+    gradient = grad.detach().to(param.dtype)
+    for name, tensor in (("grad", gradient), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+        if _kind(tensor) != _kind(param):
+            raise NeecoError(f"adam_step: {name}: {_kind(tensor)}; expected {_kind(param)}, as the parameter")
+    if goes_native(param) and param.dtype == torch.float32:
+        _native_step(param, gradient, exp_avg, exp_avg_sq, lr, step, betas, eps)
+    else:
+        _torch_step(param, gradient, exp_avg, exp_avg_sq, lr, step, betas, eps)
+
+
+def _native_step(
+    param: Tensor,
+    grad: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    lr: float,
+    step: int,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    for name, tensor in (("param", param), ("exp_avg", mean), ("exp_avg_sq", square)):
+        if not tensor.is_contiguous():
+            raise NeecoError(f"adam_step: {name}: must be contiguous")
+    native().adam(param.detach(), grad.contiguous(), mean, square, lr, step, *betas, eps)
     # Autograd notices in-place changes by this counter, which native code does not touch.
     torch.autograd.graph.increment_version(param)
+
+
+def _torch_step(
+    param: Tensor,
+    grad: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    lr: float,
+    step: int,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """The definition."""
+    mean.lerp_(grad, 1 - betas[0])
+    square.mul_(betas[1]).addcmul_(grad, grad, value=1 - betas[1])
+    spread = (square.sqrt() / math.sqrt(1 - betas[1] ** step)).add_(eps)
+    param.addcdiv_(mean, spread, value=-lr / (1 - betas[0] ** step))
+
+
+def _kind(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)} on {tensor.device}"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neeco.raster.field import field_slopes
 from neeco.raster.sh import headlight_factor, rotation_matrices, sh_colors
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
 
 LOW_PASS = 0.3  # px^2 added to projected covariances
 FAINTEST = 1 / 255  # smallest alpha that is drawn
@@ -32,21 +32,22 @@ class Projection:
 def rasterize_reference(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
-    """`rasterize`, as a formula. Memory grows with Gaussians x pixels."""
+    """`rasterize`, as a formula, on the device of the means. Memory grows with Gaussians x pixels."""
     means = gaussians.means
     offsets = torch.zeros(len(gaussians), 2, dtype=means.dtype, device=means.device)
     offsets.requires_grad_(torch.is_grad_enabled())
-    rotation, translation = camera_from_world(camera.world_from_camera.to(means))
+    camera = camera.to(means.device)
+    rotation, translation = camera_from_world(camera.world_from_camera.to(means.dtype))
     usable = usable_gaussians(gaussians, camera, channels)
-    chosen, usable_channels = _take(gaussians, usable), None if channels is None else channels[usable]
-    camera_means = chosen.means @ rotation.T + translation
-    values = torch.cat([_colors(chosen, camera, camera_means), camera_means[:, 2:]], dim=-1)
-    if usable_channels is not None:
-        values = torch.cat([values, usable_channels], dim=-1)
+    gaussians, channels = _hide(gaussians, channels, ~usable, camera)
+    camera_means = gaussians.means @ rotation.T + translation
+    values = torch.cat([_colors(gaussians, camera, camera_means), camera_means[:, 2:]], dim=-1)
+    if channels is not None:
+        values = torch.cat([values, channels], dim=-1)
 
-    projection = project(chosen, camera, camera_means, rotation, offsets[usable])
-    order = torch.argsort(depth_keys(chosen.means, camera), stable=True)
-    weights = blend_weights(projection, chosen.opacities, order, camera)  # [P, N], near to far
+    projection = project(gaussians, camera, camera_means, rotation, offsets)
+    order = torch.argsort(depth_keys(gaussians.means, camera), stable=True)
+    weights = blend_weights(projection, gaussians.opacities, order, camera)  # [P, N], near to far
     images = (weights @ values[order]).reshape(camera.height, camera.width, -1)
     alpha = weights.sum(dim=1).reshape(camera.height, camera.width)
     color = images[..., :3]
@@ -54,8 +55,7 @@ def rasterize_reference(
         color = color + (1 - alpha)[..., None] * background
     drawn = alpha > 0
     depth = torch.where(drawn, images[..., 3] / torch.where(drawn, alpha, torch.ones_like(alpha)), 0.0)
-    radii = torch.zeros(len(gaussians), dtype=means.dtype, device=means.device)
-    radii[usable] = _radii(projection, chosen.opacities, camera)
+    radii = _radii(projection, gaussians.opacities, camera)
     return Rendering(color, alpha, depth, None if channels is None else images[..., 4:], radii, offsets)
 
 
@@ -98,8 +98,8 @@ def project(
 
 def alphas_at_pixels(projection: Projection, opacities: Tensor, camera: Camera) -> Tensor:
     """Alpha [P, N] of every Gaussian at every pixel centre, before any of the cut-offs."""
-    rows = torch.arange(camera.height).to(opacities) + 0.5
-    columns = torch.arange(camera.width).to(opacities) + 0.5
+    rows = torch.arange(camera.height, dtype=opacities.dtype, device=opacities.device) + 0.5
+    columns = torch.arange(camera.width, dtype=opacities.dtype, device=opacities.device) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     dx = x.reshape(-1, 1) - projection.centers[:, 0]
     dy = y.reshape(-1, 1) - projection.centers[:, 1]
@@ -129,7 +129,7 @@ def _colors(gaussians: Gaussians, camera: Camera, camera_means: Tensor) -> Tenso
 
 
 def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | None) -> Tensor:
-    """Indices of Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
+    """[N] bool: Gaussians in front of the camera with finite parameters and quaternions that are not zero."""
     n = len(gaussians)
     light = gaussians.headlight
     tensors: list[Tensor | None] = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
@@ -138,20 +138,32 @@ def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | No
     for tensor in tensors:
         if tensor is not None and n > 0:
             good &= torch.isfinite(tensor.detach()).reshape(n, -1).all(dim=1)
-    return (good & (gaussians.quats.detach().norm(dim=-1) > 0)).nonzero()[:, 0]
+    return good & (gaussians.quats.detach().norm(dim=-1) > 0)
 
 
-def _take(gaussians: Gaussians, index: Tensor) -> Gaussians:
+def _hide(
+    gaussians: Gaussians, channels: Tensor | None, hidden: Tensor, camera: Camera
+) -> tuple[Gaussians, Tensor | None]:
+    """Gaussians and channels with the `hidden` [N] made transparent, finite, 1 mm before the camera, without gradients.
+
+    Taking the others out instead would make shapes depend on numbers, which a device without numbers cannot do.
+    """
+    pose = camera.world_from_camera.detach().to(gaussians.means.dtype)
+
+    def but(tensor: Tensor, value: Tensor | float) -> Tensor:
+        return torch.where(hidden.reshape(-1, *[1] * (tensor.dim() - 1)), value, tensor)
+
     light = gaussians.headlight
-    return Gaussians(
-        means=gaussians.means[index],
-        quats=gaussians.quats[index],
-        scales=gaussians.scales[index],
-        opacities=gaussians.opacities[index],
-        sh=gaussians.sh[index],
-        sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames[index],
-        headlight=None if light is None else type(light)(light.falloff[index], light.vignette),
+    shown = Gaussians(
+        means=but(gaussians.means, pose[:3, 3] + pose[:3, 2]),
+        quats=but(gaussians.quats, 1.0),
+        scales=but(gaussians.scales, 1.0),
+        opacities=but(gaussians.opacities, 0.0),
+        sh=but(gaussians.sh, 0.0),
+        sh_frames=None if gaussians.sh_frames is None else but(gaussians.sh_frames, 1.0),
+        headlight=None if light is None else Headlight(but(light.falloff, 0.0), light.vignette),
     )
+    return shown, None if channels is None else but(channels, 0.0)
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,10 @@ class Headlight:
 
     falloff: Tensor  # [N] exponent
     vignette: Tensor  # [2]
+
+    def to(self, device: torch.device | str) -> Headlight:
+        """The same light on `device`."""
+        return Headlight(self.falloff.to(device), self.vignette.to(device))
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,11 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on `device`."""
+        held = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: value.to(device) for name, value in held.items() if value is not None})
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -58,6 +67,10 @@ class Camera:
     width: int
     height: int
     near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera, its pose on `device`."""
+        return replace(self, world_from_camera=self.world_from_camera.to(device))
 
 
 @dataclass(frozen=True)
@@ -75,18 +88,3 @@ class Rendering:
     def visible(self) -> Tensor:
         """[N] bool: which Gaussians touched the image."""
         return self.radii > 0
-
-
-def to_dtype(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
-    """The same Gaussians in another floating type."""
-    light = gaussians.headlight
-    return Gaussians(
-        means=gaussians.means.to(dtype),
-        quats=gaussians.quats.to(dtype),
-        scales=gaussians.scales.to(dtype),
-        opacities=gaussians.opacities.to(dtype),
-        sh=gaussians.sh.to(dtype),
-        sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames.to(dtype),
-        headlight=None if light is None else Headlight(light.falloff.to(dtype), light.vignette.to(dtype)),
-        backdrop=None if gaussians.backdrop is None else gaussians.backdrop.to(dtype),
-    )

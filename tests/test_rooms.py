@@ -1,0 +1,143 @@
+"""The code is a stack of rooms: a room imports only from rooms below it, and modules do not import in circles."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src"
+ROOMS = (  # from the top down; rooms of one line do not know each other
+    ("cli",),
+    ("viewer", "report"),
+    ("experiments",),
+    ("synthesis",),
+    ("evaluation",),
+    ("labels",),
+    ("training",),
+    ("scene",),
+    ("ingest",),
+    ("capture",),
+    ("raster",),
+    ("files",),
+    ("errors",),
+)
+LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
+OUTSIDE = ("__init__", "__main__", "_native")  # the package's version, its start (the command line's), the C++ kernels
+Graph = dict[str, set[str]]  # module -> modules it imports anywhere: at its top, in functions, for types alone
+
+
+def imports_of(source: str, package: str, known: set[str]) -> set[str]:
+    """Modules of `known` that a module in `package` imports; of `from neeco.a import b`, neeco.a.b if it is one."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            levels = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*levels, *([node.module] if node.module else [])])
+            submodules = {f"{base}.{alias.name}" for alias in node.names} & known
+            found |= submodules
+            # `from neeco.a import b, C`: C comes from neeco.a itself; b does not need what neeco.a holds
+            if len(submodules) < len(node.names):
+                found.add(base)
+    return found & known
+
+
+def modules() -> dict[str, Path]:
+    names = {}
+    for path in sorted((SOURCE / "neeco").rglob("*.py")):
+        parts = path.relative_to(SOURCE).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return names
+
+
+def graph() -> Graph:
+    paths = modules()
+    return {
+        name: imports_of(path.read_text(), name if path.name == "__init__.py" else name.rpartition(".")[0], set(paths))
+        for name, path in paths.items()
+    }
+
+
+def room(module: str) -> str:
+    return module.split(".")[1] if "." in module else "__init__"
+
+
+def upward(imports: Graph) -> list[str]:
+    """Imports that do not lead down, `importer -> imported`."""
+    return [
+        f"{module} -> {other}"
+        for module, others in sorted(imports.items())
+        for other in sorted(others)
+        if room(module) not in OUTSIDE
+        and room(other) not in OUTSIDE
+        and room(module) != room(other)
+        and LEVELS[room(module)] >= LEVELS[room(other)]
+    ]
+
+
+def circles(imports: Graph) -> list[str]:
+    """Every group of modules that reach each other (Tarjan's strongly connected components)."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found = []
+
+    def visit(module: str) -> None:
+        index[module] = low[module] = len(index)
+        stack.append(module)
+        for other in sorted(imports[module] - {module}):
+            if other not in index:
+                visit(other)
+            if other in stack:
+                low[module] = min(low[module], low[other])
+        if low[module] == index[module]:
+            group = stack[stack.index(module) :]
+            del stack[stack.index(module) :]
+            if len(group) > 1:
+                found.append(" <-> ".join(sorted(group)))
+
+    for module in sorted(imports):
+        if module not in index:
+            visit(module)
+    return found
+
+
+def test_every_room_has_its_place() -> None:
+    assert {room(module) for module in modules()} <= {*LEVELS, *OUTSIDE}
+
+
+def test_a_room_imports_only_from_rooms_below() -> None:
+    assert upward(graph()) == []
+
+
+def test_no_circle_between_modules() -> None:
+    assert circles(graph()) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from neeco.cli import main",
+        "import neeco.cli",
+        "from neeco import cli",
+        "def f():\n    from neeco.cli import main",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from neeco.cli import main",
+        "from ..cli import main",
+        "from .. import cli",
+    ],
+)
+def test_an_import_upward_is_seen_wherever_it_stands(source: str) -> None:
+    known = {"neeco", "neeco.cli", "neeco.raster", "neeco.raster.api"}
+    imports = {"neeco.raster.api": imports_of(source, "neeco.raster", known)}
+    assert upward(imports) == ["neeco.raster.api -> neeco.cli"]
+
+
+def test_rooms_of_one_line_do_not_know_each_other() -> None:
+    assert upward({"neeco.report.page": {"neeco.viewer.page"}}) == ["neeco.report.page -> neeco.viewer.page"]
+
+
+def test_circles_are_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": set()}) == ["a <-> b <-> c"]
