@@ -66,7 +66,8 @@ def test_plain_torch_takes_the_place_of_the_kernel(simd: str, shape: tuple[int, 
                 adam_step(param, gradient * 10.0 ** (step - 4), *moments, lr=0.01, step=step)
         ends.append((param, *moments))
     for native, plain in zip(*ends, strict=True):
-        assert torch.allclose(native, plain, rtol=2e-5, atol=1e-6)  # the kernel's 1 - 0.999 is a float32 too
+        near_zero = 1e-6 * max(1.0, float(native.abs().max()))  # where gradients cancel
+        assert torch.allclose(native, plain, rtol=2e-5, atol=near_zero)  # the kernel's 1 - 0.999 is a float32 too
 
 
 def test_a_step_needs_no_numbers_of_a_device() -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from neeco.raster.adam import Adam
+from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 

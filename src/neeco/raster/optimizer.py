@@ -5,8 +5,6 @@ The moments are plain tensors that belong to the caller: density control edits t
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -72,12 +70,70 @@ def _torch_step(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """The definition."""
-    mean.lerp_(grad, 1 - betas[0])
-    square.mul_(betas[1]).addcmul_(grad, grad, value=1 - betas[1])
-    spread = (square.sqrt() / math.sqrt(1 - betas[1] ** step)).add_(eps)
-    param.addcdiv_(mean, spread, value=-lr / (1 - betas[0] ** step))
+    param.sub_(lr * adam_update(grad, mean, square, step, betas, eps))
+
+
+@torch.no_grad()
+def adam_update(
+    grad: Tensor, mean: Tensor, square: Tensor, step: float, betas: tuple[float, float], eps: float
+) -> Tensor:
+    """The definition: both moments take `grad` in, in place; returns the step for a learning rate of 1."""
+    mean.copy_(betas[0] * mean + (1 - betas[0]) * grad)
+    square.copy_(betas[1] * square + (1 - betas[1]) * grad.square())
+    return mean / (1 - betas[0] ** step) / ((square / (1 - betas[1] ** step)).sqrt() + eps)
 
 
 def _kind(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)} on {tensor.device}"
+
+
+class Adam:
+    """One learning rate per call; each tensor keeps its own step count (Kingma & Ba 2015, eps 1e-15 as in 3DGS)."""
+
+    def __init__(self) -> None:
+        self.first: dict[str, Tensor] = {}
+        self.second: dict[str, Tensor] = {}
+        self.steps: dict[str, int] = {}
+
+    @torch.no_grad()
+    def step(self, name: str, parameter: Tensor, learning_rate: float) -> None:
+        """Update `parameter` in place by its gradient and clear the gradient. Without a gradient nothing happens."""
+        if parameter.grad is None:
+            return
+        if name not in self.first:
+            self.first[name], self.second[name] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            self.steps[name] = 0
+        self.steps[name] += 1
+        adam_step(
+            parameter.detach(),
+            parameter.grad.contiguous(),
+            self.first[name],
+            self.second[name],
+            lr=learning_rate,
+            step=self.steps[name],
+        )
+        parameter.grad = None
+
+    def select_rows(self, names: list[str], index: Tensor, fresh: Tensor) -> None:
+        """Keep the moments of rows `index` [M]; rows marked `fresh` [M] start at zero."""
+        for name in names:
+            for moments in (self.first, self.second):
+                if name in moments:
+                    moments[name] = moments[name][index].contiguous()
+                    moments[name][fresh] = 0
+
+    def forget(self, name: str) -> None:
+        """Zero one tensor's moments."""
+        for moments in (self.first, self.second):
+            if name in moments:
+                moments[name].zero_()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Moments by name, for a checkpoint."""
+        return {f"first.{n}": t for n, t in self.first.items()} | {f"second.{n}": t for n, t in self.second.items()}
+
+    def restore(self, tensors: dict[str, Tensor], steps: dict[str, int]) -> None:
+        """The inverse of `tensors` and `steps`."""
+        self.first = {n.removeprefix("first."): t for n, t in tensors.items() if n.startswith("first.")}
+        self.second = {n.removeprefix("second."): t for n, t in tensors.items() if n.startswith("second.")}
+        self.steps = dict(steps)

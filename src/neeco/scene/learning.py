@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame, Instrument
-from neeco.raster.adam import Adam
+from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
 from neeco.scene.hinges import Hinged

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.adam import Adam
+from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.rotations import quat_to_matrix
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.raster.optimizer import adam_update
 from neeco.scene.rotations import rigid_from_vector, vector_from_rotation
 from neeco.training.config import RefineConfig, decayed
 
@@ -88,10 +89,8 @@ class Refinement:
                 continue
             row = slice(None) if name == "latency" else index
             steps = float(self.frame_steps.sum()) if name == "latency" else count
-            first, second = self.moments[f"first.{name}"], self.moments[f"second.{name}"]
-            first[row] = 0.9 * first[row] + 0.1 * leaf.grad
-            second[row] = 0.99 * second[row] + 0.01 * leaf.grad.square()
-            update = first[row] / (1 - 0.9**steps) / ((second[row] / (1 - 0.99**steps)).sqrt() + 1e-12)
+            first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
+            update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
             getattr(self, name)[row] -= decay * self.rates[name] * update
         self._leaves = {}
 

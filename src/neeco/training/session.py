@@ -14,8 +14,8 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.raster import Rendering, rasterize
-from neeco.raster.adam import Adam
 from neeco.raster.losses import photometric_loss
+from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation, floored_decay
 from neeco.scene.learning import InstrumentSearch, Report, StepResult
 from neeco.scene.scene import Scene

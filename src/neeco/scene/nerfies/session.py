@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.raster.adam import Adam
+from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import log_linear
 from neeco.scene.learning import Config, Start, StepResult
 from neeco.scene.nerfies.rays import RayTable
