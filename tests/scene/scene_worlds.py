@@ -10,6 +10,8 @@ from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recording, Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.nerfies.scene import NerfScene
+from neeco.scene.nerfies.settings import NerfiesSettings
 from neeco.scene.rotations import rigid_from_vector
 
 TISSUE, INSTRUMENT = 20, 40
@@ -78,3 +80,26 @@ def make_scene(method: str) -> Scene:
         torch.manual_seed(0)
         deformation.fit_ranges(list(states), canonical.means)
     return scene
+
+
+SMALL_NERF = {"rays": 16, "coarse_samples": 6, "width": 8, "depth": 2, "warp_width": 8, "warp_depth": 3, "chunk": 7}
+NERF_TIMES = (0.0, 1.0, 3.0)
+
+
+def make_nerf(**changes) -> NerfScene:
+    """Three moments of one instrument before one camera, the heads of the warp large enough to move things."""
+    torch.manual_seed(3)
+    pose = torch.eye(4, dtype=torch.float64)
+    states = tuple(State({"rod": InstrumentState(pose, {})}, time) for time in NERF_TIMES)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 9.0, 9.0, 4.0, 3.0, 8, 6)
+    recorded = Recording(("a", "b", "c"), ("train",) * 3, states, (camera,) * 3)
+    instruments = (Instrument("rod"),)
+    scene = NerfScene("nerfies", NerfiesSettings(**SMALL_NERF | changes), instruments, recorded)
+    scene.center.copy_(torch.tensor([0.0, 0.0, 50.0]))
+    scene.scale.fill_(40.0)
+    scene.bounds.copy_(torch.tensor([20.0, 80.0]))
+    scene.opened.fill_(8.0)
+    for head in (scene.warp.rotation, scene.warp.velocity):
+        torch.nn.init.normal_(head.weight, std=0.3)
+    torch.nn.init.normal_(scene.codes)
+    return scene.requires_grad_(False)

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scene_worlds import make_nerf
 from torch import Tensor
 
-from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.scene.encoding import encode_by_octave, window
 from neeco.scene.nerfies.render import composite, even_depths, finer_depths
@@ -20,28 +21,6 @@ from neeco.scene.nerfies.warp import WarpField, move_by_screw
 from neeco.scene.recording import Recording
 from neeco.scene.rotations import skew
 from neeco.scene.scene import gaussian_scene
-
-SMALL = {"rays": 16, "coarse_samples": 6, "width": 8, "depth": 2, "warp_width": 8, "warp_depth": 3, "chunk": 7}
-TIMES = (0.0, 1.0, 3.0)
-
-
-def make_nerf(**changes) -> NerfScene:
-    """Three moments of one instrument before one camera, the heads of the warp large enough to move things."""
-    torch.manual_seed(3)
-    pose = torch.eye(4, dtype=torch.float64)
-    states = tuple(State({"rod": InstrumentState(pose, {})}, time) for time in TIMES)
-    camera = Camera(torch.eye(4, dtype=torch.float64), 9.0, 9.0, 4.0, 3.0, 8, 6)
-    recorded = Recording(("a", "b", "c"), ("train",) * 3, states, (camera,) * 3)
-    instruments = (Instrument("rod"),)
-    scene = NerfScene("nerfies", NerfiesSettings(**SMALL | changes), instruments, recorded)
-    scene.center.copy_(torch.tensor([0.0, 0.0, 50.0]))
-    scene.scale.fill_(40.0)
-    scene.bounds.copy_(torch.tensor([20.0, 80.0]))
-    scene.opened.fill_(8.0)
-    for head in (scene.warp.rotation, scene.warp.velocity):
-        torch.nn.init.normal_(head.weight, std=0.3)
-    torch.nn.init.normal_(scene.codes)
-    return scene.requires_grad_(False)
 
 
 def screw_matrix(rotation: Tensor, velocity: Tensor) -> Tensor:

@@ -85,12 +85,13 @@ def _train(capture: Path, output: Path, minutes: float) -> Run:
     from dataclasses import replace
 
     from neeco.cli._training import train_with_progress
+    from neeco.raster.devices import device_of
     from neeco.training.config import method_defaults
     from neeco.training.run import load_run
 
     print(f"2/4 train for {minutes:g} minutes")
     config = replace(method_defaults("kinematic"), minutes=minutes)
-    return load_run(train_with_progress(capture, output, config))
+    return load_run(train_with_progress(capture, output, config, device_of("auto")))
 
 
 def _synthesize(trained: Run, output: Path) -> None:

@@ -24,6 +24,8 @@ class Arguments:
     """Optimisation steps; by default as the method has it."""
     minutes: float | None = None
     """Stop in time with a finished run."""
+    device: str = "auto"
+    """cpu, cuda, cuda:N, or auto: a CUDA device where there is one."""
     seed: int = 0
     """The same seed gives the same scene on the same machine (without --minutes)."""
     resume: bool = False
@@ -43,6 +45,7 @@ class Arguments:
 def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
     from neeco.cli._training import train_with_progress
+    from neeco.raster.devices import device_of
     from neeco.training.options import variant_config
 
     config = variant_config(
@@ -58,6 +61,6 @@ def run(args: Arguments) -> int:
         },
         args.set,
     )
-    path = train_with_progress(args.capture, args.output, config, resume=args.resume)
+    path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {path})")
     return 0

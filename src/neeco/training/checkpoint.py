@@ -30,10 +30,14 @@ def save_checkpoint(session: Session, run: Path) -> None:
     of_session, fields = session.pack()
     tensors = {f"scene/{name}": tensor for name, tensor in of_scene.items()} | of_session
     tensors |= {f"adam/{name}": tensor for name, tensor in session.adam.tensors().items()}
+    device = session.generator.device
     tensors |= {"random/torch": torch.get_rng_state(), "random/generator": session.generator.get_state()}
+    if device.type == "cuda":
+        tensors["random/cuda"] = torch.cuda.get_rng_state(device)
     header = {
         "schema": SCHEMA,
         "scene": scene_header,
+        "device": device.type,
         "adam_steps": session.adam.steps,
         "iteration": session.iteration,
         "seconds": session.seconds,
@@ -41,7 +45,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
     }
     metadata = {"neeco": json.dumps(header | fields)}
     save_tensors(
-        {name: tensor.detach().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
+        {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
     )
 
 
@@ -64,10 +68,20 @@ def read_checkpoint(run: Path) -> tuple[Learned, dict[str, Any], dict[str, Tenso
 
 
 def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-    """Put a fresh session, made around the checkpoint's scene, where the checkpoint was."""
-    session.adam.restore(members(tensors, "adam"), header["adam_steps"])
-    session.restore(tensors, header)
+    """Put a fresh session, made around the checkpoint's scene, where the checkpoint was.
+
+    Raises NeecoError on another kind of device: its random numbers would not go on.
+    """
+    device = session.generator.device
+    before = header.get("device", "cpu")  # older ones know no other
+    if before != device.type:
+        raise NeecoError(f"--device: the run was begun on {before}; go on with --device {before}")
+    there = {name: tensor.to(device) for name, tensor in tensors.items() if not name.startswith("random/")}
+    session.adam.restore(members(there, "adam"), header["adam_steps"])
+    session.restore(there, header)
     session.generator.set_state(tensors["random/generator"])
     torch.set_rng_state(tensors["random/torch"])
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(tensors["random/cuda"], device)
     session.window = [StepResult(loss, psnr) for loss, psnr in header.get("window", [])]  # not in older ones
     session.iteration, session.seconds = header["iteration"], header["seconds"]

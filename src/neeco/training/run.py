@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
 from neeco.files import write_text
-from neeco.scene.drawable import Drawable
+from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
 
@@ -25,7 +28,7 @@ class Run:
     """A finished training run. `config` is config.yaml as a dict (keys schema, version, capture, and TrainConfig's)."""
 
     path: Path
-    scene: Drawable
+    scene: Learned
     config: dict[str, Any]
 
     def capture(self) -> Capture:
@@ -37,13 +40,23 @@ class Run:
         return read_capture(root, self.config["transforms"])
 
 
-def load_run(path: Path) -> Run:
-    """Open a run folder. Raises NeecoError when it is not one, is unfinished or comes from another version's format."""
+def load_run(path: Path, device: torch.device | None = None) -> Run:
+    """Open a run folder, its scene on `device` (None: the CPU). Raises NeecoError when it is not one, is unfinished or
+    comes from another version's format."""
     path = Path(path)
     config = read_config(path)
     if not (path / "scene.safetensors").is_file():
         raise NeecoError(f"{path}: training has not finished here; continue it with `neeco train … --resume`")
-    return Run(path, load_scene(path / "scene.safetensors"), config)
+    scene = load_scene(path / "scene.safetensors")
+    return Run(path, scene if device is None else scene.to(device), config)
+
+
+@contextmanager
+def open_run(path: Path, device: torch.device | None = None) -> Iterator[Run]:
+    """`load_run` for a block that draws: until its end torch uses as many threads as pay for the run's method."""
+    run = load_run(path, device)
+    with run.scene.torch_threads():
+        yield run
 
 
 def read_config(path: Path) -> dict[str, Any]:

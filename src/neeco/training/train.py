@@ -28,6 +28,7 @@ from neeco.training.run import read_config, stored_config, write_config
 from neeco.training.views import TrainingViews
 
 CHECKPOINT_INTERVAL = 500  # iterations
+CPU = torch.device("cpu")
 ROW_INTERVAL = 50  # iterations averaged into one row of metrics.jsonl
 
 
@@ -54,6 +55,7 @@ def train(
     output: Path,
     config: TrainConfig,
     *,
+    device: torch.device = CPU,
     resume: bool = False,
     progress: Progress | None = None,
     watch: Watch | None = None,
@@ -61,11 +63,12 @@ def train(
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
-    Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an
-    interrupted run under the settings it was started with. The same seed gives the same scene, interrupted or not,
-    unless `minutes` is set: minutes of `clock` (s; time.process_time counts the processor's), without what `watch`
-    takes. Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss
-    that is no number.
+    `device` is where it computes; a run goes on on the kind of device it was begun on. Writes config.yaml,
+    metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an interrupted run
+    under the settings it was started with. The same seed gives the same scene on a CPU, interrupted or not, unless
+    `minutes` is set: minutes of `clock` (s; time.process_time counts the processor's), without what `watch` takes.
+    Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is
+    no number.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way
     KeyboardInterrupt says how to go on. What fails before the first step leaves no run folder behind.
@@ -82,7 +85,7 @@ def train(
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
     with new_folder(output), method_class(config.method).torch_threads():
         try:
-            session = _begin(capture, frames, output, config, resume, log)
+            session = _begin(capture, frames, output, config, device, resume, log)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("before the first step; run the same command again") from None
         write_config(output, capture_path, config)
@@ -110,10 +113,16 @@ def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
 
 
 def _begin(
-    capture: Capture, frames: tuple[Frame, ...], output: Path, config: TrainConfig, resume: bool, log: _Log
+    capture: Capture,
+    frames: tuple[Frame, ...],
+    output: Path,
+    config: TrainConfig,
+    device: torch.device,
+    resume: bool,
+    log: _Log,
 ) -> Session:
     """The session before its first step, or where the checkpoint in `output` left it."""
-    views = TrainingViews.read(frames)
+    views = TrainingViews.read(frames).to(device)
     started = log.clock()
     torch.manual_seed(config.seed)
     start = Start(capture, views, config, log.note, partial(gaussian_session, capture, views, config, log.note))
