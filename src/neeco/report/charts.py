@@ -133,7 +133,7 @@ def draw_dots(axes: Axes, places: np.ndarray, **style: object) -> None:
 
 def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:
     """About `count` round numbers along an axis, written by `label`."""
-    axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
+    axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=3))
     axis.set_major_formatter(lambda value, _: label(round(value, 12)))
 
 
