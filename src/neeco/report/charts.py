@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import LogLocator, MaxNLocator
@@ -100,7 +102,7 @@ def residual_chart(times: np.ndarray, values: np.ndarray, title: str, level: flo
 
 
 @page_style()
-def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, str]]:
+def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup]]:
     """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
     entries = []
     for order, name in enumerate(names):
@@ -125,10 +127,10 @@ def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]
     return tuple(means)
 
 
-def draw_dots(axes: Axes, places: np.ndarray, **style: object) -> None:
+def draw_dots(axes: Axes, places: np.ndarray, **style: Any) -> None:
     """Round dots at places [N, 2], `linewidth` across, as one path."""
     line = np.concatenate([places, places, np.full_like(places, np.nan)], axis=1).reshape(-1, 2)
-    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", clip_on=False, **style)  # type: ignore[arg-type]
+    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", clip_on=False, **style)
 
 
 def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:
@@ -153,21 +155,21 @@ def _color(order: int) -> str:
     return STAND_INS[f"m{order % COLORS}"]
 
 
-def _mark(order: int, size: float = 6.4) -> dict[str, object]:
+def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
     """A method's mark, hollow."""
     shape = {"marker": MARKS[order % len(MARKS)], "markersize": size, "markeredgewidth": 1, "fillstyle": "none"}
     return {**shape, "linestyle": "", "color": _color(order), "clip_on": False}
 
 
-def _dashes(order: int) -> dict[str, object]:
+def _dashes(order: int) -> dict[str, Any]:
     dashes = [float(length) for length in DASHES[order % len(DASHES)].split()]
     return {"color": _color(order), "clip_on": False, **({"dashes": dashes} if dashes else {})}
 
 
-def _draw_line(axes: Axes, order: int, points: Sequence[Point], style: dict[str, object]) -> None:
+def _draw_line(axes: Axes, order: int, points: Sequence[Point], style: dict[str, Any]) -> None:
     if len(points) < 2:
         style = _mark(order, 8.0)
-    axes.plot(*_columns(points), **{"color": _color(order), "clip_on": False, **style})  # type: ignore[arg-type]
+    axes.plot(*_columns(points), **{"color": _color(order), "clip_on": False, **style})
 
 
 def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
@@ -198,5 +200,5 @@ def _draw_names(axes: Axes, series: Sequence[Series], size: tuple[int, int]) -> 
     beyond = max(0.0, places[-1] + box.y0) if places else 0.0
     for (_, order, item), y in zip(ends, places, strict=True):
         name = item.name if len(item.name) <= LABEL_CHARACTERS else item.name[: LABEL_CHARACTERS - 1] + "…"
-        place = {"transform": IdentityTransform(), "va": "center_baseline"}
+        place: dict[str, Any] = {"transform": IdentityTransform(), "va": "center_baseline"}
         axes.text(box.x1 + 8, beyond - y, name, color=_color(order), gid="name", **place)

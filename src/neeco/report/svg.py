@@ -12,6 +12,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 
 VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(7)))
 STAND_INS = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}
-STYLE = {
+STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
     "axes.grid.axis": "y",
