@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import IdentityTransform
 
 from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
@@ -23,7 +23,7 @@ CHARACTER = 6.9  # units that one takes at most, on average
 COLORS = 7
 DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
-SUBDIVIDED = 300.0  # from lowest to highest: a logarithmic axis has 2 and 5 between powers of ten up to here
+FEW_DECADES = (10.0, 300.0)  # highest over lowest where the ticks of a logarithmic axis are 1, 2 and 5
 
 Point = tuple[float, float]
 
@@ -76,7 +76,10 @@ def line_chart(
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
         low, high = axes.get_ylim()
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < SUBDIVIDED else (1.0,)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        if high / low > FEW_DECADES[0]:
+            subdivided = high / low < FEW_DECADES[1]
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if subdivided else (1.0,)))
     falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
     for x, words in starts:
         _draw_start(axes, x, words, falling)
