@@ -181,7 +181,7 @@ def chart(rows: list[Row], key: str, title: str) -> Figure:
             line = [row for row in rows if (row.name, row.split) == (name, split)]
             minutes, values = [row.cpu_seconds / 60 for row in line], [getattr(row, key) for row in line]
             solid = split == "test"
-            style = {"color": COLORS[index % len(COLORS)], "linestyle": "-" if solid else "--"}
+            style = {"color": COLORS[index % len(COLORS)], "linestyle": "-" if solid else "--", "linewidth": 1.8}
             axes.plot(minutes, values, label=name if solid else None, **style)
     axes.set_xlim(left=0)
     axes.grid(axis="y", color="#dde1e6")

@@ -83,7 +83,7 @@ def line_chart(
     falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
     for x, words in starts:
         _draw_start(axes, x, words, falling)
-    _draw_names(axes, [item for item in series if item.main and item.name], size)
+    _draw_names(axes, [item for item in series if item.main and item.name])
     return inline_svg(axes, f"{title} over {over}")
 
 
@@ -192,7 +192,7 @@ def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
     )
 
 
-def _draw_names(axes: Axes, series: Sequence[Series], size: tuple[int, int]) -> None:
+def _draw_names(axes: Axes, series: Sequence[Series]) -> None:
     """Each method's name at the end of its line, moved apart where they would cover one another."""
     axes.get_ylim()  # the scale is settled only when it is asked for
     ends = sorted((-axes.transData.transform(item.main[-1])[1], item.order, item) for item in series)

@@ -29,7 +29,7 @@ def write_page(path: Path, template: str, **data: Any) -> Path:
     """
     page = _templates().get_template(template)
     made_at = f"{now():%Y-%m-%d %H:%M %Z}"
-    write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}))
+    write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}) + "\n")
     return path
 
 
