@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import math
 import tempfile
 import time
 from dataclasses import asdict, dataclass, fields
-from html import escape
 from pathlib import Path
 
+import matplotlib
 import torch
+from matplotlib.figure import Figure
 
 from neeco.capture import read_capture
 from neeco.capture.model import Frame
@@ -28,7 +30,6 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_text
 from neeco.raster.threads import set_threads
-from neeco.report.axes import nice_ticks
 from neeco.scene import Drawable
 from neeco.scene.learning import Session
 from neeco.training.options import training_config
@@ -38,7 +39,7 @@ from neeco.training.train import train
 MINUTES = (0.5, 1.0, *range(2, 61, 2))  # of processor time, when a run is scored
 KINDS = {"str": str, "float": float, "int": int, "int | None": lambda text: int(text) if text else None}
 COLORS = ("#0b6e99", "#b3541e", "#1a7f4b", "#7a3ea1", "#8a6d00", "#b3261e")
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 520, 300, 46, 170, 30, 40
+WIDTH, HEIGHT = 520, 300  # view box units
 
 
 @dataclass(frozen=True)
@@ -162,52 +163,38 @@ def plot(args: argparse.Namespace) -> None:
     Beside it curves_instrument.svg, unless no run was of a capture with true masks.
     """
     rows = read_rows(args.folder)
-    write_text(args.folder / "curves.svg", chart(rows, "psnr", "PSNR on held-out frames, dB"))
+    write_chart(args.folder / "curves.svg", chart(rows, "psnr", "PSNR on held-out frames, dB"))
     inside = [row for row in rows if math.isfinite(row.psnr_instrument)]
     if inside:
         chart_inside = chart(inside, "psnr_instrument", "PSNR inside the instrument, dB")
-        write_text(args.folder / "curves_instrument.svg", chart_inside)
+        write_chart(args.folder / "curves_instrument.svg", chart_inside)
     for row in rows:
         print(row)
 
 
-def chart(rows: list[Row], key: str, title: str) -> str:
-    """An SVG line chart of `key` over minutes: one colour per run, the split `test` solid, others dashed."""
-    values = [getattr(row, key) for row in rows]
-    low, high = min(values) - 0.5, max(values) + 0.5
-    last = max(row.cpu_seconds for row in rows) / 60
-
-    def at(row: Row) -> str:
-        x = LEFT + row.cpu_seconds / 60 / last * (WIDTH - LEFT - RIGHT)
-        return f"{x:.1f} {down(getattr(row, key)):.1f}"
-
-    def down(value: float) -> float:
-        return TOP + (high - value) / (high - low) * (HEIGHT - TOP - BOTTOM)
-
-    parts = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" font-family="sans-serif"']
-    parts += [' font-size="11" fill="none">', f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>']
-    parts.append(f'<text x="{LEFT}" y="18" fill="#1c2024" font-size="13">{escape(title)}</text>')
-    for tick in nice_ticks(low, high, 6):
-        parts.append(f'<path stroke="#dde1e6" d="M{LEFT} {down(tick):.1f}H{WIDTH - RIGHT}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{down(tick) + 4:.1f}" text-anchor="end" fill="#5c656e">{tick:g}</text>')
-    for tick in nice_ticks(0, last, 6):
-        x = LEFT + tick / last * (WIDTH - LEFT - RIGHT)
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 24}" text-anchor="middle" fill="#5c656e">{tick:g}</text>')
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    parts.append(
-        f'<text x="{middle}" y="{HEIGHT - 8}" text-anchor="middle" fill="#5c656e">minutes of processor time</text>'
-    )
+def chart(rows: list[Row], key: str, title: str) -> Figure:
+    """A line chart of `key` over minutes: one colour per run, the split `test` solid, others dashed."""
+    figure = Figure((WIDTH / 72, HEIGHT / 72), dpi=72, layout="constrained")
+    axes = figure.add_subplot(title=title, xlabel="minutes of processor time")
     for index, name in enumerate(dict.fromkeys(row.name for row in rows)):
-        color = COLORS[index % len(COLORS)]
         for split in dict.fromkeys(row.split for row in rows):
-            line = [at(row) for row in rows if (row.name, row.split) == (name, split)]
-            dash = "" if split == "test" else ' stroke-dasharray="5 3"'
-            parts.append(f'<path stroke="{color}" stroke-width="1.8"{dash} d="M{"L".join(line)}"/>')
-        y = TOP + 14 + 18 * index
-        parts.append(f'<path stroke="{color}" stroke-width="3" d="M{WIDTH - RIGHT + 10} {y - 4}h18"/>')
-        parts.append(f'<text x="{WIDTH - RIGHT + 34}" y="{y}" fill="#1c2024">{escape(name)}</text>')
-    parts.append(f'<text x="{WIDTH - RIGHT + 10}" y="{HEIGHT - BOTTOM}" fill="#5c656e">dashed: unseen states</text>')
-    return "".join(parts) + "</svg>\n"
+            line = [row for row in rows if (row.name, row.split) == (name, split)]
+            minutes, values = [row.cpu_seconds / 60 for row in line], [getattr(row, key) for row in line]
+            solid = split == "test"
+            style = {"color": COLORS[index % len(COLORS)], "linestyle": "-" if solid else "--", "linewidth": 1.8}
+            axes.plot(minutes, values, label=name if solid else None, **style)
+    axes.set_xlim(left=0)
+    axes.grid(axis="y", color="#dde1e6")
+    axes.legend(title="dashed: unseen states", loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    return figure
+
+
+def write_chart(path: Path, figure: Figure) -> None:
+    """Write the figure as SVG, the same bytes for the same numbers."""
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "neeco", "svg.fonttype": "none"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    write_text(path, stream.getvalue())
 
 
 def main() -> None:

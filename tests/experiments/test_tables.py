@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 
 from neeco.cli.compare import fitting
+from neeco.experiments.comparison_tables import latex_text, markdown_text, summary_csv, tables_of
 from neeco.experiments.summary import RUN_METRICS, SPLIT_METRICS, spread, summarise
-from neeco.experiments.tables import csv_text, latex_escape, latex_text, markdown_text, tables_of
+from neeco.experiments.tables import latex_escape
 
 PSNR = {"a_b": (20.0, 22.0), "c|d": (20.5, 21.5), "lost": ()}
 
@@ -47,11 +48,12 @@ def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
 def test_equal_means_are_both_best_and_lower_lpips_is_better(comparison) -> None:
     split, own = tables_of(comparison)
     assert [column.key for column in split.columns] == ["psnr", "lpips"]  # nobody knows the others
-    cells = dict(split.rows)
+    cells = {row.keys[0]: row.cells for row in split.rows}
+    assert split.keys == own.keys == ("method",)
     assert [cell.best for cell in cells["a_b"]] == [True, True]
     assert [cell.best for cell in cells["c|d"]] == [True, False]
-    assert (cells["a_b"][0].mean, cells["a_b"][0].std) == ("21.00", "1.41")
-    assert dict(own.rows)["a_b"][1].mean == "1.00"  # 60 s in minutes
+    assert (cells["a_b"][0].text, cells["a_b"][0].std) == ("21.00", "1.41")
+    assert own.rows[0].cells[1].text == "1.00"  # 60 s in minutes
 
 
 def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
@@ -87,7 +89,7 @@ def test_latex_escaping(text: str, escaped: str) -> None:
 
 
 def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
-    rows = list(csv.DictReader(io.StringIO(csv_text(comparison))))
+    rows = list(csv.DictReader(io.StringIO(summary_csv(comparison))))
     assert [row["name"] for row in rows] == ["a_b", "c|d", "lost"]
     assert float(rows[0]["psnr_std"]) == 2**0.5
     assert rows[2]["psnr_mean"] == ""

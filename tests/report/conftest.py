@@ -1,4 +1,15 @@
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
+import pytest
+
+from neeco.report import render
+
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture
+def noon(monkeypatch):
+    """Pages are written at one fixed time."""
+    monkeypatch.setattr(render, "now", lambda: datetime(2026, 1, 1, 12, tzinfo=UTC))

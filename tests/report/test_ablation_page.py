@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
-from html_page import Page
+from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.experiments.ablation_results import table_of, verdict
 from neeco.experiments.ablations import ABLATIONS
@@ -61,13 +61,13 @@ def test_the_page_is_whole_and_fetches_nothing(ablation: dict, tmp_path: Path) -
     assert "a&lt;b&gt;&amp;c" in text
     assert "it &lt;failed&gt;" in text
     assert "too short" in text
-    assert "<td class='yes'>yes</td>" in text
+    assert '<td class="yes">yes</td>' in text
     assert "1 of 1 as in the paper" in text
 
 
 def test_every_figure_has_its_numbers_beside_it(ablation: dict, tmp_path: Path) -> None:
     text = write_ablation_report(tmp_path, ablation).read_text(encoding="utf-8")
-    links = re.findall(r"download='([^']+)' href='data:text/csv;base64,([^']+)'", text)
+    links = re.findall(r'download="([^"]+)" href="data:text/csv;base64,([^"]+)"', text)
     files = {name: list(csv.DictReader(io.StringIO(base64.b64decode(data).decode()))) for name, data in links}
     assert set(files) == {
         "uniform-motion.csv",
@@ -79,3 +79,12 @@ def test_every_figure_has_its_numbers_beside_it(ablation: dict, tmp_path: Path) 
     assert curves[1] == {"setting": "off", "iteration": "50", "psnr_test": "15.0"}
     assert files["tracker-noise-psnr.csv"][2] == {"split": "test", "level": "1.0", "psnr": "22.0"}
     assert text.count("<figure>") == text.count("data (CSV)</a>") == 2
+
+
+def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(ablation: dict, tmp_path: Path, noon) -> None:
+    ablation |= {"capture": f"/data/{HOSTILE}", "settings": [HOSTILE], "notes": [HOSTILE]}
+    ablation["failures"] = [{"run": HOSTILE, "error": HOSTILE}]
+    ablation["runs"][0]["name"] = HOSTILE
+    for row in (*ablation["tables"][0]["rows"], *ablation["tables"][0]["curves"]):
+        row["comparison"] = row["label"] = HOSTILE
+    check_hostile_names(lambda: write_ablation_report(tmp_path, ablation).read_text(encoding="utf-8"), VOID)

@@ -8,11 +8,11 @@ import io
 from itertools import pairwise
 
 import pytest
-from html_page import Page
+from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.experiments.summary import summarise
 from neeco.report import comparison_shots
-from neeco.report.charts import Series, binned, chart, legend
+from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.comparison_page import command_of, write_comparison_report
 from neeco.report.comparison_shots import median_frame
 from neeco.report.standings import first_in, standings
@@ -118,7 +118,7 @@ def test_every_figures_data_is_in_the_page_and_beside_it(tmp_path, comparison, c
     beside = {path.name: path.read_text(encoding="utf-8") for path in (tmp_path / "out/data").iterdir()}
     assert set(beside) == set(FIGURES)
     assert set(beside.values()) == inside
-    assert all(f"download='{name}'" in text for name in FIGURES)
+    assert all(f'download="{name}"' in text for name in FIGURES)
     frames = list(csv.DictReader(io.StringIO(beside["frames.csv"])))
     assert [(row["split"], row["name"], row["seed"]) for row in frames] == [
         (split, name, "0") for split in ("test", "unseen") for name in ("kinematic", "3dgs")
@@ -129,14 +129,14 @@ def test_every_figures_data_is_in_the_page_and_beside_it(tmp_path, comparison, c
 
 def test_means_spreads_the_best_and_what_is_missing_are_shown(tmp_path, comparison, capture):
     text, _ = page_of(tmp_path / "out", comparison, capture)
-    assert "<td class=best>24.20 <small>± 0.28</small></td>" in text
+    assert '<td class="best">24.20 <small>± 0.28</small></td>' in text
     assert "<td>20.05 <small>± 0.07</small></td>" in text
     assert "<td>–</td>" in text  # 3dgs has no labels
     assert "failed: config.yaml: &lt;field&gt;: wrong" in text
     assert "1 of 5 runs failed" in text
     assert "a &lt;processor&gt;" in text
     assert "capture &lt;b&gt;" in text
-    assert text.count("<svg viewBox='0 0 460") + text.count('<svg viewBox="0 0 460') == 2 + 2  # curves; PSNR twice
+    assert text.count('<svg viewBox="0 0 460') == 2 + 2  # curves; PSNR twice
 
 
 @pytest.mark.parametrize("seeds", [(0,), (0, 1)])
@@ -145,7 +145,7 @@ def test_one_method_has_a_page_too(tmp_path, capture, seeds):
     text, _ = page_of(tmp_path / "out", comparison, capture)
     assert "only kinematic has a PSNR" in text
     assert ("± 0.71" in text) == (len(seeds) == 2)
-    assert "class=best" not in text
+    assert 'class="best"' not in text
 
 
 def test_a_comparison_where_everything_failed_says_so(tmp_path, capture):
@@ -220,11 +220,14 @@ def test_one_seed_is_said_once(comparison):
 
 def test_charts_tell_methods_apart_without_colour():
     series = [Series(f"m{k}", k, ((0.0, 1.0 + k), (1.0, 2.0 + k))) for k in range(7)]
-    dashes = {part.split('"')[0] for part in chart("t", "x", series).split('stroke-dasharray="')[1:]}
-    assert len(dashes) == 7
-    assert legend(["a", "<b>"], ["<b>"]).count("<span>") == 1
-    assert "&lt;b&gt;" in legend(["a", "<b>"], ["<b>"])
-    assert chart("t", "x", []) == chart("t", "x", [Series("one", 0, ((1.0, 1.0),))]) == ""
+    lines = [part for part in line_chart("t", "x", series).split("<path ") if "stroke: var(--m" in part]
+    dashes = {part.partition("stroke-dasharray: ")[2].partition(";")[0] for part in lines}
+    assert len(lines) == len(dashes) == 7
+    ((name, sample),) = legend(["a", "<b>"], ["<b>"])
+    assert name == "<b>"
+    assert "&lt;b&gt;" in sample
+    assert "var(--m1)" in sample
+    assert line_chart("t", "x", []) == line_chart("t", "x", [Series("one", 0, ((1.0, 1.0),))]) == ""
 
 
 def test_names_at_the_ends_of_lines_do_not_cover_one_another():
@@ -232,10 +235,20 @@ def test_names_at_the_ends_of_lines_do_not_cover_one_another():
         Series("low", 6, ((0.0, 0.0), (1.0, 0.0)))
     ]
     places = sorted(
-        float(part.split(' y="')[1].split('"')[0]) for part in chart("t", "x", series).split('class="name"')[1:]
+        float(part.split(' y="')[1].split('"')[0]) for part in line_chart("t", "x", series).split('class="name"')[1:]
     )
     assert len(places) == 7
     assert min(b - a for a, b in pairwise(places)) >= 13 - 1e-6
+
+
+def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, noon, monkeypatch):
+    capture = world.make_capture(tmp_path / HOSTILE, world.TinyScene(), ("train", "test", "unseen"))
+    monkeypatch.setattr(comparison_shots, "load_run", lambda folder: world.TinyRun(folder, world.TinyScene(), None))
+    jobs = [job(f"{HOSTILE}{k}", seed, 24.0 + k, 0.8) for k in (0, 1) for seed in (0, 1)]
+    comparison = comparison_of(capture, [*jobs, {**FAILED, "name": HOSTILE, "error": HOSTILE}])
+    comparison |= {"notes": [HOSTILE], "settings": [HOSTILE], "version": HOSTILE}
+    comparison["machine"]["cpu"] = HOSTILE
+    check_hostile_names(lambda: page_of(tmp_path / "out", comparison, capture)[0], VOID)
 
 
 def test_groups_take_means_and_leave_out_empty_ones():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from html_page import Page
+from html_page import HOSTILE, Page, check_hostile_names
 from PIL import Image
 
 from neeco.capture import read_capture
@@ -101,7 +101,7 @@ def test_the_page_says_the_numbers(text):
 
 
 def test_what_was_dropped_is_grouped_by_reason_with_frame_numbers(text):
-    assert "<td>blurred: …% of its neighbours&#x27; sharpness</td><td>4</td>" in text
+    assert "<td>blurred: …% of its neighbours&#39; sharpness</td><td>4</td>" in text
     assert "96–98, 105" in text
     assert "<td>no camera</td><td>1</td>" in text
 
@@ -122,7 +122,7 @@ def test_the_view_that_turns_brings_its_data_and_runs_no_foreign_script(text):
 def test_the_tracked_frame_is_drawn_where_the_instrument_is(tmp_path):
     def first_picture(**changes):
         write_ingest_page(made(SAMPLE, **changes), tmp_path / "page.html")
-        uri = re.search(r"src='data:image/jpeg;base64,([^']*)'", (tmp_path / "page.html").read_text())[1]
+        uri = re.search(r'src="data:image/jpeg;base64,([^"]*)"', (tmp_path / "page.html").read_text())[1]
         return np.asarray(Image.open(io.BytesIO(b64decode(uri))).convert("RGB")).astype(int)
 
     capture = read_capture(SAMPLE)
@@ -258,3 +258,23 @@ def test_without_an_instrument_or_points_there_is_still_a_page(tmp_path):
 def test_a_capture_that_cannot_be_read_is_named(tmp_path):
     with pytest.raises(NeecoError, match="no such folder"):
         write_ingest_page(replace(made(SAMPLE), capture=tmp_path / "gone"), tmp_path / "page.html")
+
+
+def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(tmp_path, noon):
+    def rename(document):
+        document["instruments"] = [{"name": HOSTILE, "joints": {HOSTILE: {"limits": [0, 2]}}}]
+        for frame in document["frames"]:
+            frame["split"] = frame["split"] if frame["split"] == "train" else HOSTILE
+            for state in frame["instruments"]:
+                state.update(name=HOSTILE, joints={HOSTILE: next(iter(state["joints"].values()))})
+
+    clock = ClockOffset(0.0, float("nan"), HOSTILE)
+    names = {"recording": HOSTILE, "clocks": {HOSTILE: clock}, "split_rule": HOSTILE, "notes": (HOSTILE,)}
+    result = made(edited(tmp_path / HOSTILE, rename), dropped=((3, HOSTILE),), **names)
+    path = tmp_path / "page.html"
+
+    def write():
+        write_ingest_page(result, path)
+        return path.read_text()
+
+    check_hostile_names(write, VOID, scripts=1)

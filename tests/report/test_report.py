@@ -1,16 +1,19 @@
 """The report is one offline page that says what the numbers say."""
 
 import json
+import re
+from dataclasses import replace
 
+import matplotlib
 import pytest
-from html_page import Page
+from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.report import write_report
-from neeco.report.axes import nice_ticks
-from neeco.report.curves import curve, phase_starts, read_metrics
+from neeco.report.charts import Series, line_chart
 from neeco.report.figures import chosen_rows
+from neeco.report.run_page import curve, phase_starts, read_metrics
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}
 
@@ -83,14 +86,40 @@ def test_best_median_and_worst_frame_are_shown_once_each():
 
 def test_curves_mark_where_the_phase_changes_and_stay_out_when_there_is_nothing_to_draw(tmp_path):
     rows = [{"iteration": i, "loss": 1.0 - i / 20, "phase": 1 if i < 5 else 2} for i in range(10)]
-    assert phase_starts(rows) == [(5.0, "2")]
+    assert phase_starts(rows) == [(5.0, "phase 2")]
     assert 'class="phase"' in curve(rows, "loss", "loss")
     assert curve(rows, "psnr", "PSNR") == ""
     assert curve(rows[:1], "loss", "loss") == ""
     assert read_metrics(tmp_path / "none.jsonl") == []
 
 
+def ticks_of(low, high):
+    """What stands at the left of a chart of values from `low` to `high`."""
+    svg = line_chart("", "x", [Series("", 0, ((0.0, low), (1.0, high)))])
+    texts = re.findall(r"text-anchor: end[^>]*>([^<]+)</text>", svg)
+    return [float(text) for text in texts]
+
+
 def test_ticks_are_round_and_inside_the_range():
-    assert nice_ticks(0.0, 10.0, 5) == [0, 2, 4, 6, 8, 10]
-    ticks = nice_ticks(23.1, 29.7, 4)
-    assert ticks == [24, 26, 28]
+    assert ticks_of(0.0, 10.0) == [0, 5, 10]
+    assert ticks_of(23.1, 29.7) == [24, 26, 28, 30]  # the chart ends at 30.03
+
+
+def test_a_chart_has_no_ids_no_fixed_colours_and_needs_nothing_from_elsewhere(monkeypatch):
+    rows = [{"iteration": i, "loss": 1.0 - i / 20, "phase": 1 if i < 5 else 2} for i in range(10)]
+    svg = curve(rows, "loss", "loss $\\frac$ \u65e5 \x01")
+    assert svg.startswith('<svg viewBox="0 0 420 190" role="img" aria-label="loss $')
+    assert not re.search(r" id=|url\(|http|#[0-9a-f]{3}|font-family", svg)
+    assert "$\\frac$ \u65e5 \ufffd" in svg
+    monkeypatch.setitem(matplotlib.rcParams, "font.size", 40.0)  # the user's own settings change nothing
+    assert curve(rows, "loss", "loss $\\frac$ \u65e5 \x01") == svg
+
+
+def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(reported, world, tmp_path, noon):
+    scene = world.TinyScene(method=HOSTILE, diagnostics={HOSTILE: {"hinge": HOSTILE, "verdict": HOSTILE}})
+    capture = world.make_capture(tmp_path / HOSTILE, scene, ("train", "test"))
+    (tmp_path / "config.yaml").write_text(HOSTILE)
+    evaluation = evaluate_run(world.TinyRun(tmp_path, scene, capture)) | {"notes": [HOSTILE]}
+    scene.instruments = (replace(scene.instruments[0], name=HOSTILE),)
+    scene.label_names = ((HOSTILE, HOSTILE), ("bar", HOSTILE))
+    check_hostile_names(lambda: write_report(tmp_path, evaluation, capture, scene).read_text(), VOID)

@@ -108,12 +108,12 @@ def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
         if table["judged"]:
             console.print(f"{table['title']}: {agreement(table)}", markup=False, highlight=False)
             continue
-        headings, lines, keys = grid(table)
+        told = grid(table)
+        headings = [*told.keys, *(column.title for column in told.columns)]
         rows = [
-            [Text(cell, "bold" if row["reference"] else "") for cell in line]
-            for row, line in zip(table["rows"], lines, strict=True)
+            [Text(str(cell), "bold" if row.reference else "") for cell in (*row.keys, *row.cells)] for row in told.rows
         ]
-        for piece in fitted(table["title"], headings, rows, keys, console.width):
+        for piece in fitted(told.title, headings, rows, len(told.keys), console.width):
             console.print(piece)
     for note in ablation["notes"]:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)

@@ -16,7 +16,6 @@ from neeco.cli._tables import fitted
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
     from neeco.experiments.jobs import Budget
-    from neeco.experiments.tables import Cell
     from neeco.experiments.tables import Table as ResultTable
 
 
@@ -61,7 +60,7 @@ def run(args: Compare) -> int:
     from neeco.capture import read_capture
     from neeco.cli._jobs import JobBars
     from neeco.experiments.comparison import compare, failures
-    from neeco.experiments.tables import absent_notes, budget_words, tables_of
+    from neeco.experiments.comparison_tables import absent_notes, budget_words, tables_of
     from neeco.report.comparison_page import write_comparison_report
 
     with JobBars() as bars:
@@ -142,13 +141,9 @@ def _budget(args: Compare) -> Budget:
 
 def fitting(table: ResultTable, width: int) -> list[Table]:
     """A table of the comparison for a terminal of `width` characters; the best of a column is bold."""
-    headings = ["method", *(column.title for column in table.columns)]
-    rows = [
-        [Text(name), Text("failed", "red")] if name in table.failed else [Text(name), *map(_text, cells)]
-        for name, cells in table.rows
-    ]
-    return fitted(table.title, headings, rows, 1, width)
-
-
-def _text(cell: Cell) -> Text:
-    return Text(f"{cell.mean} ± {cell.std}" if cell.std else cell.mean, "bold" if cell.best else "")
+    headings = [*table.keys, *(column.title for column in table.columns)]
+    rows = []
+    for row in table.rows:
+        cells = [Text(str(cell), "bold" if cell.best else "") for cell in row.cells]
+        rows.append([*map(Text, row.keys), *(cells if row.failed is None else [Text("failed", "red")])])
+    return fitted(table.title, headings, rows, len(table.keys), width)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from neeco.experiments.tables import latex_escape
+from neeco.experiments import tables
+from neeco.experiments.tables import UNKNOWN, Cell, Column, Row, Table
 from neeco.files import write_text
 
 HEADINGS = {
@@ -17,15 +16,8 @@ HEADINGS = {
     "psnr_instrument": "instrument PSNR",
     "mask_iou": "mask IoU",
 }
-VERDICTS = {"yes": "yes", "no": "no", "even": "even", None: "-"}
-
-
-class Grid(NamedTuple):
-    """A table as text. The first `keys` columns say what a row is, the last of them its setting; numbers follow."""
-
-    headings: list[str]
-    rows: list[list[str]]
-    keys: int
+HEADER = ("table", "comparison", "setting", "run", "measure", "paper", "ours", "difference", "agrees")
+VERDICTS = {"yes": "yes", "no": "no", "even": "even", None: UNKNOWN}
 
 
 def write_tables(output: Path, ablation: dict[str, Any]) -> list[Path]:
@@ -51,35 +43,37 @@ def heading(measure: str) -> str:
 def formatted(measure: str, value: float | None, *, signed: bool = False) -> str:
     """A number as the tables show it: dB with two digits, IoU with three; `-` when not known."""
     if value is None:
-        return "-"
+        return UNKNOWN
     digits = 3 if measure.startswith("mask_iou") else 2
     return f"{value:{'+' if signed else ''}.{digits}f}"
 
 
-def grid(table: dict[str, Any]) -> Grid:
+def grid(table: dict[str, Any]) -> Table:
     """A table for reading: per judged measure the paper's number, ours and the verdict; the rest as ours alone.
 
     What is compared has a column of its own where it is not the same in all rows.
     """
     judged = table["judged"]
     several = len({row["comparison"] for row in table["rows"]}) > 1
-    headings = ["", "setting"] if several else ["setting"]
-    keys = len(headings)
+    columns = []
     for measure in table["measures"]:
-        headings += [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
+        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
+        columns += [Column(measure, title) for title in titles]
     rows = []
     for row in table["rows"]:
-        cells = [row["comparison"], row["label"]] if several else [row["label"]]
-        for measure in table["measures"]:
-            ours = _ours(row, measure)
-            if measure not in judged:
-                cells.append(ours)
-                continue
-            paper = row["paper"].get(measure)
-            told = formatted(measure, paper) if paper is not None else row["paper_direction"] or "-"
-            cells += [told, ours, "" if row["reference"] else VERDICTS[row["agrees"].get(measure)]]
-        rows.append(cells)
-    return Grid(headings, rows, keys)
+        keys = (row["comparison"], row["label"]) if several else (row["label"],)
+        cells = [Cell(text) for measure in table["measures"] for text in _told(row, measure, measure in judged)]
+        rows.append(Row(keys, tuple(cells), reference=row["reference"]))
+    return Table(table["title"], ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+
+
+def _told(row: dict[str, Any], measure: str, judged: bool) -> list[str]:
+    """Our number, and where it is judged the paper's before it and the verdict behind it."""
+    if not judged:
+        return [_ours(row, measure)]
+    paper = row["paper"].get(measure)
+    told = formatted(measure, paper) if paper is not None else row["paper_direction"] or UNKNOWN
+    return [told, _ours(row, measure), "" if row["reference"] else VERDICTS[row["agrees"].get(measure)]]
 
 
 def _ours(row: dict[str, Any], measure: str) -> str:
@@ -104,40 +98,24 @@ def agreement(table: dict[str, Any]) -> str:
 
 def csv_text(table: dict[str, Any]) -> str:
     """One line per setting and measure: every number in full."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["table", "comparison", "setting", "run", "measure", "paper", "ours", "difference", "agrees"])
+    lines = []
     for row in table["rows"]:
+        entry = {"table": table["name"], "setting": row["label"], **{key: row[key] for key in ("comparison", "run")}}
         for measure in dict.fromkeys([*table["measures"], *row["values"]]):
-            numbers = [row["paper"].get(measure), row["values"].get(measure), row["difference"].get(measure)]
-            cells = ["" if number is None else number for number in numbers]
-            verdict = row["agrees"].get(measure) or ""
-            writer.writerow([table["name"], row["comparison"], row["label"], row["run"], measure, *cells, verdict])
-    return stream.getvalue()
+            numbers = {"paper": row["paper"], "ours": row["values"], **{k: row[k] for k in ("difference", "agrees")}}
+            told = {column: values.get(measure) for column, values in numbers.items()}
+            lines.append({**entry, "measure": measure, **told})
+    return tables.csv_text(HEADER, lines)
 
 
 def markdown(table: dict[str, Any]) -> str:
     """A Markdown table under its title."""
-    headings, rows, keys = grid(table)
-    lines = [f"## {table['title']}", "", table["question"], ""]
-    rule = "|" + "---|" * keys + "---:|" * (len(headings) - keys)
-    lines += [_line(headings), rule, *map(_line, rows)]
+    title, empty, *lines = tables.markdown_lines(grid(table))
     told = agreement(table)
-    return "\n".join([*lines, *(["", f"Directions: {told}."] if told else [])]) + "\n"
-
-
-def _line(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    directions = ["", f"Directions: {told}."] if told else []
+    return "\n".join([title, empty, table["question"], "", *lines, *directions]) + "\n"
 
 
 def latex(table: dict[str, Any]) -> str:
     """A LaTeX table (booktabs)."""
-    headings, rows, keys = grid(table)
-    lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_escape(table['title'])}}}"]
-    lines += [rf"\begin{{tabular}}{{{'l' * keys}{'r' * (len(headings) - keys)}}}", r"\toprule"]
-    lines += [_tex_row(headings), r"\midrule", *map(_tex_row, rows), r"\bottomrule"]
-    return "\n".join([*lines, r"\end{tabular}", r"\end{table}"]) + "\n"
-
-
-def _tex_row(cells: list[str]) -> str:
-    return " & ".join(map(latex_escape, cells)) + r" \\"
+    return "\n".join(tables.latex_lines(grid(table), table["title"])) + "\n"

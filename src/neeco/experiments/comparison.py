@@ -16,6 +16,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.cluster import require_ray, threads_per_worker
+from neeco.experiments.comparison_tables import write_tables
 from neeco.experiments.distance import distances_to_training
 from neeco.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits
 from neeco.experiments.machine import machine
@@ -24,7 +25,6 @@ from neeco.experiments.running import run_jobs
 from neeco.experiments.settings import check_settings, settings_for
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import summarise
-from neeco.experiments.tables import write_tables
 from neeco.experiments.watching import CURVE_FILE, TOTALS
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.methods import unmet_need

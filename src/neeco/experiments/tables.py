@@ -1,4 +1,4 @@
-"""The tables of a comparison: CSV for programs, Markdown for pages, LaTeX for papers."""
+"""One kind of result table, for the terminal, pages, Markdown and LaTeX; and the CSV of numbers behind it."""
 
 from __future__ import annotations
 
@@ -6,211 +6,9 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
-from neeco.experiments.summary import MASK_METRICS, RUN_METRICS, SPLIT_METRICS
-from neeco.files import write_text
-
-METRICS = (*SPLIT_METRICS, *MASK_METRICS, *RUN_METRICS)
 UNKNOWN = "-"
-ABSENT = {
-    "psnr_instrument": "the capture has no true masks, or no run finished",
-    "mask_iou": "no method here carries labels, the capture has no true masks, or no run finished",
-}
-
-
-@dataclass(frozen=True)
-class Column:
-    """One number of a table: its key in `summary`, its title, how it is written, and which way is better."""
-
-    key: str
-    title: str
-    digits: int
-    better: Literal["high", "low", None]
-    scale: float = 1.0
-
-
-SPLIT_COLUMNS = (
-    Column("psnr", "PSNR", 2, "high"),
-    Column("ssim", "SSIM", 3, "high"),
-    Column("lpips", "LPIPS", 3, "low"),
-    Column("psnr_instrument", "PSNR instrument", 2, "high"),
-    Column("mask_iou", "label IoU", 3, "high"),
-)
-MASK_COLUMNS = (
-    Column("iou", "label IoU", 3, "high"),
-    Column("challenge_iou", "Challenge IoU", 3, "high"),
-    Column("challenge_iou_parts", "of parts", 3, "high"),
-    Column("dice", "Dice", 3, "high"),
-    Column("boundary_f", "boundary F", 3, "high"),
-    Column("box_ap", "box AP", 3, "high"),
-)
-RUN_COLUMNS = (
-    Column("iterations", "iterations", 0, None),
-    Column("seconds", "minutes", 2, None, 1 / 60),
-    Column("processor_seconds", "processor minutes", 2, None, 1 / 60),
-    Column("fps", "FPS", 1, "high"),
-    Column("num_gaussians", "Gaussians", 0, None),
-    Column("peak_memory_mb", "peak MiB", 0, "low"),
-)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One entry: mean ± std as text, and whether it is the best of its column."""
-
-    mean: str
-    std: str = ""
-    best: bool = False
-
-
-@dataclass(frozen=True)
-class Table:
-    """A titled table of methods; `failed` tells what stands in a method's row when no seed finished."""
-
-    title: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
-    failed: Mapping[str, str]
-
-
-def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
-    """One table per split, then the methods' own. Columns that nobody has a number for are left out."""
-    failed = _failed(comparison)
-    tables = []
-    for split in comparison["splits"]:
-        rows = [row for row in comparison["summary"] if row["split"] == split]
-        scored = any(row["iou"]["n"] for row in rows)  # the same number, for other people's masks too
-        ours = [column for column in SPLIT_COLUMNS if not (scored and column.key == "mask_iou")]
-        tables.append(_table(f"split {split}", (*ours, *MASK_COLUMNS), rows, failed))
-    trained = {entry["name"] for entry in comparison["methods"] if entry["source"] == "train"}
-    first = comparison["splits"][0]
-    rows = [row for row in comparison["summary"] if row["split"] == first and row["name"] in trained]
-    tables.append(_table("training and drawing", RUN_COLUMNS, rows, failed))
-    return tables
-
-
-def absent_notes(comparison: Mapping[str, Any]) -> list[str]:
-    """What the tables lack, and why."""
-    notes = list(comparison["notes"])
-    for column in SPLIT_COLUMNS:
-        values = [row[column.key]["n"] for row in comparison["summary"]]
-        if not any(values) and not any(note.startswith(column.key) for note in notes):
-            notes.append(f"{column.key}: nobody has it: {ABSENT.get(column.key, 'no run finished')}")
-    if not any(row["seconds"]["std"] is not None for row in comparison["summary"]):
-        notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
-    return notes
-
-
-def _failed(comparison: Mapping[str, Any]) -> dict[str, str]:
-    """Methods of which no seed finished, with the first reason."""
-    finished = {job["name"] for job in comparison["jobs"] if "error" not in job}
-    reasons: dict[str, str] = {}
-    for job in comparison["jobs"]:
-        if "error" in job and job["name"] not in finished:
-            reasons.setdefault(job["name"], job["error"])
-    return reasons
-
-
-def _table(title: str, columns: Sequence[Column], rows: Sequence[dict[str, Any]], failed: Mapping[str, str]) -> Table:
-    kept = tuple(column for column in columns if any(row[column.key]["n"] for row in rows))
-    best = {column.key: _best(column, rows) for column in kept}
-    made = tuple(
-        (row["name"], tuple(_cell(column, row[column.key], best[column.key]) for column in kept)) for row in rows
-    )
-    return Table(title, kept, made, failed)
-
-
-def _written(column: Column, value: float) -> str:
-    return f"{value * column.scale:,.{column.digits}f}"
-
-
-def _best(column: Column, rows: Sequence[Mapping[str, Any]]) -> str | None:
-    """The best mean as it is written, so that equal entries are all best; None when there is nothing to choose."""
-    means = [row[column.key]["mean"] for row in rows if row[column.key]["n"]]
-    if column.better is None or len(means) < 2:
-        return None
-    return _written(column, max(means) if column.better == "high" else min(means))
-
-
-def _cell(column: Column, value: Mapping[str, Any], best: str | None) -> Cell:
-    if not value["n"]:
-        return Cell(UNKNOWN)
-    mean = _written(column, value["mean"])
-    std = "" if value["std"] is None else _written(column, value["std"])
-    return Cell(mean, std, mean == best)
-
-
-def csv_text(comparison: Mapping[str, Any]) -> str:
-    """One line per method and split, unrounded; unknown numbers are empty."""
-    header = ["name", "split", "failed"]
-    header += [f"{metric}_{part}" for metric in METRICS for part in ("mean", "std", "n")]
-    lines = []
-    for row in comparison["summary"]:
-        line = {"name": row["name"], "split": row["split"], "failed": row["failed"]}
-        lines.append(line | {f"{m}_{part}": row[m][part] for m in METRICS for part in ("mean", "std", "n")})
-    return rows_as_csv(lines, header)
-
-
-def rows_as_csv(rows: Sequence[Mapping[str, Any]], header: Sequence[str]) -> str:
-    """CSV with a header line; None is empty."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
-
-
-def budget_words(comparison: Mapping[str, Any]) -> str:
-    """What every run was given, and how often."""
-    from neeco.experiments.jobs import Budget
-
-    seeds = len(comparison["seeds"])
-    return f"{Budget(**comparison['budget'])} each, {seeds} seed{'s' if seeds > 1 else ''}"
-
-
-def machine_words(comparison: Mapping[str, Any]) -> str:
-    """The machine that the numbers were taken on."""
-    machine = comparison["machine"]
-    threads = machine["threads_per_worker"] or machine["threads"]
-    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
-    drawing = f"{threads} drawing thread{'s' if threads > 1 else ''}"
-    return f"{machine['cpu']}, {machine['cores']} cores, {drawing}{workers}, torch {machine['torch']}"
-
-
-def markdown_text(comparison: Mapping[str, Any]) -> str:
-    """Markdown: a heading, one table per split, the methods' own, and what is absent."""
-    name = Path(comparison["capture"]).name
-    parts = [f"# Comparison on {_md(name)}", "", f"{budget_words(comparison)}. {_md(machine_words(comparison))}.", ""]
-    for table in tables_of(comparison):
-        parts += [f"## {_md(table.title)}", ""]
-        parts.append("| method | " + " | ".join(_md(_arrow(column)) for column in table.columns) + " |")
-        parts.append("|---|" + "---:|" * len(table.columns))
-        for method, cells in table.rows:
-            shown = [f"failed: {_md(table.failed.get(method, ''))}"] + [""] * (len(cells) - 1)
-            if method not in table.failed:
-                shown = [_md_cell(cell) for cell in cells]
-            parts.append(f"| {_md(method)} | " + " | ".join(shown) + " |")
-        parts.append("")
-    parts += ["Mean ± standard deviation over seeds; the best of a column is bold.", ""]
-    parts += [f"- {_md(note)}" for note in absent_notes(comparison)]
-    return "\n".join(parts).rstrip() + "\n"
-
-
-def _arrow(column: Column) -> str:
-    return column.title + {"high": " ↑", "low": " ↓", None: ""}[column.better]
-
-
-def _md(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
-
-
-def _md_cell(cell: Cell) -> str:
-    text = f"**{cell.mean}**" if cell.best else cell.mean
-    return f"{text} ± {cell.std}" if cell.std else text
-
-
 LATEX_SPECIAL = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -221,6 +19,105 @@ LATEX_SPECIAL = {
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
 }
+Better = Literal["high", "low", None]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number of a table: its key among the results, its title, how it is written, and which way is better."""
+
+    key: str
+    title: str
+    digits: int = 0
+    better: Better = None
+    scale: float = 1.0
+
+    def written(self, value: float) -> str:
+        return f"{value * self.scale:,.{self.digits}f}"
+
+    @property
+    def heading(self) -> str:
+        """The title with an arrow that says which way is better."""
+        return self.title + {"high": " ↑", "low": " ↓", None: ""}[self.better]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One entry as text, ± its standard deviation where known, and whether it is the best of its column."""
+
+    text: str
+    std: str = ""
+    best: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.text} ± {self.std}" if self.std else self.text
+
+
+@dataclass(frozen=True)
+class Row:
+    """What the row is of (as many keys as the table has), its cells, or why there are none."""
+
+    keys: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    failed: str | None = None
+    reference: bool = False  # what the others are measured against
+
+
+@dataclass(frozen=True)
+class Table:
+    """A titled table: `keys` heads the columns that say what a row is, the numbers' columns follow."""
+
+    title: str
+    keys: tuple[str, ...]
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+
+
+def csv_text(header: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
+    """CSV with a header line, unrounded; None and what a row lacks are empty, what the header lacks is left out."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def markdown_lines(table: Table) -> list[str]:
+    """The table in Markdown under its title; the best of a column is bold."""
+
+    def line(cells: Sequence[str]) -> str:
+        return f"| {' | '.join(cells)} |"
+
+    headings = [*table.keys, *(column.heading for column in table.columns)]
+    lines = [f"## {markdown_escape(table.title)}", "", line([markdown_escape(heading) for heading in headings])]
+    lines.append("|" + "---|" * len(table.keys) + "---:|" * len(table.columns))
+    for row in table.rows:
+        shown = [f"**{cell.text}**" + str(cell)[len(cell.text) :] if cell.best else str(cell) for cell in row.cells]
+        if row.failed is not None:
+            shown = [f"failed: {markdown_escape(row.failed)}"] + [""] * (len(row.cells) - 1)
+        lines.append(line([*map(markdown_escape, row.keys), *shown]))
+    return lines
+
+
+def markdown_escape(text: str) -> str:
+    """`text` so that Markdown shows it as it stands, in a table too."""
+    return text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
+
+
+def latex_lines(table: Table, caption: str) -> list[str]:
+    """The table in LaTeX for the package booktabs; the best of a column is bold."""
+    arrows = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
+    headings = [latex_escape(key.capitalize()) for key in table.keys]
+    headings += [latex_escape(column.title) + arrows[column.better] for column in table.columns]
+    lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_escape(caption)}}}"]
+    lines += [rf"\begin{{tabular}}{{{'l' * len(table.keys)}{'r' * len(table.columns)}}}", r"\toprule"]
+    lines += [" & ".join(headings) + r" \\", r"\midrule"]
+    for row in table.rows:
+        shown = [_latex_cell(cell) for cell in row.cells]
+        if row.failed is not None:
+            shown = [rf"\multicolumn{{{max(len(row.cells), 1)}}}{{l}}{{{latex_escape(f'failed: {row.failed}')}}}"]
+        lines.append(" & ".join([*map(latex_escape, row.keys), *shown]) + r" \\")
+    return [*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"]
 
 
 def latex_escape(text: str) -> str:
@@ -228,63 +125,8 @@ def latex_escape(text: str) -> str:
     return "".join(LATEX_SPECIAL.get(character, character) for character in text)
 
 
-def latex_text(comparison: Mapping[str, Any]) -> str:
-    """LaTeX tables for the package booktabs, one per split and one of the methods' own."""
-    parts = ["% \\usepackage{booktabs}", f"% {_one_line(machine_words(comparison))}"]
-    name = latex_escape(Path(comparison["capture"]).name)
-    for table in tables_of(comparison):
-        caption = f"{name}, {latex_escape(table.title)}. {latex_escape(budget_words(comparison))}."
-        parts += ["", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}"]
-        parts += [rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule"]
-        parts += [" & ".join(["Method", *(_latex_title(column) for column in table.columns)]) + r" \\", r"\midrule"]
-        for method, cells in table.rows:
-            reason = latex_escape(f"failed: {table.failed.get(method, '')}")
-            shown = [rf"\multicolumn{{{max(len(cells), 1)}}}{{l}}{{{reason}}}"]
-            if method not in table.failed:
-                shown = [_latex_cell(cell) for cell in cells]
-            parts.append(" & ".join([latex_escape(method), *shown]) + r" \\")
-        parts += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
-    parts += [""] + [f"% {_one_line(note)}" for note in absent_notes(comparison)]
-    return "\n".join(parts).rstrip() + "\n"
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def _latex_title(column: Column) -> str:
-    return latex_escape(column.title) + {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}[column.better]
-
-
 def _latex_cell(cell: Cell) -> str:
-    if cell.mean == UNKNOWN:
+    if cell.text == UNKNOWN:
         return "--"
-    text = rf"\textbf{{{cell.mean}}}" if cell.best else cell.mean
+    text = rf"\textbf{{{cell.text}}}" if cell.best else latex_escape(cell.text)
     return rf"{text} $\pm$ {cell.std}" if cell.std else text
-
-
-def write_tables(output: Path, comparison: Mapping[str, Any]) -> None:
-    """Write comparison.csv, .md and .tex, and data/*.csv behind them, into `output`."""
-    write_text(output / "comparison.csv", csv_text(comparison))
-    write_text(output / "comparison.md", markdown_text(comparison))
-    write_text(output / "comparison.tex", latex_text(comparison))
-    for name, text in data_files(comparison).items():
-        write_text(output / "data" / name, text)
-
-
-def data_files(comparison: Mapping[str, Any]) -> dict[str, str]:
-    """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
-    job_header = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
-    jobs = [
-        {**job, **numbers, "split": split}
-        for job in comparison["jobs"]
-        for split, numbers in (job["splits"] or {"": {}}).items()
-    ]
-    distance_header = ["name", "seed", "split", "frame", "distance", "psnr", "psnr_instrument", "mask_iou"]
-    speed_header = ["name", "seed", "method", "backend", "fps", "milliseconds", "draws", "num_gaussians"]
-    return {
-        "jobs.csv": rows_as_csv(jobs, job_header),
-        "curves.csv": rows_as_csv(comparison["curves"], ["name", "seed", "seconds", "iteration", "split", "psnr"]),
-        "distance.csv": rows_as_csv(comparison["distance"], distance_header),
-        "speed.csv": rows_as_csv(comparison["speed"]["rows"], speed_header),
-    }

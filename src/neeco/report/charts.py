@@ -1,22 +1,29 @@
-"""Charts of several series as inline SVG, told apart by colour, dashes and marks, and their numbers as a download."""
+"""Charts of several series, told apart by colour, dashes and marks; of one number per frame; and their keys."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
+from typing import Any
 
-from neeco.report.axes import Axes, short, widened
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.transforms import IdentityTransform
 
-WIDTH, HEIGHT = 460, 270  # view box units; the page scales it
-LEFT, TOP, BOTTOM = 46, 28, 42  # margins; the one at the right holds the names
+from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
+
+SIZE, SMALL = (460, 270), (420, 190)  # view box units; the page scales them
 LABEL_STEP = 13  # units between two names
 LABEL_CHARACTERS = 20  # of a name at the end of its line
-CHARACTER = 6.2  # units that one takes at most, on average
+CHARACTER = 6.9  # units that one takes at most, on average
 COLORS = 7
 DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
+MARKS = ("o", "s", "^", "x", "D", "+", "v")
+FEW_DECADES = (10.0, 300.0)  # highest over lowest where the ticks of a logarithmic axis are 1, 2 and 5
 
 Point = tuple[float, float]
 
@@ -32,64 +39,84 @@ class Series:
     dots: tuple[Point, ...] = ()  # faint marks
 
 
-def chart(title: str, x_title: str, series: Sequence[Series], *, lines: Sequence[tuple[float, str]] = ()) -> str:
-    """Lines and marks over a shared frame; "" when nothing has two points. `lines`: (x, words) of vertical lines."""
+@page_style()
+def line_chart(
+    title: str,
+    over: str,
+    series: Sequence[Series],
+    *,
+    starts: Sequence[tuple[float, str]] = (),
+    note: str = "",
+    logarithmic: bool = False,
+    size: tuple[int, int] = SIZE,
+) -> str:
+    """Lines and marks over a shared frame as inline SVG; "" when nothing has two points.
+
+    starts: (x, what begins there), drawn as dashed vertical lines. note: stands at the right, above the chart.
+    """
     points = [point for item in series for line in (item.main, *item.faint, item.dots) for point in line]
     if len({x for x, _ in points}) < 2:
         return ""
-    xs, ys = [x for x, _ in points], [y for _, y in points]
     right = 14 + round(CHARACTER * min(LABEL_CHARACTERS, max(len(item.name) for item in series)))
-    margins = (LEFT, right, TOP, BOTTOM)
-    axes = Axes(min(0.0, *xs), max(xs), *widened(min(ys), max(ys)), WIDTH, HEIGHT, margins)
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)} over {escape(x_title)}">']
-    parts.append(f'<text class="title" x="{LEFT}" y="17">{escape(title)}</text>')
-    parts += axes.grid(short)
-    middle = (LEFT + WIDTH - right) / 2
-    parts[-1] += f'<text x="{middle:.0f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_title)}</text>'
-    for x, words in lines:
-        place = f"M{axes.across(x):.1f} {TOP}V{HEIGHT - BOTTOM}"
-        text = f'<text class="phase-name" x="{axes.across(x) + 4:.1f}" y="{TOP + 10}">{escape(words)}</text>'
-        parts.append(f'<path class="phase" d="{place}"/>{text}')
+    axes = new_axes(size, 46, right, 28, 42)
+    axes.set_title(title)
+    axes.set_title(note, loc="right", fontsize=11)
+    axes.set_xlabel(over)
+    axes.set_yscale("log" if logarithmic else "linear")
+    axes.margins(y=0.05)
     for item in series:
-        parts += [mark(item.order, axes.across(x), axes.down(y)) for x, y in item.dots]
-        parts += [_line(item.order, axes, line, "faint") for line in item.faint]
+        axes.plot(*_columns(item.dots), alpha=0.45, **_mark(item.order))
+        for line in item.faint:
+            _draw_line(axes, item.order, line, {"linewidth": 0.7, "alpha": 0.55})
     for item in series:  # above all that is faint
-        parts.append(_line(item.order, axes, item.main, "main"))
-    return "".join([*parts, *_names(series, axes), "</svg>"])
+        _draw_line(axes, item.order, item.main, {"linewidth": 2, **_dashes(item.order)})
+    xs = [x for x, _ in points]
+    axes.set_xlim(min(0.0, *xs), max(xs))
+    round_ticks(axes.xaxis, 5, short)
+    round_ticks(axes.yaxis, 4, short)
+    if logarithmic:
+        low, high = axes.get_ylim()
+        axes.yaxis.set_minor_locator(NullLocator())
+        if high / low > FEW_DECADES[0]:
+            subdivided = high / low < FEW_DECADES[1]
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if subdivided else (1.0,)))
+    falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
+    for x, words in starts:
+        _draw_start(axes, x, words, falling)
+    _draw_names(axes, [item for item in series if item.main and item.name])
+    return inline_svg(axes, f"{title} over {over}")
 
 
-def legend(names: Sequence[str], shown: Sequence[str]) -> str:
-    """What line and mark each method has that is shown; `names`: all methods, whose order gives them these."""
-    items = []
+@page_style()
+def residual_chart(times: np.ndarray, values: np.ndarray, title: str, level: float) -> str:
+    """Dots of values [N] >= 0 at times [N] s, and a line at `level`, as inline SVG; "" for fewer than two."""
+    if len(values) < 2:
+        return ""
+    axes = new_axes(SMALL, 46, 12, 28, 26)
+    axes.set_title(title)
+    axes.set_title(f"rms {level:.3g}, largest {values.max():.3g}", loc="right", fontsize=11, color=STAND_INS["soft"])
+    draw_dots(axes, np.stack([times, values], axis=1), gid="dots", color=STAND_INS["accent"], linewidth=3.2, alpha=0.65)
+    axes.axhline(level, color=STAND_INS["phase"], linewidth=1, dashes=(5, 3))
+    axes.set_xlim(float(times.min()), max(float(times.max()), float(times.min()) + 1e-9))
+    axes.set_ylim(0, max(float(values.max()), level, 1e-9) * 1.05)
+    round_ticks(axes.xaxis, 5, short)
+    round_ticks(axes.yaxis, 4, short)
+    return inline_svg(axes, f"{title} over video time")
+
+
+@page_style()
+def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup]]:
+    """(name, its line and mark as inline SVG) of every method shown; `names`: all, whose order gives them these."""
+    entries = []
     for order, name in enumerate(names):
-        if name not in shown:
-            continue
-        sample = (
-            f'<svg viewBox="0 0 46 14"><path class="main" stroke="{color(order)}" '
-            f'stroke-dasharray="{_dashes(order)}" d="M1 7H45"/>{mark(order, 23, 7)}</svg>'
-        )
-        items.append(f"<span>{sample}{escape(name)}</span>")
-    return f"<p class='legend'>{''.join(items)}</p>"
-
-
-def color(order: int) -> str:
-    """A method's colour, as the style sheet has it."""
-    return f"var(--m{order % COLORS})"
-
-
-def mark(order: int, x: float, y: float, size: float = 3.2) -> str:
-    """A method's mark about a place in view box units."""
-    a = size
-    shapes = (
-        f"M{x - a:.1f} {y:.1f}a{a} {a} 0 1 0 {2 * a} 0a{a} {a} 0 1 0 {-2 * a} 0",
-        f"M{x - a:.1f} {y - a:.1f}h{2 * a}v{2 * a}h{-2 * a}z",
-        f"M{x:.1f} {y - a:.1f}l{a} {2 * a}h{-2 * a}z",
-        f"M{x - a:.1f} {y - a:.1f}l{2 * a} {2 * a}m0 {-2 * a}l{-2 * a} {2 * a}",
-        f"M{x:.1f} {y - a * 1.3:.1f}l{a} {a * 1.3:.1f}l{-a} {a * 1.3:.1f}l{-a} {-a * 1.3:.1f}z",
-        f"M{x - a:.1f} {y:.1f}h{2 * a}M{x:.1f} {y - a:.1f}v{2 * a}",
-        f"M{x - a:.1f} {y - a:.1f}h{2 * a}l{-a} {2 * a}z",
-    )
-    return f'<path class="dot" stroke="{color(order)}" d="{shapes[order % len(shapes)]}"/>'
+        if name in shown:
+            axes = new_axes((46, 14), 0, 0, 0, 0)
+            axes.set_axis_off()
+            axes.plot([1, 45], [7, 7], linewidth=2, **_dashes(order))
+            axes.plot(23, 7, **_mark(order))
+            axes.set(xlim=(0, 46), ylim=(0, 14))
+            entries.append((name, inline_svg(axes, f"line of {name}")))
+    return entries
 
 
 def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]:
@@ -103,35 +130,78 @@ def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]
     return tuple(means)
 
 
-def _dashes(order: int) -> str:
-    return DASHES[order % len(DASHES)] or "none"
+def draw_dots(axes: Axes, places: np.ndarray, **style: Any) -> None:
+    """Round dots at places [N, 2], `linewidth` across, as one path."""
+    line = np.concatenate([places, places, np.full_like(places, np.nan)], axis=1).reshape(-1, 2)
+    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", clip_on=False, **style)
 
 
-def _line(order: int, axes: Axes, points: Sequence[Point], kind: str) -> str:
+def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:
+    """About `count` round numbers along an axis, written by `label`."""
+    axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10], min_n_ticks=3))
+    axis.set_major_formatter(lambda value, _: label(round(value, 12)))
+
+
+def short(value: float) -> str:
+    """A number for a tick."""
+    if abs(value) >= 10_000:
+        return f"{value / 1000:.3g}k"
+    return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]
+
+
+def _color(order: int) -> str:
+    """A method's colour, as the style sheet has it."""
+    return STAND_INS[f"m{order % COLORS}"]
+
+
+def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
+    """A method's mark, hollow."""
+    shape = {"marker": MARKS[order % len(MARKS)], "markersize": size, "markeredgewidth": 1, "fillstyle": "none"}
+    return {**shape, "linestyle": "", "color": _color(order), "clip_on": False}
+
+
+def _dashes(order: int) -> dict[str, Any]:
+    dashes = [float(length) for length in DASHES[order % len(DASHES)].split()]
+    return {"color": _color(order), "clip_on": False, **({"dashes": dashes} if dashes else {})}
+
+
+def _draw_line(axes: Axes, order: int, points: Sequence[Point], style: dict[str, Any]) -> None:
     if len(points) < 2:
-        return "".join(mark(order, axes.across(x), axes.down(y), 4.0) for x, y in points)
-    dashes = f' stroke-dasharray="{_dashes(order)}"' if kind == "main" else ""
-    return f'<path class="{kind}" stroke="{color(order)}"{dashes} d="{axes.path(list(points))}"/>'
+        style = _mark(order, 8.0)
+    axes.plot(*_columns(points), **{"color": _color(order), "clip_on": False, **style})
 
 
-def _names(series: Sequence[Series], axes: Axes) -> list[str]:
+def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
+    """A dashed line where something begins; its name stands where lines leave room for it."""
+    low, high = axes.get_xlim()
+    x = min(max(x, low), high)
+    beyond = x - low > 0.75 * (high - low)
+    axes.axvline(x, color=STAND_INS["phase"], linewidth=1, dashes=(4, 3), gid="phase", clip_on=False)
+    axes.annotate(
+        words,
+        (x, 1 if falling else 0),
+        (-4 if beyond else 4, -12 if falling else 5),
+        xycoords=axes.get_xaxis_transform(),
+        textcoords="offset points",
+        ha="right" if beyond else "left",
+        color=STAND_INS["phase"],
+    )
+
+
+def _draw_names(axes: Axes, series: Sequence[Series]) -> None:
     """Each method's name at the end of its line, moved apart where they would cover one another."""
-    drawn = [item for item in series if item.main]
-    ends = sorted(((axes.down(item.main[-1][1]), item) for item in drawn), key=lambda end: (end[0], end[1].order))
-    places: list[float] = []
-    for y, _ in ends:
-        places.append(max(y + 4, places[-1] + LABEL_STEP) if places else y + 4)
-    beyond = max(0.0, places[-1] - (HEIGHT - BOTTOM)) if places else 0.0
-    texts = []
-    for (_, item), y in zip(ends, places, strict=True):
+    axes.get_ylim()  # the scale is settled only when it is asked for
+    ends = sorted((-axes.transData.transform(item.main[-1])[1], item.order, item) for item in series)
+    places: list[float] = []  # downwards
+    for y, _, _ in ends:
+        places.append(max(y, places[-1] + LABEL_STEP) if places else y)
+    box = axes.bbox
+    beyond = max(0.0, places[-1] + box.y0) if places else 0.0
+    for (_, order, item), y in zip(ends, places, strict=True):
         name = item.name if len(item.name) <= LABEL_CHARACTERS else item.name[: LABEL_CHARACTERS - 1] + "…"
-        place = f'x="{WIDTH - axes.margins[1] + 8}" y="{y - beyond:.1f}"'
-        texts.append(f'<text class="name" {place} style="fill:{color(item.order)}">{escape(name)}</text>')
-    return texts
-
-
-def download(text: str, name: str, words: str | None = None) -> str:
-    """A link that saves `text` as file `name`, without any server: the text is inside the link."""
-    data = base64.b64encode(text.encode("utf-8")).decode("ascii")
-    title = escape(name if words is None else words)
-    return f"<a class='download' download='{escape(name)}' href='data:text/csv;base64,{data}'>{title}</a>"
+        place: dict[str, Any] = {"transform": IdentityTransform(), "va": "center_baseline"}
+        axes.text(box.x1 + 8, beyond - y, name, color=_color(order), gid="name", **place)

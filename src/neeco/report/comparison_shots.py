@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import FULL_SCALE, difference_map, overlay_outline
+from neeco.evaluation.difference import difference_map, overlay_outline
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.evaluation.scoring import draw
@@ -72,25 +71,6 @@ def median_frame(comparison: Mapping[str, Any], capture: Capture, split: str) ->
     return among[len(among) // 2] if among else None
 
 
-def shots_html(rows: Sequence[FrameRow]) -> str:
-    """The section, without its download; "" when there is nothing to show."""
-    drawn = [row for row in rows if row.shots]
-    if not drawn:
-        return ""
-    parts = [
-        "<h2>The same frame by every method</h2><p>The median frame of each split by PSNR over all methods, drawn at "
-        "the poses the capture states. Under each drawing its difference from the photograph: black is equal, bright "
-        f"is wrong, full scale {FULL_SCALE:g} of the range from black to white. In yellow, where known, the true "
-        "outline of the instrument.</p>"
-    ]
-    for row in drawn:
-        cells = [_cell("photograph", "", [row.photograph, row.outlined], row)]
-        cells += [_cell(shot.name, f"{shot.psnr:.2f} dB", [shot.drawn, shot.difference], row) for shot in row.shots]
-        parts.append(f"<h3>{escape(row.split)} <span class='soft'>frame {escape(row.frame)}</span></h3>")
-        parts.append(f"<div class='shots'>{''.join(cells)}</div>")
-    return "".join(parts)
-
-
 def _first_seeds(jobs: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
     found: dict[str, int] = {}
     for job in jobs:
@@ -117,11 +97,3 @@ def _row(capture: Capture, frame: Frame, shots: Sequence[Shot]) -> FrameRow:
     photograph, reference = to_bytes(frame.load_image().numpy()), load_reference(capture, frame)
     outlined = None if reference is None else jpeg(overlay_outline(photograph, reference.mask.numpy()))
     return FrameRow(frame.split, frame.name, jpeg(photograph), outlined, tuple(shots))
-
-
-def _cell(name: str, note: str, images: Sequence[str | None], row: FrameRow) -> str:
-    what = "drawing and difference" if note else "the photograph"
-    pictures = "".join(
-        f"<img src='{uri}' alt='{escape(name)}: {what}, frame {escape(row.frame)}'>" for uri in images if uri
-    )
-    return f"<figure>{pictures}<figcaption><b>{escape(name)}</b> {note}</figcaption></figure>"

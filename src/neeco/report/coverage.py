@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from itertools import pairwise
 
 import numpy as np
+from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
-from neeco.report.axes import nice_ticks
+from neeco.report.charts import round_ticks
+from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
 
-WIDTH, HEIGHT = 340, 150  # view box units
-LEFT, RIGHT, TOP, BOTTOM = 12, 12, 26, 22
 BINS = 24
 SLACK = 0.02  # of the trained range: a state outside by less is not called outside
 CONSTANT = 1e-6  # mm or deg
-SPLIT_CLASSES = {"train": "s-train", "test": "s-test", "unseen": "s-unseen"}
+SPLIT_COLORS = {"train": "accent", "test": "good", "unseen": "phase"}
 
 
 @dataclass(frozen=True)
@@ -129,55 +127,42 @@ def unvisited(degrees: Sequence[Degree]) -> list[str]:
     return sentences
 
 
+@page_style()
 def histogram(degree: Degree) -> str:
-    """Stacked bars of a degree of freedom, coloured by split; ground outside the trained range is shaded."""
+    """Stacked bars of a degree of freedom, coloured by split, as inline SVG; ground outside the trained range is
+    shaded."""
     low, high = float(degree.values.min()), float(degree.values.max())
-    title = escape(f"{degree.name}, {degree.unit}")
     trained = degree.trained
     said = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="frames over {title}; {said}">']
-    parts.append(f'<text class="title" x="{LEFT}" y="15">{title}</text>')
+    axes = new_axes((340, 150), 12, 12, 28, 22)
+    axes.set_title(f"{degree.name}, {degree.unit}")
+    axes.set_yticks([])
     if high - low < CONSTANT:
-        parts.append(f'<text x="{LEFT}" y="{HEIGHT / 2}">always {_number(low)}</text></svg>')
-        return "".join(parts)
-    parts.append(f'<text x="{WIDTH - RIGHT}" y="15" text-anchor="end">{said}</text>')
-    margin = 0.02 * (high - low)
-    left, right = low - margin, high + margin
-    base = HEIGHT - BOTTOM
-
-    def across(value: float) -> float:
-        return LEFT + (value - left) / (right - left) * (WIDTH - LEFT - RIGHT)
-
+        axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
+        axes.set_xticks([])
+        return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
+    axes.set_title(said, loc="right", fontsize=11, color=STAND_INS["soft"])
+    axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
+    left, right = axes.get_xlim()
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
-        if across(end) - across(start) > 4:
-            parts.append(
-                f'<rect class="beyond" x="{across(start):.1f}" y="{TOP}" width="{across(end) - across(start):.1f}" '
-                f'height="{base - TOP}"/>'
-            )
-    parts += _bars(degree, np.linspace(low, high, BINS + 1), across, base)
-    parts.append(f'<path class="grid" d="M{LEFT} {base}H{WIDTH - RIGHT}"/>')
-    for tick in nice_ticks(low, high, 4):
-        anchor = "start" if across(tick) < 20 else "end" if across(tick) > WIDTH - 20 else "middle"
-        parts.append(f'<text x="{across(tick):.1f}" y="{HEIGHT - 6}" text-anchor="{anchor}">{_number(tick)}</text>')
-    return "".join([*parts, "</svg>"])
+        if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
+            axes.axvspan(start, end, color=STAND_INS["phase"], alpha=0.13, linewidth=0, gid="beyond")
+    _draw_bars(axes, degree, np.linspace(low, high, BINS + 1))
+    axes.axhline(0, color=STAND_INS["edge"], linewidth=1, clip_on=False)
+    round_ticks(axes.xaxis, 4, _number)
+    return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
 
 
-def _bars(degree: Degree, edges: np.ndarray, across: Callable[[float], float], base: float) -> list[str]:
-    names = sorted(set(degree.splits), key=lambda name: [*SPLIT_CLASSES, name].index(name))
-    counts = np.stack([np.histogram(degree.of(name), edges)[0] for name in names])
-    tallest = max(1, int(counts.sum(axis=0).max()))
-    unit = (base - TOP) / tallest
-    bars = []
-    for column, (start, end) in enumerate(pairwise(edges)):
-        floor = base
-        for name, count in zip(names, counts[:, column], strict=True):
-            if count:
-                floor -= count * unit
-                bars.append(
-                    f'<rect class="{SPLIT_CLASSES.get(name, "s-other")}" x="{across(start) + 0.5:.1f}" y="{floor:.1f}" '
-                    f'width="{across(end) - across(start) - 1:.1f}" height="{count * unit:.1f}"/>'
-                )
-    return bars
+def _draw_bars(axes: Axes, degree: Degree, edges: np.ndarray) -> None:
+    names = sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name))
+    floor = np.zeros(BINS)
+    for name in names:
+        count = np.histogram(degree.of(name), edges)[0]
+        kept, color = count > 0, STAND_INS[SPLIT_COLORS.get(name, "soft")]
+        middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
+        axes.bar(middles[kept], count[kept], 0.92 * width, floor[kept], color=color, clip_on=False)
+        floor += count
+    axes.set_ylim(0, max(1.0, floor.max()))
 
 
 def _number(value: float) -> str:

@@ -27,17 +27,13 @@ FRAMES_PER_SPLIT = 3
 
 @dataclass(frozen=True)
 class FrameFigure:
-    """One frame's row of pictures, as data URIs, and what the caption says of it."""
+    """One frame's row of pictures and what the caption says of it."""
 
     split: str
     name: str
     why: str  # best, median, worst
-    poses: str  # given or aligned
-    numbers: dict[str, Any]
-    photograph: str
-    drawn: str
-    difference: str
-    mask: str | None
+    scores: tuple[str, ...]
+    pictures: tuple[tuple[str, str], ...]  # (what it is, data URI)
 
 
 def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[FrameFigure]:
@@ -47,7 +43,7 @@ def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable,
         frames = {frame.name: frame for frame in capture.split(split)}
         for why, row in chosen_rows(rows):
             if row["frame"] in frames:
-                figures.append(_figure(capture, scene, split, frames[row["frame"]], why, kind, row))
+                figures.append(_figure(capture, scene, split, frames[row["frame"]], why, row))
     return figures
 
 
@@ -62,32 +58,33 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
     return [(why, ranked[place]) for place, why in sorted(chosen.items())]
 
 
-def _figure(
-    capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, kind: str, row: dict[str, Any]
-) -> FrameFigure:
+def _figure(capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]) -> FrameFigure:
     state, camera = _poses(frame, row)
     drawing = draw(scene, state, camera)
     photograph, image = frame.load_image().numpy(), drawing.image.numpy()
     reference = load_reference(capture, frame)
-    mask = None
+    ignored = frame.load_mask()
+    compared = image if ignored is None else np.where(ignored.numpy()[..., None], image, photograph)
+    pictures = [
+        ("photograph", jpeg(to_bytes(photograph))),
+        ("drawn", jpeg(to_bytes(image))),
+        ("difference", png(difference_map(compared, photograph))),
+    ]
     if drawing.parts is not None:
         overlay = overlay_parts(photograph, drawing.parts.numpy())
         if reference is not None:
             overlay = overlay_outline(overlay, reference.mask.numpy())
-        mask = jpeg(overlay)
-    ignored = frame.load_mask()
-    compared = image if ignored is None else np.where(ignored.numpy()[..., None], image, photograph)
-    return FrameFigure(
-        split=split,
-        name=frame.name,
-        why=why,
-        poses=kind,
-        numbers=row,
-        photograph=jpeg(to_bytes(photograph)),
-        drawn=jpeg(to_bytes(image)),
-        difference=png(difference_map(compared, photograph)),
-        mask=mask,
-    )
+        pictures.append(("label mask over photograph", jpeg(overlay)))
+    return FrameFigure(split, frame.name, why, tuple(_scores(row)), tuple(pictures))
+
+
+def _scores(row: dict[str, Any]) -> list[str]:
+    """What evaluation found of a frame, in words."""
+    scores = [f"{row['psnr']:.2f} dB"]
+    if row.get("mask_iou") is not None:
+        scores.append(f"IoU {row['mask_iou']:.3f}")
+    moves = row.get("moved", {}).items()
+    return [*scores, *(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°" for body, moved in moves)]
 
 
 def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:

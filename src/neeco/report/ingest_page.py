@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from datetime import datetime
-from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-import neeco
 from neeco.capture import read_capture
 from neeco.capture.model import Capture
-from neeco.files import write_text
 from neeco.ingest.result import IngestResult
-from neeco.report.coverage import Degree, degrees_of_freedom, extrapolations, histogram, unvisited
-from neeco.report.ingest_figures import MainAxis, axis_length, in_view, main_axes, sample_figures
-from neeco.report.ingest_style import INGEST_STYLE
-from neeco.report.residuals import scatter
-from neeco.report.style import STYLE, html_page
-from neeco.report.tracks import read_tracks, turning_view, view
+from neeco.report.charts import residual_chart
+from neeco.report.coverage import (
+    SPLIT_COLORS,
+    Degree,
+    degrees_of_freedom,
+    extrapolations,
+    histogram,
+    unvisited,
+)
+from neeco.report.ingest_figures import (
+    AXIS_COLORS,
+    MAIN_AXIS_COLOR,
+    OUTLINE_COLOR,
+    MainAxis,
+    axis_length,
+    in_view,
+    main_axes,
+    sample_figures,
+)
+from neeco.report.render import write_page
+from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -34,38 +46,30 @@ def write_ingest_page(result: IngestResult, path: Path) -> None:
     """
     capture = read_capture(result.capture)
     axes = main_axes(capture, result.shapes)
-    degrees = degrees_of_freedom(capture, {name: axis.direction for name, axis in axes.items()})
-    sections = [
-        _header(result, capture),
-        _tiles(result, capture),
-        _residuals(result),
-        _clocks(result, capture),
-        _frames(result, capture, axes),
-        _tracks(result, capture),
-        _coverage(result, capture, degrees, axes),
-        _dropped(result),
-        _notes(result),
-        _made(result, capture),
-    ]
-    write_text(path, html_page(f"{capture.root.name}: ingest", STYLE + INGEST_STYLE, sections))
-
-
-def _header(result: IngestResult, capture: Capture) -> str:
-    verdict = give_verdict(result, capture)
-    doubts = "".join(f"<li>{escape(doubt)}</li>" for doubt in verdict.doubts)
-    splits = ", ".join(f"{len(capture.split(name))} {escape(name)}" for name in capture.splits)
-    return (
-        f"<header><h1>{escape(capture.root.name)} <span class='soft'>from {escape(result.recording)}</span></h1>"
-        f"<p class='verdict {verdict.level}'><b>{escape(verdict.headline)}</b></p>"
-        + (f"<ul class='note'>{doubts}</ul>" if doubts else "")
-        + f"<p>{len(result.kept)} of {result.video_frames} video frames became the capture ({splits}). Every number "
-        "below compares parts of the recording with each other; none of them knows the truth.</p>"
-        f"<p class='soft'>{datetime.now().astimezone():%Y-%m-%d %H:%M %Z} · neeco {escape(neeco.__version__)} · "
-        f"{escape(str(result.capture))}</p></header>"
+    write_page(
+        path,
+        "ingest.html",
+        title=f"{capture.root.name}: ingest",
+        name=capture.root.name,
+        subtitle=f"from {result.recording}",
+        stamps=[result.capture],
+        result=result,
+        capture=capture,
+        verdict=give_verdict(result, capture),
+        splits=", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits),
+        tiles=_tiles(result, capture),
+        residuals=_residuals(result),
+        clocks=_clocks(result, capture),
+        **_frames(result, capture, axes),
+        **_tracks(capture),
+        **_coverage(capture, axes),
+        dropped=_dropped(result),
+        facts=_facts(result, capture),
     )
 
 
-def _tiles(result: IngestResult, capture: Capture) -> str:
+def _tiles(result: IngestResult, capture: Capture) -> list[tuple[str, str]]:
+    """(number, what it is) of the few that matter most."""
     tiles = [(f"{len(result.kept)}", f"frames kept of {result.video_frames}")]
     registration = result.registration
     if registration is not None:
@@ -80,167 +84,92 @@ def _tiles(result: IngestResult, capture: Capture) -> str:
         tiles.append(
             (f"{inside / max(count, 1):.0%}", f"of frames have the tracked origin of {instrument.name} in view")
         )
-    cells = "".join(f"<div class='tile'><b>{value}</b><span>{escape(name)}</span></div>" for value, name in tiles)
-    return f"<div class='tiles'>{cells}</div>"
+    return tiles
 
 
-def _residuals(result: IngestResult) -> str:
-    if result.registration is None:
-        if result.reprojection_px is None:
-            return ""
-        return (
-            "<h2>Registration</h2><p>There is none: no laparoscope was tracked, or the two could not be tied together "
-            "(see the notes). Cameras have the reconstruction's own frame and unit; the tracker has another.</p>"
-        )
+def _residuals(result: IngestResult) -> list[str]:
+    """Charts of how far each camera is from where the laparoscope's tracker puts it."""
     registration = result.registration
+    if registration is None:
+        return []
     rows = result.registered_frames.astype(int)
     shown = rows >= 0  # frames that helped to register but were left out of the capture afterwards have no row
     times = result.kept_times[rows[shown]] - result.kept_times.min()
     positions, turns = registration.position_residual, np.degrees(registration.rotation_residual)
-    charts = scatter(times, positions[shown], "position residual, mm", rms(positions))
-    charts += scatter(times, turns[shown], "rotation residual, deg", rms(turns))
-    return (
-        "<h2>Registration</h2><p>Where the laparoscope's tracker puts each camera, against where the images put it, "
-        "after one similarity, hand-eye transform and clock offset for the whole recording. Even scatter is the "
-        "tracker's noise; a slow wave is its drift or a bent scale; single spikes are frames to distrust.</p>"
-        f"<div class='curves'>{charts}</div><p class='soft'>Over seconds since the first frame; the line is the root "
-        "mean square.</p>"
-    )
+    return [
+        residual_chart(times, positions[shown], "position residual, mm", rms(positions)),
+        residual_chart(times, turns[shown], "rotation residual, deg", rms(turns)),
+    ]
 
 
-def _clocks(result: IngestResult, capture: Capture) -> str:
-    if not result.clocks:
-        return ""
+def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     rows = []
     for name, clock in result.clocks.items():
         sure = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
         moved = clock_cost_mm(name, clock.sd, result, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
-        rows.append(
-            f"<tr><td>{escape(name)}</td><td>{offset}</td><td>{sure}</td><td>{cost}</td><td>{escape(clock.source)}</td></tr>"
-        )
-    return (
-        "<h2>Clocks</h2><p>How far each log's clock is ahead of the video's. What the doubt costs is how far the "
-        "instrument travels in that time when it is fast (90th percentile of its speed); a dash: nobody knows.</p>"
-        "<div class='scroll'><table><thead><tr><th>clock</th><th>ahead, ms</th><th>sd, ms</th><th>costs, mm</th>"
-        f"<th>from</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
-    )
+        rows.append([name, offset, sure, cost, clock.source])
+    return rows
 
 
-def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -> str:
+def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -> dict[str, Any]:
+    """Sample frames as (picture, which frame, its second, its split), and the key to what is drawn over them."""
     length = axis_length(capture)
-    figures = sample_figures(capture, result.shapes, axes, length)
     numbers = dict(zip(np.round(result.kept_times, 6).tolist(), result.kept.tolist(), strict=True))
-    cells, start = [], min(frame.state.time for frame in capture.frames)
-    for figure in figures:
+    start = min(frame.state.time for frame in capture.frames)
+    samples = []
+    for figure in sample_figures(capture, result.shapes, axes, length):
         number = numbers.get(round(figure.frame.state.time, 6))
         place = figure.frame.name if number is None else f"video frame {number}"
-        cells.append(
-            f"<figure><img src='{figure.picture}' alt='{escape(place)}'><figcaption>{escape(place)}, "
-            f"{figure.frame.state.time - start:.2f} s <span class='tag'>{escape(figure.frame.split)}</span>"
-            "</figcaption></figure>"
-        )
-    return f"<h2>Frames</h2>{_frames_key(result, capture, axes, length)}<div class='samples'>{''.join(cells)}</div>"
+        samples.append((figure.picture, place, f"{figure.frame.state.time - start:.2f}", figure.frame.split))
+    return {
+        "samples": samples,
+        "axis_mm": f"{length:g}",
+        "axis_colors": list(zip("xyz", AXIS_COLORS, strict=True)),
+        "shaped": any(name in result.shapes for name in axes),
+        "shape_colors": (OUTLINE_COLOR, MAIN_AXIS_COLOR),
+    }
 
 
-def _frames_key(result: IngestResult, capture: Capture, axes: dict[str, MainAxis], length: float) -> str:
-    if not capture.instruments:
-        return "<p>No instrument was tracked, so nothing is drawn over the frames.</p>"
-    if not capture.registered:
-        return "<p>The instrument's poses are not in the cameras' frame, so nothing can be drawn over the frames.</p>"
-    drawn = [
-        f"Each tracked frame has its axes drawn, {length:g} mm long: "
-        "<span class='key'><i class='x'></i>x<i class='y'></i>y<i class='z'></i>z</span>. They should ride on the "
-        "instrument in every picture, always at the same place of it."
-    ]
-    if any(name in result.shapes for name in axes):
-        drawn.append(
-            "<span class='key'><i class='shape'></i>outline</span> of the rough shape that the images' motion gave, "
-            "and its <span class='key'><i class='main'></i>long axis</span> with the tip circled (of its two ends, the "
-            "one more often in view)."
-        )
-    else:
-        drawn.append("The instrument's rough shape was not found in the images.")
-    return f"<p>{' '.join(drawn)}</p>"
-
-
-def _tracks(result: IngestResult, capture: Capture) -> str:
+def _tracks(capture: Capture) -> dict[str, Any]:
+    """Two fixed views of the tracks, what the one that turns needs, and whose line has which colour."""
     tracks = read_tracks(capture)
     right, down, forward = np.eye(3)
-    names = ["<i class='camera'></i>camera, and where it looks"]
-    names += [f"<i class='line{index % 3}'></i>{escape(name)}" for index, name in enumerate(tracks.instruments)]
-    notes = "" if tracks.measured else " The points are random stand-ins: none were measured."
-    if result.registration is None and result.reprojection_px is not None:
-        notes += " No tracker gives the scale, so lengths here are proportions only."
-    if capture.instruments and not capture.registered:
-        notes += " The instrument is left out: its poses are in another frame."
-    return (
-        "<h2>Tracks</h2><p>The tissue's points with the tracks, as the cameras stand on average."
-        f"{notes}</p><p class='soft key'>{''.join(names)}</p><div class='curves'>"
-        + view(tracks, "from above (away from the camera is up)", right, -forward)
-        + view(tracks, "from the side (away from the camera is right)", forward, down)
-        + f"{turning_view(tracks)}</div>"
-    )
+    return {
+        "views": [
+            view(tracks, "from above (away from the camera is up)", right, -forward),
+            view(tracks, "from the side (away from the camera is right)", forward, down),
+        ],
+        "turning": turning_data(tracks),
+        "lines": [(LINE_COLORS[index % len(LINE_COLORS)], name) for index, name in enumerate(tracks.instruments)],
+        "measured": tracks.measured,
+    }
 
 
-def _coverage(result: IngestResult, capture: Capture, degrees: list[Degree], axes: dict[str, MainAxis]) -> str:
-    if not degrees:
-        return (
-            "<h2>States</h2><p>There are no instrument states: only methods that need none, such as 3dgs, can be "
-            "trained, and nothing can be drawn in a new state.</p>"
-        )
-    parts = ["<h2>States</h2>", _extrapolating(degrees), _splits_key(capture, result.split_rule)]
-    for instrument in capture.instruments:
-        charts = "".join(histogram(degree) for degree in degrees if degree.instrument == instrument.name)
-        if not charts:
-            continue
-        about = "its long axis" if instrument.name in axes else "the z axis of its tracked frame"
-        where = "in the cameras' world" if capture.registered else "in the tracker's frame"
-        parts.append(
-            f"<h3>{escape(instrument.name)}</h3><p class='soft'>Position {where}; pitch, yaw and roll away from the "
-            f"mean direction of the training frames, roll about {about}."
-            f"{'' if instrument.joints else ' No joint was read.'}</p><div class='histograms'>{charts}</div>"
-        )
-    return "".join(parts)
+def _coverage(capture: Capture, axes: dict[str, MainAxis]) -> dict[str, Any]:
+    """Which states there are: sentences on where training ends, and the charts of every instrument."""
+    degrees = degrees_of_freedom(capture, {name: axis.direction for name, axis in axes.items()})
+    named = [name for name in capture.splits if name in SPLIT_COLORS]
+    others = ", ".join(name for name in capture.splits if name not in named)
+    return {
+        "degrees": degrees,
+        "trained": any(degree.trained is not None for degree in degrees),
+        "extrapolations": extrapolations(degrees),
+        "unvisited": unvisited(degrees),
+        "split_colors": [*((SPLIT_COLORS[name], name) for name in named), *([("soft", others)] if others else [])],
+        "instruments": [_instrument(item.name, bool(item.joints), degrees, axes) for item in capture.instruments],
+    }
 
 
-def _extrapolating(degrees: list[Degree]) -> str:
-    if all(degree.trained is None for degree in degrees):
-        return "<p class='verdict bad'>There is no training frame: the model would be extrapolating everywhere.</p>"
-    said = extrapolations(degrees)
-    holes = unvisited(degrees)
-    sentence = (
-        "The model will be extrapolating wherever a state to draw leaves the range of its training frames (ground that "
-        "is shaded below). "
-    )
-    if said:
-        sentence += "Frames of this capture's own test splits do:"
-    else:
-        sentence += "No frame of this capture's other splits does, so nothing here will tell how well it extrapolates."
-    listing = "".join(f"<li>{escape(item)}</li>" for item in said)
-    text = f"<p>{sentence}</p>" + (f"<ul class='note'>{listing}</ul>" if said else "")
-    if holes:
-        listing = "".join(f"<li>{escape(item)}</li>" for item in holes)
-        text += (
-            "<p>Inside the range it will have to bridge these stretches without a training frame:</p>"
-            f"<ul class='note'>{listing}</ul>"
-        )
-    return text
+def _instrument(name: str, jointed: bool, degrees: list[Degree], axes: dict[str, MainAxis]) -> dict[str, Any]:
+    charts = [histogram(degree) for degree in degrees if degree.instrument == name]
+    about = "its long axis" if name in axes else "the z axis of its tracked frame"
+    return {"name": name, "jointed": jointed, "about": about, "charts": charts}
 
 
-def _splits_key(capture: Capture, rule: str) -> str:
-    shown = [name for name in capture.splits if name in ("train", "test", "unseen")]
-    items = "".join(f"<i class='s-{name}'></i>{name}" for name in shown)
-    if len(shown) < len(capture.splits):
-        others = ", ".join(name for name in capture.splits if name not in shown)
-        items += f"<i class='s-other'></i>{escape(others)}"
-    return f"<p class='soft key'>{items}</p>" + (f"<p class='soft'>Splits: {escape(rule)}.</p>" if rule else "")
-
-
-def _dropped(result: IngestResult) -> str:
-    if not result.dropped:
-        return "<h2>Dropped</h2><p>Nothing: every video frame is in the capture.</p>"
+def _dropped(result: IngestResult) -> list[list[str]]:
+    """Rows of reason, count and frames; reasons that differ in a number only are one."""
     groups: dict[str, list[tuple[int, str]]] = {}
     for frame, why in result.dropped:
         groups.setdefault(_NUMBER.sub("…", why), []).append((frame, why))
@@ -248,13 +177,8 @@ def _dropped(result: IngestResult) -> str:
     for pattern, members in sorted(groups.items(), key=lambda group: -len(group[1])):
         reasons = {why for _, why in members}
         reason = next(iter(reasons)) if len(reasons) == 1 else pattern
-        frames = _ranges(sorted(frame for frame, _ in members))
-        rows.append(f"<tr><td>{escape(reason)}</td><td>{len(members)}</td><td class='wide'>{frames}</td></tr>")
-    return (
-        f"<h2>Dropped</h2><p>{len(result.dropped)} of {result.video_frames} video frames are not in the capture.</p>"
-        "<div class='scroll'><table class='dropped'><thead><tr><th>why</th><th>frames</th><th class='wide'>which</th>"
-        f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
-    )
+        rows.append([reason, str(len(members)), _ranges(sorted(frame for frame, _ in members))])
+    return rows
 
 
 def _ranges(frames: Sequence[int]) -> str:
@@ -268,13 +192,7 @@ def _ranges(frames: Sequence[int]) -> str:
     return ", ".join(f"{first}" if first == last else f"{first}–{last}" for first, last in runs)
 
 
-def _notes(result: IngestResult) -> str:
-    if not result.notes:
-        return ""
-    return "<h2>Notes</h2><ul class='note'>" + "".join(f"<li>{escape(note)}</li>" for note in result.notes) + "</ul>"
-
-
-def _made(result: IngestResult, capture: Capture) -> str:
+def _facts(result: IngestResult, capture: Capture) -> list[tuple[str, str]]:
     width, height = result.size
     facts = [
         ("recording", result.recording),
@@ -284,23 +202,14 @@ def _made(result: IngestResult, capture: Capture) -> str:
     ]
     registration = result.registration
     if registration is not None:
-        lever = registration.camera_from_sensor[:3, 3]
+        lever = ", ".join(f"{value:.1f}" for value in registration.camera_from_sensor[:3, 3])
         facts.append(("scale", f"{registration.scale:.6g} mm per unit of the reconstruction"))
-        facts.append(
-            ("sensor on the scope", "at " + ", ".join(f"{value:.1f}" for value in lever) + " mm in the camera's frame")
-        )
+        facts.append(("sensor on the scope", f"at {lever} mm in the camera's frame"))
     for name, shape in result.shapes.items():
-        facts.append(
-            (
-                f"shape of {name}",
-                f"{len(shape.points):,} points {shape.spacing:.2g} mm apart, {shape.agreement:.0%} of frames agree",
-            )
-        )
-    facts.append(
-        ("instruments", ", ".join(_described(item.name, item.joints) for item in capture.instruments) or "none")
-    )
-    items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts)
-    return f"<h2>How it was made</h2><dl class='made'>{items}</dl>"
+        told = f"{len(shape.points):,} points {shape.spacing:.2g} mm apart, {shape.agreement:.0%} of frames agree"
+        facts.append((f"shape of {name}", told))
+    instruments = ", ".join(_described(item.name, item.joints) for item in capture.instruments) or "none"
+    return [*facts, ("instruments", instruments)]
 
 
 def _described(name: str, joints: Iterable[str]) -> str:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
+from neeco.report.charts import draw_dots
+from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # view box units
 SVG_POINTS, CANVAS_POINTS = 1500, 4000
 STRAY = 0.01  # share of the points at either end that may lie outside the picture
 GAP = 4.0  # median time steps: a longer one breaks the line
 RAYS = 10  # cameras drawn with the direction they look in
-LINE_CLASSES = ("t-first", "t-second", "t-third")
+LINE_COLORS = ("phase", "good", "bad")  # of the instruments; the camera's is accent
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,9 @@ def _mean_axes(poses: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
+@page_style()
 def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> str:
-    """An SVG of the tracks seen along across x down; both [3] in the tracks' frame."""
+    """The tracks seen along across x down, as inline SVG; both [3] in the tracks' frame."""
     plane = np.stack([across, down], axis=1).astype(np.float64)  # [3, 2]
     low, high = _extent(tracks, plane)
     scale = min((WIDTH - 2 * MARGIN) / max(high[0] - low[0], 1e-9), (HEIGHT - 3 * MARGIN) / max(high[1] - low[1], 1e-9))
@@ -81,27 +83,26 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
     def place(positions: np.ndarray) -> np.ndarray:
         return scale * (positions @ plane) + offset
 
-    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">']
-    parts.append(f'<text class="title" x="12" y="18">{escape(title)}</text>')
+    axes = new_axes((WIDTH, HEIGHT), 0, 0, 0, 0)
+    axes.set_axis_off()
+    axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
+    axes.text(12, 18, title, color=STAND_INS["ink"], fontsize=12)
     step = -(-len(tracks.points) // SVG_POINTS) or 1
     dots = place(tracks.points[::step])
     inside = ((dots > 0) & (dots < [WIDTH, HEIGHT])).all(axis=1)
-    parts.append(f'<path class="t-points" d="{"".join(f"M{x:.0f} {y:.0f}h0" for x, y in dots[inside])}"/>')
-    parts.append(f'<path class="t-camera" d="{_line(place(tracks.camera), tracks.breaks)}"/>')
-    reach = 0.12 * float(np.linalg.norm(high - low))
+    draw_dots(axes, dots[inside], gid="points", color=STAND_INS["soft"], linewidth=1.7, alpha=0.55)
+    _draw_line(axes, place(tracks.camera), tracks.breaks, "accent", 1.8)
     chosen = np.unique(np.linspace(0, len(tracks.camera) - 1, RAYS).round().astype(int))
-    ends = place(tracks.camera[chosen] + reach * tracks.looking[chosen])
-    rays = "".join(
-        f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for (a, b), (c, d) in zip(place(tracks.camera[chosen]), ends, strict=True)
-    )
-    parts.append(f'<path class="t-rays" d="{rays}"/>')
+    ends = tracks.camera[chosen] + 0.12 * float(np.linalg.norm(high - low)) * tracks.looking[chosen]
+    rays = np.stack([place(tracks.camera[chosen]), place(ends)], axis=1).reshape(-1, 2)
+    _draw_line(axes, rays, np.arange(1, len(rays)) % 2 == 0, "accent", 1.0)
     for index, track in enumerate(tracks.instruments.values()):
-        line = _line(place(track), tracks.breaks)
-        parts.append(f'<path class="{LINE_CLASSES[index % len(LINE_CLASSES)]}" d="{line}"/>')
+        _draw_line(axes, place(track), tracks.breaks, LINE_COLORS[index % len(LINE_COLORS)], 1.8)
     length = _round_length(0.25 * (WIDTH - 2 * MARGIN) / scale)
-    parts.append(f'<path class="t-scale" d="M{WIDTH - 12 - length * scale:.1f} {HEIGHT - 10}H{WIDTH - 12}"/>')
-    parts.append(f'<text x="{WIDTH - 12}" y="{HEIGHT - 16}" text-anchor="end">{length:g} mm</text></svg>')
-    return "".join(parts)
+    end = WIDTH - 12
+    axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=STAND_INS["ink"], linewidth=2, clip_on=False)
+    axes.text(end, HEIGHT - 16, f"{length:g} mm", ha="right")
+    return inline_svg(axes, title)
 
 
 def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -113,18 +114,10 @@ def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return all_of.min(axis=0), all_of.max(axis=0)
 
 
-def _line(places: np.ndarray, breaks: np.ndarray) -> str:
-    """An SVG path through [F, 2], interrupted at breaks and where a place is unknown."""
-    parts, pen = [], False
-    for index, (x, y) in enumerate(places):
-        if not np.isfinite(x):
-            pen = False
-            continue
-        if index and breaks[index - 1]:
-            pen = False
-        parts.append(f"{'L' if pen else 'M'}{x:.1f} {y:.1f}")
-        pen = True
-    return "".join(parts)
+def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, width: float) -> None:
+    """A line through [F, 2], interrupted at breaks [F - 1] and where a place is unknown."""
+    line = np.insert(places, np.flatnonzero(breaks) + 1, np.nan, axis=0)
+    axes.plot(line[:, 0], line[:, 1], color=STAND_INS[color], linewidth=width, clip_on=False)
 
 
 def _round_length(wanted: float) -> float:
@@ -132,8 +125,8 @@ def _round_length(wanted: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
 
 
-def turning_view(tracks: Tracks) -> str:
-    """A canvas that turns when it is dragged, with its data and script; without scripts it stays hidden."""
+def turning_data(tracks: Tracks) -> dict[str, object]:
+    """What the canvas needs that turns when it is dragged (templates/turning.js)."""
     step = -(-len(tracks.points) // CANVAS_POINTS) or 1
     low, high = _extent(tracks, np.eye(3))
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
@@ -145,62 +138,10 @@ def turning_view(tracks: Tracks) -> str:
         return base64.b64encode(whole.tobytes()).decode("ascii")
 
     colors = np.clip(np.rint(tracks.colors[::step] * 255), 0, 255).astype(np.uint8)
-    data = {
+    return {
         "points": packed(tracks.points[::step]),
         "colors": base64.b64encode(colors.tobytes()).decode("ascii"),
         "lines": [packed(tracks.camera), *(packed(track) for track in tracks.instruments.values())],
         "breaks": np.flatnonzero(tracks.breaks).tolist(),
-        "names": ["--accent", "--phase", "--good", "--bad"],
+        "names": ["--accent", *(f"--{color}" for color in LINE_COLORS)],
     }
-    return (
-        "<figure class='turning' hidden><canvas></canvas><figcaption>Drag to turn.</figcaption></figure>"
-        f"<script>(function () {{ const data = {json.dumps(data)};\n{_SCRIPT}}})();</script>"
-    )
-
-
-_SCRIPT = """
-const figure = document.querySelector('.turning'), canvas = figure.querySelector('canvas');
-const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
-const shorts = text => { const b = bytes(text), view = new DataView(b.buffer), out = new Int16Array(b.length / 2);
-  for (let i = 0; i < out.length; i++) out[i] = view.getInt16(2 * i, true); return out; };
-const points = shorts(data.points), colors = bytes(data.colors), lines = data.lines.map(shorts);
-const breaks = new Set(data.breaks);
-let yaw = 0.6, pitch = 0.35, held = null, waiting = false;
-figure.hidden = false;
-function draw() {
-  waiting = false;
-  const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-  canvas.width = width * ratio; canvas.height = height * ratio;
-  const pen = canvas.getContext('2d'), style = getComputedStyle(document.documentElement);
-  pen.scale(ratio, ratio);
-  const zoom = Math.min(width, height) * 0.62 / 16000, cy = Math.cos(yaw), sy = Math.sin(yaw);
-  const cp = Math.cos(pitch), sp = Math.sin(pitch);
-  const at = (a, i) => { const x = cy * a[i] - sy * a[i + 2], d = sy * a[i] + cy * a[i + 2];
-    return [width / 2 + zoom * x, height / 2 + zoom * (cp * a[i + 1] - sp * d)]; };
-  for (let i = 0; i < points.length; i += 3) {
-    const [x, y] = at(points, i);
-    pen.fillStyle = `rgb(${colors[i]},${colors[i + 1]},${colors[i + 2]})`;
-    pen.fillRect(x - 1, y - 1, 2, 2);
-  }
-  lines.forEach((line, index) => {
-    pen.strokeStyle = style.getPropertyValue(data.names[index % data.names.length]);
-    pen.lineWidth = 1.8; pen.beginPath();
-    for (let i = 0, on = false; i < line.length; i += 3) {
-      if (line[i] === -32768) { on = false; continue; }
-      const [x, y] = at(line, i);
-      if (on && !breaks.has(i / 3 - 1)) pen.lineTo(x, y); else pen.moveTo(x, y);
-      on = true;
-    }
-    pen.stroke();
-  });
-}
-const later = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
-canvas.addEventListener('pointerdown', e => { held = [e.clientX, e.clientY]; canvas.setPointerCapture(e.pointerId); });
-canvas.addEventListener('pointermove', e => { if (!held) return;
-  yaw += (e.clientX - held[0]) * 0.01; pitch += (e.clientY - held[1]) * 0.01;
-  pitch = Math.max(-1.5, Math.min(1.5, pitch)); held = [e.clientX, e.clientY]; later(); });
-for (const end of ['pointerup', 'pointercancel']) canvas.addEventListener(end, () => { held = null; });
-window.addEventListener('resize', later);
-matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);
-draw();
-"""

@@ -1,0 +1,249 @@
+"""The one-page report of a run: one file, offline, readable by someone who did not train it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from neeco.capture.model import Capture
+from neeco.evaluation.difference import FULL_SCALE, PART_COLORS
+from neeco.report.charts import SMALL, Series, line_chart, short
+from neeco.report.figures import file_uri, frame_figures
+from neeco.report.render import REPORT_FILE, write_page
+from neeco.scene import Drawable
+
+MAX_POINTS = 300  # of a training curve
+
+
+class Score(NamedTuple):
+    """A column of the table of numbers: its key in evaluation.json, how it is written, and what it means."""
+
+    key: str
+    heading: str
+    form: str
+    meaning: str
+
+
+SCORES = (
+    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the photograph's; 30 is close, 20 is rough."),
+    Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
+    Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
+    Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
+    Score("psnr_instrument", "PSNR instr.", "{:.2f}", "PSNR over the pixels where the instrument truly is."),
+    Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
+    Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
+    Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
+    Score("fps", "FPS", "{:.1f}", "Posed drawings per second on the machine that evaluated."),
+    Score("num_gaussians", "Gaussians", "{:,}", "How many Gaussians one drawing uses."),
+    Score("frames", "frames", "{}", "How many frames were scored."),
+)  # fmt: skip
+KINDS = {
+    "given": "As given: drawn at the poses the capture states, tracker errors included",
+    "aligned": "Aligned: instrument and camera pose fitted to each photograph first, the scene unchanged",
+}
+KIND_NAMES = {"given": "as given", "aligned": "aligned"}
+PARTS = ("shaft", "wrist", "jaws", "jaw_left", "jaw_right")
+
+
+def write_report(
+    run_path: Path,
+    evaluation: dict[str, Any],
+    capture: Capture,
+    scene: Drawable,
+    *,
+    synthesis_preview: Path | None = None,
+) -> Path:
+    """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
+
+    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. Raises NeecoError
+    when a picture cannot be read or the page cannot be written.
+    """
+    rows = read_metrics(run_path / "metrics.jsonl")
+    kind = "aligned" if "aligned" in evaluation else "given"
+    with scene.torch_threads():
+        figures = frame_figures(evaluation, capture, scene, kind)
+    config = run_path / "config.yaml"
+    return write_page(
+        run_path / REPORT_FILE,
+        "run.html",
+        title=f"{capture.root.name}: {scene.method}",
+        name=capture.root.name,
+        subtitle=f"learned by {scene.method}",
+        stamps=[run_path],
+        kind="A radiance field" if scene.num_gaussians is None else "A Gaussian-splatting model",
+        instruments=", ".join(item.name for item in scene.instruments) or "no instrument",
+        trained=len(capture.split("train")),
+        train_scored="train" in evaluation["given"],
+        tiles=_tiles(evaluation, kind),
+        **_numbers(evaluation),
+        notes=evaluation.get("notes", ()),
+        part_head=["split", *(part.replace("_", " ") for part in PARTS), "jaws matched"],
+        parts=_parts(evaluation),
+        figures=figures,
+        drawn=KIND_NAMES[kind],
+        full_scale=FULL_SCALE,
+        tints=_tints(scene),
+        curves=_curves(rows),
+        **_diagnostics(getattr(scene, "diagnostics", {})),
+        preview=synthesis_preview and file_uri(synthesis_preview),
+        facts=_facts(capture, scene, rows),
+        config=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
+    )
+
+
+def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
+    """(number, what it is) of the few that matter most."""
+    tiles = []
+    for split, numbers in evaluation["given"].items():
+        if numbers["psnr"] is not None:
+            tiles.append((f"{numbers['psnr']:.1f} dB", f"PSNR, {split}, as given"))
+    for split, numbers in evaluation[labelled].items():
+        if numbers["mask_iou"] is not None:
+            tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
+    first = next(iter(evaluation["given"].values()), None)
+    if first is not None:
+        tiles.append((f"{first['fps']:.1f}", "posed drawings per second"))
+        if first["num_gaussians"] is not None:
+            tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
+    return tiles
+
+
+def _numbers(evaluation: dict[str, Any]) -> dict[str, Any]:
+    """The columns of the table of numbers that anything is known for, and its rows: (title of the kind, its splits)."""
+    kinds = {kind: evaluation[kind] for kind in KINDS if kind in evaluation}
+    known = [numbers for splits in kinds.values() for numbers in splits.values()]
+    columns = [score for score in SCORES if any(numbers.get(score.key) is not None for numbers in known)]
+    scores = []
+    for kind, splits in kinds.items():
+        rows = [
+            (split, [_written(numbers.get(score.key), score.form) for score in columns])
+            for split, numbers in splits.items()
+        ]
+        scores.append((KINDS[kind], rows))
+    return {"columns": columns, "scores": scores}
+
+
+def _parts(evaluation: dict[str, Any]) -> list[list[str]]:
+    """Rows of per-part IoU, where any is known."""
+    rows = []
+    for kind in KINDS:
+        for split, numbers in evaluation.get(kind, {}).items():
+            parts = numbers.get("part_iou") or {}
+            if any(value is not None for value in parts.values()):
+                way = evaluation["labels"]["jaw_assignment"].get(kind, {}).get(split) or "-"
+                cells = [_written(parts.get(name), "{:.3f}") for name in PARTS]
+                rows.append([f"{split}, {KIND_NAMES[kind]}", *cells, way])
+    return rows
+
+
+def _tints(scene: Drawable) -> list[tuple[str, str]]:
+    """Which tint is which part."""
+    several = len({instrument for instrument, _ in scene.label_names}) > 1
+    tints = []
+    for index, (instrument, part) in enumerate(scene.label_names):
+        name = f"{instrument} {part}" if several else part
+        red, green, blue = (int(value) for value in PART_COLORS[index % len(PART_COLORS)])
+        tints.append((f"rgb({red}, {green}, {blue})", name.replace("_", " ")))
+    return tints
+
+
+def _curves(rows: list[dict[str, Any]]) -> list[str]:
+    charts = [
+        curve(rows, "psnr", "PSNR of training frames, dB"),
+        curve(rows, "loss", "loss (log scale)", logarithmic=True),
+        curve(rows, "num_gaussians", "Gaussians"),
+    ]
+    return [chart for chart in charts if chart]
+
+
+def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
+    """What the scene says about its own joints, from training data alone."""
+    told = _flat(diagnostics)
+    judged = [key.split(" · ")[-1] == "verdict" for key, _ in told]
+    return {
+        "diagnostics": [(key, _plain(value)) for (key, value), judges in zip(told, judged, strict=True) if not judges],
+        "verdicts": [value for (_, value), judges in zip(told, judged, strict=True) if judges],
+    }
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    items: list[tuple[str, Any]] = []
+    for key, item in value.items():
+        name = prefix + str(key).replace("_", " ")
+        items += _flat(item, name + " · ") if isinstance(item, Mapping) else [(name, item)]
+    return items
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _facts(capture: Capture, scene: Drawable, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    splits = ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
+    facts = [("capture", str(capture.root)), ("frames", splits), ("method", scene.method)]
+    if rows:
+        last = rows[-1]
+        facts.append(("iterations", f"{last['iteration']:,}"))
+        if isinstance(last.get("seconds"), int | float):
+            facts.append(("training time", f"{last['seconds'] / 60:.1f} min"))
+    return facts
+
+
+def _written(value: Any, form: str) -> str:
+    return "–" if value is None else form.format(value)
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows of a metrics.jsonl; empty when there is none. A last line cut off by a kill is left out."""
+    if not path.is_file():
+        return []
+    rows = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if isinstance(row, dict) and isinstance(row.get("iteration"), int | float):
+            rows.append(row)
+    return rows
+
+
+def phase_starts(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
+    """(iteration, phase) wherever the phase changes, the first phase left out."""
+    changes = []
+    for before, after in pairwise(rows):
+        if after.get("phase") != before.get("phase") and after.get("phase") is not None:
+            changes.append((float(after["iteration"]), f"phase {after['phase']}"))
+    return changes
+
+
+def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
+    """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
+    points = [(float(row["iteration"]), float(row[key])) for row in rows if _is_number(row.get(key))]
+    points = _thinned([(x, y) for x, y in points if y > 0 or not logarithmic])
+    if len(points) < 2:
+        return ""
+    series = [Series("", 0, tuple(points))]
+    note, starts = f"{short(points[-1][1])} at the end", phase_starts(rows)
+    return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=SMALL)
+
+
+def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """At most MAX_POINTS points: means of equal runs, so that a noisy curve reads as its trend."""
+    if len(points) <= MAX_POINTS:
+        return points
+    run = -(-len(points) // MAX_POINTS)
+    groups = [points[start : start + run] for start in range(0, len(points), run)]
+    return [(group[-1][0], sum(y for _, y in group) / len(group)) for group in groups]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
