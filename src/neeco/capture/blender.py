@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from neeco.capture.images import EXTENSIONS
+from neeco.capture.nodes import Node
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.points import random_points
-from neeco.capture.problems import Node, Report
+from neeco.capture.problems import Report
 from neeco.capture.transforms import load_document, parse_frames, parse_points, parses_as_json, relative_name
 
 HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there

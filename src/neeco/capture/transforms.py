@@ -14,10 +14,12 @@ import torch
 from neeco.capture.images import image_size
 from neeco.capture.instruments import declared_instruments, parse_instruments, seen_instruments
 from neeco.capture.model import Frame, State
+from neeco.capture.nodes import Node
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.paths import inside
 from neeco.capture.points import read_ply
-from neeco.capture.problems import Node, Report, shown
+from neeco.capture.poses import swap_camera_axes
+from neeco.capture.problems import Report, shown
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.raster.types import Camera
@@ -26,15 +28,6 @@ SCHEMA = "neeco-capture/1"
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
-
-
-def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
-    """Turn a camera pose [4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or back.
-
-    The only place where the two conventions meet.
-    """
-    return world_from_camera * _FLIP_YZ
 
 
 def load_document(file: Path, root: Path, report: Report) -> Node:

@@ -12,8 +12,8 @@ import numpy as np
 
 from neeco.capture.check.states import states_of
 from neeco.capture.parsed import Parsed, Place
+from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import Report, errors_only, shown
-from neeco.capture.transforms import swap_camera_axes
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from neeco.capture.instruments import passes_limits
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.problems import Report, key_name, shown
 
-LIMIT_TOLERANCE = 1e-3  # rad
 FULL_TURN = 2 * math.pi
 STILL = 1e-9  # mm or rad; a state that changes less does not change
 
@@ -65,7 +65,7 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: Rep
             report.error(place.file, field, "is missing", "give its value in every frame, or drop the frame")
             continue
         value = state.joints[joint]
-        if limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE:
+        if limits is not None and passes_limits(value, limits):
             message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
             report.error(place.file, field, message, "repair the reading (radians?) or the limits")
         if largest is None or abs(value) > abs(largest[0]):
