@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
 from neeco.capture.nodes import as_float
@@ -17,6 +18,7 @@ from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.requirements import optional_module
+from neeco.raster.types import Camera
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
@@ -42,6 +44,17 @@ class Lens:
     @property
     def distorted(self) -> bool:
         return any(self.distortion)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fl_x, fl_y, cx, cy."""
+        return self.fl_x, self.fl_y, self.cx, self.cy
+
+    def camera(self, world_from_camera: np.ndarray) -> Camera:
+        """A pinhole's camera at a pose [4, 4] with OpenCV axes."""
+        assert self.size is not None
+        assert not self.distorted
+        return Camera(torch.from_numpy(world_from_camera.copy()), *self.intrinsics, *self.size)
 
     def check_size(self, size: tuple[int, int], source: object) -> None:
         """Raise NeecoError when measured on images of another size than (width, height). source: named in it."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.ingest.lens import Lens
 from neeco.ingest.recording import FEWEST_FRAMES
 from neeco.ingest.requirements import require_installed
 
@@ -26,16 +27,6 @@ FEATURES = 1200  # per image
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics px of undistorted images."""
-
-    fl_x: float
-    fl_y: float
-    cx: float
-    cy: float
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ class StructureFromMotion:
         source: Path,
         folder: Path,
         names: Sequence[str],
-        pinhole: Pinhole | None,
+        pinhole: Lens | None,
         masks: Path | None = None,
     ) -> None:
         require_installed("pycolmap")
@@ -105,7 +96,7 @@ class StructureFromMotion:
             "masks": str(masks) if masks else "",
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "OPENCV",
-            "camera_params": [pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy] if pinhole else [],
+            "camera_params": [*pinhole.intrinsics] if pinhole else [],
             "features": FEATURES,
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }

@@ -14,6 +14,7 @@ from neeco.capture.check.states import states_of
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import Report, errors_only, shown
+from neeco.raster.pinhole import project
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene
@@ -21,6 +22,7 @@ SEEN_RARELY = 0.1  # a share of the points, or of the frames, that makes one loo
 SEEN_SURELY = 0.7  # a share that settles it
 SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
 METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
+BEHIND = 1e-9  # mm; what is less deep is not in front of a camera
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
 
 
@@ -45,10 +47,11 @@ class _Cameras:
         """Which camera has which point in its image, bool [F, P]; points [P, 3], or [F, P, 3] one set per camera."""
         poses = self.poses if poses is None else poses
         local = np.einsum("fpi,fij->fpj", points - poses[:, None, :3, 3], poses[:, :3, :3])
-        depth = np.where(local[..., 2] > 1e-9, local[..., 2], np.nan)
+        fx, fy, cx, cy = self.intrinsics.T[..., None]  # each [F, 1]
+        width, height = self.sizes.T[..., None]
         with np.errstate(all="ignore"):
-            pixels = local[..., :2] / depth[..., None] * self.intrinsics[:, None, :2] + self.intrinsics[:, None, 2:]
-            return ((pixels > 0) & (pixels < self.sizes[:, None])).all(axis=-1)
+            u, v = project(local, fx, fy, cx, cy, nearest=BEHIND)
+            return (local[..., 2] > BEHIND) & (u > 0) & (u < width) & (v > 0) & (v < height)
 
     def scaled(self, factor: float) -> np.ndarray:
         return _scaled(self.poses, factor)
