@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture import check_capture, errors_only, read_capture
+from neeco.capture import check_capture, errors_only, read_capture, transforms
+from neeco.capture.check import read_checked
 from neeco.capture.points import write_ply
 from neeco.cli import check as check_verb
 from neeco.errors import NeecoError
@@ -286,3 +287,17 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     errors = [problem for problem in report["problems"] if problem["severity"] == "error"]
     assert errors[0]["field"] == "frames[5].instruments[0].joints.jaw_angle"
     assert report["summary"]["splits"] == {"train": 7, "test": 1}
+
+
+def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
+    parsed = []
+    real = transforms.read_json
+    monkeypatch.setattr(transforms, "read_json", lambda path: parsed.append(path) or real(path))
+    assert len(read_checked(folder.root).frames) == 8
+    assert len(parsed) == 1
+
+
+def test_frames_that_are_all_left_out_are_an_error(folder):
+    folder.edit(lambda document: document.update(train_filenames=[]))
+    folder.edit(lambda document: [frame.pop("split") for frame in document["frames"]])
+    assert_found(folder, "frames", "no usable frame")

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.poses import rigid_fault
-from neeco.capture.problems import Report, key_name, shown
+from neeco.capture.problems import ProblemReport, key_name, shown
 
 
 @dataclass(frozen=True)
 class Node:
     """A value and where it lies. A reading that fails tells `report` one error and returns None.
 
-    Whether that ends the reading is the report's choice: `Report` collects, `Refusal` raises.
+    Whether that ends the reading is the report's choice: `ProblemReport` collects, `Refusal` raises.
     """
 
     value: Any
     file: str
     field: str
-    report: Report
+    report: ProblemReport
 
     def error(self, message: str, remedy: str = "") -> None:
         self.report.error(self.file, self.field, message, remedy)

@@ -28,3 +28,5 @@ class Parsed:
     points_place: Place = Place("", "")
     registered: bool = True
     timed: bool = True  # the recording says when each frame was taken
+    says_units: bool = False  # the file names its unit of length
+    is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's

@@ -29,7 +29,7 @@ def errors_only(problems: list[Problem]) -> list[Problem]:
 
 
 @dataclass
-class Report:
+class ProblemReport:
     """Collects problems while a capture is read, so that all of them can be told at once."""
 
     problems: list[Problem] = field(default_factory=list)
@@ -50,7 +50,7 @@ class Report:
         raise NeecoError(f"{place}{errors[0]}{more}")
 
 
-class Refusal(Report):
+class Refusal(ProblemReport):
     """Raises the first error as NeecoError in one line: for files that are read as a whole or not at all."""
 
     def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:

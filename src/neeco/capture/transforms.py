@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +17,7 @@ from neeco.capture.parsed import Parsed, Place
 from neeco.capture.paths import inside
 from neeco.capture.points import read_ply
 from neeco.capture.poses import swap_camera_axes
-from neeco.capture.problems import Report, shown
+from neeco.capture.problems import ProblemReport, shown
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.raster.types import Camera
@@ -30,7 +28,7 @@ _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def load_document(file: Path, root: Path, report: Report) -> Node:
+def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
     name = relative_name(file, root)
     try:
@@ -50,13 +48,13 @@ def relative_name(file: Path, root: Path) -> str:
     return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
 
 
-def parse_transforms(file: Path, root: Path, report: Report, background: float = 1.0) -> Parsed:
-    """Read one transforms file of the capture at `root`; problems go to `report`. Relative paths start at the file."""
-    document = load_document(file, root, report)
+def parse_transforms(document: Node, folder: Path, root: Path, background: float = 1.0) -> Parsed:
+    """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
+    file."""
     parsed = Parsed(root)
     parse_header(document, parsed)
-    parse_frames(document, file.parent, parsed, background=background)
-    parse_points(document, file.parent, parsed)
+    parse_frames(document, folder, parsed, background=background)
+    parse_points(document, folder, parsed)
     parsed.instruments = seen_instruments(parsed.frames, declared_instruments(document))
     return parsed
 
@@ -73,6 +71,7 @@ def parse_header(document: Node, parsed: Parsed) -> None:
     if registration not in ("world", "unregistered"):
         document.child("instrument_frame").error(f"is {shown(registration)}", "write 'world' or 'unregistered'")
     parsed.registered = registration != "unregistered"
+    parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA
 
 
 def parse_frames(
@@ -303,12 +302,3 @@ class _Intrinsics:
             node.error(f"is {value:g}, must be positive")
             return None
         return value
-
-
-def parses_as_json(file: Path) -> dict[str, Any]:
-    """The JSON object in a file, {} when there is none; for deciding what a file is, without reporting."""
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}

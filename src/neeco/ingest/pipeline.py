@@ -26,7 +26,7 @@ from neeco.ingest.recording import FEWEST_FRAMES, Recording, Splits
 from neeco.ingest.registration import Registration, register_with_laparoscope
 from neeco.ingest.result import IngestResult
 from neeco.ingest.select import choose_frames, look_over
-from neeco.ingest.sfm import Progress, SfmResult, StructureFromMotion
+from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.splits import LEFT_OUT, Assigned, assign_splits
 from neeco.ingest.work import (
     States,
@@ -45,7 +45,7 @@ MOST_FRAMES = 400  # kept unless the recording asks for another number
 SCENE_MM = 100.0  # from the cameras to the tissue, taken when nothing measures it
 
 
-def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResult:
+def ingest(recording: Recording, output: Path, progress: StageProgress) -> IngestResult:
     """Make the capture `output` from a recording and say how good it is.
 
     Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and

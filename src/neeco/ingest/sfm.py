@@ -26,7 +26,7 @@ FEATURES = 1200  # per image
 # run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
-Progress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
+StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class StructureFromMotion:
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
 
-    def reconstruct(self, progress: Progress) -> SfmResult:
+    def reconstruct(self, progress: StageProgress) -> SfmResult:
         """Cameras and points, not yet adjusted together.
 
         Raises NeecoError when fewer than FEWEST_FRAMES images get a camera.
@@ -110,14 +110,14 @@ class StructureFromMotion:
         keys = [self.names[index] for index in keyframes(len(self.names))]
         return self._run(self.job | {"pairs": pairs, "keyframes": keys}, progress)
 
-    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: Progress) -> SfmResult:
+    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: StageProgress) -> SfmResult:
         """The same after bundle adjustment without the observations marked in `doubtful` [Q]."""
         rows = found.observations[doubtful]
         names = [self.names[index] for index in found.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
         return self._run(self.job | {"drop": drop}, progress)
 
-    def _run(self, job: dict[str, Any], progress: Progress) -> SfmResult:
+    def _run(self, job: dict[str, Any], progress: StageProgress) -> SfmResult:
         job_file, result = self.work / "job.json", self.work / "result.npz"
         result.unlink(missing_ok=True)
         job_file.write_text(json.dumps(job))
@@ -130,7 +130,7 @@ class StructureFromMotion:
         return _load(result, self.names, self.source)
 
 
-def run_worker(job_file: Path, source: Path, progress: Progress) -> None:
+def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
     """Pass the worker's events on; kill it when we are interrupted. Raises NeecoError naming `source` when it fails."""
     log_file = job_file.with_name("worker.log")
     with (

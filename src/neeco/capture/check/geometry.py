@@ -13,7 +13,7 @@ import numpy as np
 from neeco.capture.check.states import states_of
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.poses import swap_camera_axes
-from neeco.capture.problems import Report, errors_only, shown
+from neeco.capture.problems import ProblemReport, errors_only, shown
 from neeco.raster.pinhole import project
 
 FEW_POINTS = 100
@@ -71,7 +71,7 @@ def _inverted(poses: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def check_geometry(parsed: Parsed, report: Report) -> None:
+def check_geometry(parsed: Parsed, report: ProblemReport) -> None:
     """Check cameras against points, then instruments against both (not against cameras that are wrong)."""
     before = len(errors_only(report.problems))
     check_cameras(parsed, report)
@@ -79,7 +79,7 @@ def check_geometry(parsed: Parsed, report: Report) -> None:
         check_instruments(parsed, report)
 
 
-def check_cameras(parsed: Parsed, report: Report) -> None:
+def check_cameras(parsed: Parsed, report: ProblemReport) -> None:
     """Report points that are too few or in one spot, cameras far from them, and mistakes in camera poses."""
     place = parsed.points_place
     if parsed.points is None or not parsed.points.measured:
@@ -130,7 +130,7 @@ class _Scene:
         return max(self.spread, self.distance)
 
 
-def _check_camera_views(parsed: Parsed, scene: _Scene, report: Report) -> None:
+def _check_camera_views(parsed: Parsed, scene: _Scene, report: ProblemReport) -> None:
     cameras, points = scene.cameras, scene.points
     seen = cameras.sees(points[None]).mean(axis=1)  # [F] share of the points in each image
     file = parsed.places[0].file
@@ -183,7 +183,7 @@ def _camera_mistake(scene: _Scene, given: float) -> tuple[str, str] | None:
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def check_instruments(parsed: Parsed, report: Report) -> None:
+def check_instruments(parsed: Parsed, report: ProblemReport) -> None:
     """Report instruments far from the scene or outside every image, and the mistakes behind it."""
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
@@ -201,7 +201,7 @@ def check_instruments(parsed: Parsed, report: Report) -> None:
             _check_placement(parsed, instrument.name, np.array(has), poses, [place for place, _ in found], report)
 
 
-def _report_metres(name: str, poses: np.ndarray, place: Place, report: Report) -> bool:
+def _report_metres(name: str, poses: np.ndarray, place: Place, report: ProblemReport) -> bool:
     """Report an instrument that moves, but never a millimetre from its frame's origin; True if so."""
     origins = poses[:, :3, 3]
     farthest = float(np.linalg.norm(origins, axis=1).max())
@@ -213,7 +213,7 @@ def _report_metres(name: str, poses: np.ndarray, place: Place, report: Report) -
 
 
 def _check_placement(
-    parsed: Parsed, name: str, has: np.ndarray, poses: np.ndarray, places: list[Place], report: Report
+    parsed: Parsed, name: str, has: np.ndarray, poses: np.ndarray, places: list[Place], report: ProblemReport
 ) -> None:
     """Check one registered instrument; poses [I, 4, 4] of the frames that have it."""
     everyone = _Cameras.of(parsed)
@@ -244,7 +244,7 @@ def _how_many(seen: np.ndarray) -> str:
     return "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
 
 
-def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place], report: Report) -> bool:
+def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place], report: ProblemReport) -> bool:
     """Report poses far from the points; True when there were any."""
     distances = np.linalg.norm(poses[:, :3, 3] - scene.center, axis=1)
     limit = FAR * scene.size + SENSOR_REACH_MM * (scene.distance > METRES)
@@ -255,7 +255,9 @@ def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place]
     return bool((distances > limit).any())
 
 
-def _report_never_seen(name: str, cameras: _Cameras, poses: np.ndarray, places: list[Place], report: Report) -> None:
+def _report_never_seen(
+    name: str, cameras: _Cameras, poses: np.ndarray, places: list[Place], report: ProblemReport
+) -> None:
     """An origin outside every image: a sensor away from the instrument's visible part, or a wrong frame."""
     field = "frames[*].instruments[*].pose"
     message = f"the origin of {shown(name)} is outside every image"
@@ -313,7 +315,7 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: Report) -> None:
+def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: ProblemReport) -> None:
     """Single poses far away from all others, and out of view: tracker drop-outs."""
     origins = poses[:, :3, 3]
     distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
