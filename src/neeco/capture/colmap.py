@@ -12,10 +12,9 @@ import numpy as np
 import torch
 
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
+from neeco.capture.parsed import Parsed, Place, inside, relative_name
 from neeco.capture.problems import ProblemReport, shown
-from neeco.capture.transforms import TEST_EVERY, relative_name
+from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
 

@@ -15,8 +15,7 @@ import torch
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.nodes import Node
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
+from neeco.capture.parsed import Parsed, Place, inside
 from neeco.capture.points import random_points
 from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY

@@ -1,11 +1,14 @@
-"""What the readers hand on: frames and where each was described."""
+"""What the readers share: what they hand on, where each frame was described, and paths inside the capture's folder."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from neeco.capture.model import Frame, Instrument, PointCloud
+from neeco.capture.problems import shown
+from neeco.errors import NeecoError
 
 
 @dataclass(frozen=True)
@@ -30,3 +33,25 @@ class Parsed:
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
+
+
+def inside(root: Path, folder: Path, text: str) -> Path:
+    """The path `text`, taken relative to `folder`, which must lie inside `root` also after following symbolic links.
+
+    Raises NeecoError (without naming the field: the caller does) when it is absolute, leads out or is no path at all.
+    """
+    if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
+        raise NeecoError(f"{shown(text)} is absolute; give a path relative to the capture's folder")
+    try:
+        path = Path(os.path.normpath(folder / text))
+        outside = not path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError):
+        raise NeecoError(f"{shown(text)} is not a usable path; repair it") from None
+    if outside:
+        raise NeecoError(f"{shown(text)} leaves the capture's folder; copy the file into it and name it from there")
+    return path
+
+
+def relative_name(file: Path, root: Path) -> str:
+    """How messages call a file of the capture."""
+    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name

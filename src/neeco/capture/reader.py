@@ -12,8 +12,7 @@ from neeco.capture.blender import is_blender, parse_blender
 from neeco.capture.colmap import find_model, parse_colmap
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.model import Capture, Frame, PointCloud
-from neeco.capture.parsed import Parsed
-from neeco.capture.paths import inside
+from neeco.capture.parsed import Parsed, inside
 from neeco.capture.points import random_points
 from neeco.capture.problems import ProblemReport, errors_only
 from neeco.capture.transforms import load_document, parse_transforms

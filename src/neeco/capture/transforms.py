@@ -13,8 +13,7 @@ from neeco.capture.images import image_size
 from neeco.capture.instruments import declared_instruments, parse_instruments, seen_instruments
 from neeco.capture.model import Frame, State
 from neeco.capture.nodes import Node
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
+from neeco.capture.parsed import Parsed, Place, inside, relative_name
 from neeco.capture.points import read_ply
 from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import ProblemReport, shown
@@ -41,11 +40,6 @@ def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
         value = {}
     node = Node(value, name, "", report)
     return node if node.is_object() else Node({}, name, "", report)
-
-
-def relative_name(file: Path, root: Path) -> str:
-    """How messages call a file of the capture."""
-    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
 
 
 def parse_transforms(document: Node, folder: Path, root: Path, background: float = 1.0) -> Parsed:
