@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 
 from neeco.capture.model import Frame, Instrument, PointCloud
@@ -21,7 +21,11 @@ class Place:
 
 @dataclass
 class Parsed:
-    """A capture as far as it could be read. Frames that could not be read are left out (and reported)."""
+    """A capture as far as it could be read.
+
+    Frames without image, split, time or states that could be read are left out (and reported); where only the camera is
+    wrong they are kept, so that the rest of them can be checked.
+    """
 
     root: Path
     frames: list[Frame] = field(default_factory=list)
@@ -33,6 +37,13 @@ class Parsed:
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
+    without_camera: set[int] = field(default_factory=set)  # frames whose camera is wrong (reported) and a stand-in
+
+    def with_cameras(self) -> Parsed:
+        """The same without the frames whose camera is a stand-in."""
+        rows = [row for row in range(len(self.frames)) if row not in self.without_camera]
+        frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
+        return replace(self, frames=frames, places=places, without_camera=set())
 
 
 def inside(root: Path, folder: Path, text: str) -> Path:

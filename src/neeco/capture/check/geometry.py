@@ -72,15 +72,18 @@ def _inverted(poses: np.ndarray) -> np.ndarray:
 
 
 def check_geometry(parsed: Parsed, report: ProblemReport) -> None:
-    """Check cameras against points, then instruments against both (not against cameras that are wrong)."""
+    """Check points, cameras against points, then instruments against both (not against cameras that are wrong)."""
     before = len(errors_only(report.problems))
-    check_cameras(parsed, report)
-    if len(errors_only(report.problems)) == before:
-        check_instruments(parsed, report)
+    points = usable_points(parsed, report)
+    placed = parsed.with_cameras()
+    if points is not None and placed.frames:
+        check_cameras(placed, points, report)
+    if placed.frames and len(errors_only(report.problems)) == before:
+        check_instruments(placed, report)
 
 
-def check_cameras(parsed: Parsed, report: ProblemReport) -> None:
-    """Report points that are too few or in one spot, cameras far from them, and mistakes in camera poses."""
+def usable_points(parsed: Parsed, report: ProblemReport) -> np.ndarray | None:
+    """The measured points [P, 3] float64. Reports that there are none, few, or all in one spot; None when unusable."""
     place = parsed.points_place
     if parsed.points is None or not parsed.points.measured:
         already = any(problem.file == place.file and problem.field == place.field for problem in report.problems)
@@ -88,18 +91,28 @@ def check_cameras(parsed: Parsed, report: ProblemReport) -> None:
             report.warning(
                 place.file, place.field, "no sparse points", "training starts from random ones, and gets less"
             )
-        return
+        return None
     points = parsed.points.positions.astype(np.float64)
     if len(points) == 0:
         report.error(place.file, place.field, "holds no points", "add SfM points or drop ply_file_path")
-        return
+        return None
     if len(points) < FEW_POINTS:
         message = f"few sparse points: {len(points)}, fewer than {FEW_POINTS}"
         report.warning(place.file, place.field, message, "give SfM's whole cloud if you can")
-    scene = _Scene.of(parsed, points)
-    if scene.spread < 1e-9:
+    if _spread(points) < 1e-9:
         report.error(place.file, place.field, "all points are in one spot", "repair the point cloud")
-        return
+        return None
+    return points
+
+
+def _spread(points: np.ndarray) -> float:
+    """mm, 90% of the points [P, 3] are within this of their centre."""
+    return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
+
+
+def check_cameras(parsed: Parsed, points: np.ndarray, report: ProblemReport) -> None:
+    """Report cameras far from the points, and mistakes in camera poses."""
+    scene = _Scene.of(parsed, points)
     if parsed.instruments and scene.distance < METRES:
         message = f"cameras are {scene.distance:.3g} mm from the points: metres?"
         report.error(parsed.places[0].file, "frames", message, "give cameras, points and poses in mm")
@@ -121,9 +134,8 @@ class _Scene:
     def of(cls, parsed: Parsed, points: np.ndarray) -> _Scene:
         cameras = _Cameras.of(parsed)
         center = np.median(points, axis=0)
-        spread = float(np.quantile(np.linalg.norm(points - center, axis=1), 0.9))
         distance = float(np.median(np.linalg.norm(cameras.poses[:, :3, 3] - center, axis=1)))
-        return cls(cameras, points[:: max(1, len(points) // 500)], center, spread, distance)
+        return cls(cameras, points[:: max(1, len(points) // 500)], center, _spread(points), distance)
 
     @property
     def size(self) -> float:

@@ -30,10 +30,11 @@ def check_images(parsed: Parsed, report: ProblemReport) -> None:
     """Decode every image and mask and report what is wrong with them."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         looked = list(pool.map(_look, parsed.frames))
+    told = {(problem.file, problem.field) for problem in report.problems}  # by the reader, of sizes not stated
     first: dict[bytes, int] = {}
     for index, (found, place) in enumerate(zip(looked, parsed.places, strict=True)):
         field = f"{place.field}.file_path"
-        if found.image_error:
+        if found.image_error and (place.file, field) not in told:
             report.error(place.file, field, *found.image_error.split("; ", 1))
         if found.mask_error:
             report.error(place.file, f"{place.field}.mask_path", *found.mask_error.split("; ", 1))
