@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.points import write_ply
+from neeco.capture import check_capture, errors_only, read_capture, transforms
+from neeco.capture.check import read_checked
+from neeco.capture.points import read_ply, write_ply
 from neeco.cli import check as check_verb
 from neeco.errors import NeecoError
 
@@ -286,3 +287,84 @@ def test_the_verb_prints_and_returns_a_status(folder, capsys):
     errors = [problem for problem in report["problems"] if problem["severity"] == "error"]
     assert errors[0]["field"] == "frames[5].instruments[0].joints.jaw_angle"
     assert report["summary"]["splits"] == {"train": 7, "test": 1}
+
+
+def test_a_capture_is_parsed_once_to_be_checked_and_handed_on(folder, monkeypatch):
+    parsed = []
+    real = transforms.read_json
+    monkeypatch.setattr(transforms, "read_json", lambda path: parsed.append(path) or real(path))
+    assert len(read_checked(folder.root).frames) == 8
+    assert len(parsed) == 1
+
+
+def test_frames_that_are_all_left_out_are_an_error(folder):
+    folder.edit(lambda document: document.update(train_filenames=[]))
+    folder.edit(lambda document: [frame.pop("split") for frame in document["frames"]])
+    assert_found(folder, "frames", "no usable frame")
+
+
+def told(folder, field: str) -> list[str]:
+    return [str(problem) for problem in problems(folder) if problem.field == field]
+
+
+@pytest.mark.parametrize(
+    ("edit", "field", "words"),
+    [
+        (lambda d: d.pop("fl_x"), "fl_x", "is missing, for 8 of 8 frames"),
+        (lambda d: d.pop("w"), "w", "is missing, for 8 of 8 frames"),
+        (_head("fl_x", -1), "fl_x", "is -1, must be positive, for 8 of 8 frames"),
+        (_head("cy", "x"), "cy", "expected a number, found 'x', for 8 of 8 frames"),
+        (_head("k1", 0.1), "k1", "the images are distorted, for 8 of 8 frames"),
+        (_head("camera_model", "FISHEYE"), "camera_model", "only PINHOLE is drawn"),
+    ],
+)
+def test_a_mistake_at_the_top_level_is_told_once_and_hides_nothing(folder, edit, field, words):
+    folder.edit(edit)
+    folder.edit(_joint(5, 2.0))
+    folder.edit(_head("cx", 900))
+    (folder.root / "images/000002.png").write_bytes(b"")
+    write_ply(folder.root / "sparse.ply", type(read_points(folder))(np.zeros((0, 3)), np.zeros((0, 3))))
+    (line,) = told(folder, field)
+    assert words in line
+    assert field in [problem.field for problem in problems(folder)[:2]]  # what concerns all comes first
+    assert_found(folder, "cx", "outside the image")
+    assert_found(folder, "frames[5].instruments[0].joints.jaw_angle", "outside its limits")
+    assert_found(folder, "frames[2].file_path", "not an image file")
+    assert_found(folder, "vertex", "no points")
+    assert len(problems(folder)) == 5
+    with pytest.raises(NeecoError, match=r"transforms.json: \w+: .*for 8 of 8 frames"):
+        read_capture(folder.root)
+
+
+def read_points(folder):
+    return read_ply(folder.root / "sparse.ply")
+
+
+def test_a_number_that_some_frames_give_is_told_with_how_many_lack_it(folder):
+    folder.edit(lambda document: [frame.update(fl_x=document["fl_x"]) for frame in document["frames"][:5]])
+    folder.edit(lambda document: document.pop("fl_x"))
+    (line,) = told(folder, "fl_x")
+    assert "is missing, for 3 of 8 frames; give the camera's intrinsics at the top level or in every frame" in line
+
+
+def test_a_frame_with_a_wrong_camera_pose_is_checked_in_all_else(folder):
+    folder.edit(_frame(5, "transform_matrix", None))
+    folder.edit(_joint(5, 2.0))
+    (folder.root / "images/000005.png").write_bytes(b"")
+    fields = [problem.field for problem in problems(folder)]
+    joint = "frames[5].instruments[0].joints.jaw_angle"
+    assert sorted(fields) == ["frames[5].file_path", joint, "frames[5].transform_matrix"]
+
+
+def test_frames_whose_cameras_are_right_are_still_held_against_the_points(folder):
+    folder.edit(_frame(5, "fl_x", -1))
+    folder.edit(lambda d: d["frames"][6]["transform_matrix"][0].__setitem__(3, 1e5))
+    assert_found(folder, "frames[5].fl_x", "must be positive")
+    assert_found(folder, "frames[6].transform_matrix", "far from the points")
+
+
+def test_an_image_whose_size_nothing_states_is_told_once_when_damaged(folder):
+    folder.edit(lambda document: [document.pop(key) for key in ("w", "h")])
+    (folder.root / "images/000005.png").write_bytes(b"")
+    (line,) = told(folder, "frames[5].file_path")
+    assert "not an image file" in line

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.sfm import Progress, SfmResult, StructureFromMotion
+from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 
 POSE_HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 RECORDING = """\
@@ -184,7 +184,7 @@ def recorded(tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch) -> Rec
     made = Recorded(World(tmp_path / "rec"))
     made.write()
 
-    def run(self: StructureFromMotion, job: dict[str, Any], progress: Progress) -> SfmResult:
+    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress) -> SfmResult:
         progress("cameras: mapping", 1, 2)
         return made.reconstruct(self.names, self.job["camera_params"])
 

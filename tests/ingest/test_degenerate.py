@@ -25,7 +25,7 @@ pytest.importorskip("pycolmap")
 
 
 def silent(what: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
+    """StageProgress that nobody watches."""
 
 
 @pytest.fixture(autouse=True)

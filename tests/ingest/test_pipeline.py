@@ -31,7 +31,7 @@ HAND_EYE[:3, 3] = [12.0, -7.0, -30.0]
 
 
 def silent(what: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
+    """StageProgress that nobody watches."""
 
 
 def write_log(path: Path, times: np.ndarray, poses: np.ndarray, header: str = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz") -> None:

@@ -141,7 +141,7 @@ def test_everything_at_once(world, folder):
         ("quaternion:", "quaternions:", r"instruments\[0\]\.poses\.columns\.quaternions: unknown key; did you mean"),
         ("file: video.mp4", "file: vide.mp4", r"video\.file: no such file: 'vide\.mp4'"),
         ("fps: 50", "fps: -1", r"video\.fps: -1 is out of range; give a number above 0"),
-        ("fps: 50", "fps: fast", r"video\.fps: 'fast' is not a usable number"),
+        ("fps: 50", "fps: fast", r"video\.fps: expected a number, found 'fast'"),
         ("[290, 291, 160, 128]", "[290, 291, 160]", r"intrinsics: expected 4 numbers"),
         ("[290, 291, 160, 128]", "lens.yaml", r"intrinsics: no such file: 'lens\.yaml'"),
         ("- name: grasper", "- name:", r"instruments\[0\]\.name: missing"),

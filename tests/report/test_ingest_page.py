@@ -18,7 +18,7 @@ from PIL import Image
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.clocks import ClockOffset
-from neeco.ingest.moving import Shape
+from neeco.ingest.moving import RoughShape
 from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
@@ -32,10 +32,10 @@ VOID = {"meta", "img", "br", "path", "rect"}
 TIP_MM = 24.0
 
 
-def shaft() -> Shape:
+def shaft() -> RoughShape:
     """The sample's instrument, roughly: a rod along its z axis that comes in from behind."""
     z, x = np.meshgrid(np.arange(-40, TIP_MM + 1, 2.0), [-2.0, 0.0, 2.0])
-    return Shape(np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), 2.0, 0.8)
+    return RoughShape(np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1), 2.0, 0.8)
 
 
 def made(folder: Path, **changes) -> IngestResult:

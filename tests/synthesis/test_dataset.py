@@ -9,13 +9,13 @@ from PIL import Image
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
+from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
 from neeco.synthesis.render import render, split_views, state_views
 from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.statefile import state_to_json
 
 COUNT = 6
 SETTINGS = Settings(count=COUNT, seed=3, tissue_tolerance_mm=2.0)

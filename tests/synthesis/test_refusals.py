@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import neeco.files
+from neeco.capture.statefile import state_to_json
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.progress import counting
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.statefile import state_to_json
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, tries=3)
 

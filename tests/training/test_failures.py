@@ -128,14 +128,14 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
 def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = check.check_capture
+    real = check.inspect_capture
 
     def check_then_break(*args: object):
         problems = real(*args)
         (capture / "images/000003.png").write_bytes(b"a disk gone bad")
         return problems
 
-    monkeypatch.setattr(check, "check_capture", check_then_break)
+    monkeypatch.setattr(check, "inspect_capture", check_then_break)
     assert main(["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs"]) == 1
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1

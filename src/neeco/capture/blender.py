@@ -8,30 +8,29 @@ from pathlib import Path
 import numpy as np
 
 from neeco.capture.images import EXTENSIONS
+from neeco.capture.nodes import Node
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.points import random_points
-from neeco.capture.problems import Node, Report
-from neeco.capture.transforms import load_document, parse_frames, parse_points, parses_as_json, relative_name
+from neeco.capture.transforms import parse_frames, parse_points
 
 HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
 
 
-def is_blender_file(file: Path) -> bool:
+def is_blender(document: Node) -> bool:
     """Whether a transforms file gives the field of view instead of intrinsics, as Blender's exporters do."""
-    document = parses_as_json(file)
-    return "camera_angle_x" in document and "fl_x" not in document and "instruments" not in document
+    value = document.value
+    return "camera_angle_x" in value and "fl_x" not in value and "instruments" not in value
 
 
-def parse_blender(files: list[Path], root: Path, report: Report, background: float = 1.0) -> Parsed:
-    """Read the files of a Blender capture, one split each, named by the file; problems go to `report`.
+def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0) -> Parsed:
+    """Read the files of a Blender capture, given with their content, one split each, named by the file.
 
     Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used. Where no frame
     at all has a time nothing moves (NeRF's synthetic scenes): every frame then has time 0.
     """
     parsed = Parsed(root)
     moves = False
-    for file in files:
-        document = load_document(file, root, report)
+    for file, document in files.items():
         moves = moves or _has_times(document)
         _, _, split = file.stem.rpartition("_")
         split_name = split if split in ("train", "val", "test") else None
@@ -43,7 +42,7 @@ def parse_blender(files: list[Path], root: Path, report: Report, background: flo
         parsed.timed = True
     if parsed.points is None:
         parsed.points = random_points(np.zeros(3), HALF_SIZE)
-        parsed.points_place = Place(relative_name(files[0], root), "ply_file_path")
+        parsed.points_place = Place(next(iter(files.values())).file, "ply_file_path")
     return parsed
 
 

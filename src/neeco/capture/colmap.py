@@ -12,10 +12,9 @@ import numpy as np
 import torch
 
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
-from neeco.capture.problems import Report, shown
-from neeco.capture.transforms import TEST_EVERY, relative_name
+from neeco.capture.parsed import Parsed, Place, inside, relative_name
+from neeco.capture.problems import ProblemReport, shown
+from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
 
@@ -53,7 +52,7 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
-def parse_colmap(model: Path, root: Path, report: Report) -> Parsed:
+def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit.
 
     Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
@@ -80,7 +79,7 @@ def parse_colmap(model: Path, root: Path, report: Report) -> Parsed:
     return parsed
 
 
-def _add_points(path: Path, binary: bool, parsed: Parsed, report: Report) -> None:
+def _add_points(path: Path, binary: bool, parsed: Parsed, report: ProblemReport) -> None:
     parsed.points_place = Place(relative_name(path, parsed.root), "")
     try:
         rows = _parse(path, _points_binary if binary else _points_text)
@@ -96,7 +95,7 @@ def _add_points(path: Path, binary: bool, parsed: Parsed, report: Report) -> Non
 
 
 def _frame(
-    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: Report
+    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: ProblemReport
 ) -> Frame | None:
     intrinsics = cameras.get(image.camera_id)
     if intrinsics is None:

@@ -14,10 +14,10 @@ import torch
 
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
+from neeco.capture.nodes import Node
+from neeco.capture.parsed import Parsed, Place, inside
 from neeco.capture.points import random_points
-from neeco.capture.problems import Node, Report, shown
+from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
@@ -46,13 +46,13 @@ def is_endonerf_folder(root: Path) -> bool:
     return (root / POSES_FILE).is_file()
 
 
-def parse_endonerf(root: Path, report: Report) -> Parsed:
+def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     """Read an EndoNeRF folder; problems and what such a folder lacks go to `report`. Lengths are in its own unit.
 
     Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used;
     where the depth bounds are usable, random points fill the space between them.
     """
-    parsed = Parsed(root, timed=False, points_place=Place(POSES_FILE, "points"))
+    parsed = Parsed(root, timed=False, points_place=Place(POSES_FILE, "points"), is_endonerf=True)
     table = _load(root, report)
     if table is None:
         return parsed
@@ -76,7 +76,7 @@ def parse_endonerf(root: Path, report: Report) -> Parsed:
     return parsed
 
 
-def folder_images(root: Path, folder: str, report: Report) -> list[Path]:
+def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
     """The images in a folder of the capture, sorted by name; those that lead out of it are reported and left out."""
     if not (root / folder).is_dir():
         return []
@@ -92,7 +92,7 @@ def folder_images(root: Path, folder: str, report: Report) -> list[Path]:
     return paths
 
 
-def _load(root: Path, report: Report) -> np.ndarray | None:
+def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
     """The table [N, 17] as float64."""
     remedy = "write an array of N x 17 numbers with numpy.save"
     try:
@@ -114,7 +114,7 @@ def _load(root: Path, report: Report) -> np.ndarray | None:
     return np.array(table, dtype=np.float64)
 
 
-def _row(values: np.ndarray, field: str, report: Report) -> _Row | None:
+def _row(values: np.ndarray, field: str, report: ProblemReport) -> _Row | None:
     matrix = values[:15].reshape(3, 5)
     down, right, back, origin = (matrix[:, column] for column in range(4))
     with np.errstate(invalid="ignore"):
@@ -144,7 +144,7 @@ def _points(rows: list[_Row]) -> PointCloud | None:
     return random_points(centers.mean(axis=0), max(half_width, half_depth))
 
 
-def _say_what_is_missing(root: Path, rows: list[_Row], report: Report) -> None:
+def _say_what_is_missing(root: Path, rows: list[_Row], report: ProblemReport) -> None:
     report.warning(
         POSES_FILE, "instruments", "no instrument states", "only methods that need none can be trained, such as 3dgs"
     )

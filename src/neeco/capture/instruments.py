@@ -7,9 +7,16 @@ from collections.abc import Iterable
 import torch
 
 from neeco.capture.model import Frame, Instrument, InstrumentState
-from neeco.capture.problems import Node, shown
+from neeco.capture.nodes import Node
+from neeco.capture.problems import shown
 
 Limits = tuple[float, float] | None
+LIMIT_TOLERANCE = 1e-3  # rad (mm for sliding joints) by which rounding and noise may pass a limit
+
+
+def passes_limits(value: float, limits: Limits) -> bool:
+    """Whether a joint's value lies outside its limits by more than rounding explains."""
+    return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
 
 
 def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
@@ -27,7 +34,7 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         pose = item.child("pose").rigid()
         joints = _joints(item)
         if name is not None and name in states:
-            item.child("name").error(f"{shown(name)} is listed twice in this frame", "keep one state per instrument")
+            item.child("name").error(f"{shown(name)} comes twice here", "keep one state per instrument")
             good = False
         if name is None or pose is None or joints is None:
             good = False
@@ -86,17 +93,6 @@ def _declared_joints(item: Node) -> dict[str, Limits]:
     joints: dict[str, Limits] = {}
     for name in node.value:
         joint = node.child(name)
-        joints[name] = _limits(joint.child("limits")) if joint.value is not None and joint.is_object() else None
+        has_limits = joint.value is not None and joint.is_object() and joint.has("limits")
+        joints[name] = joint.child("limits").range("rad") if has_limits else None
     return joints
-
-
-def _limits(node: Node) -> Limits:
-    if node.value is None:
-        return None
-    values = [item.number() for item in node.items()]
-    if not isinstance(node.value, list) or any(value is None for value in values):
-        return None
-    if len(values) != 2 or not values[0] < values[1]:  # type: ignore[operator]
-        node.error(f"expected [lower, upper], found {values}", "give two numbers in rad, the lower first")
-        return None
-    return (values[0], values[1])  # type: ignore[return-value]

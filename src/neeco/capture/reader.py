@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.blender import is_blender_file, parse_blender
+from neeco.capture.blender import is_blender, parse_blender
 from neeco.capture.colmap import find_model, parse_colmap
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.model import Capture, Frame, PointCloud
-from neeco.capture.parsed import Parsed
-from neeco.capture.paths import inside
+from neeco.capture.parsed import Parsed, inside
 from neeco.capture.points import random_points
-from neeco.capture.problems import Report, errors_only
-from neeco.capture.transforms import parse_transforms
+from neeco.capture.problems import ProblemReport, errors_only
+from neeco.capture.transforms import load_document, parse_transforms
 from neeco.errors import NeecoError
 
 UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
@@ -29,17 +28,22 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
     background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
     Raises NeecoError with the first problem found; `check_capture` tells all of them.
     """
-    report = Report()
+    report = ProblemReport()
     parsed = parse_capture(path, report, transforms, background)
     if not parsed.frames and not errors_only(report.problems):
         report.error(transforms, "frames", "no frame could be read", "run `neeco check` on the capture")
     report.raise_first(parsed.root)
+    return capture_of(parsed)
+
+
+def capture_of(parsed: Parsed) -> Capture:
+    """What was read without an error, as a capture."""
     points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
     return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed)
 
 
 def parse_capture(
-    path: Path | str, report: Report, transforms: str = "transforms.json", background: float = 1.0
+    path: Path | str, report: ProblemReport, transforms: str = "transforms.json", background: float = 1.0
 ) -> Parsed:
     """Read as much of a capture as can be read; what is wrong with it goes to `report`."""
     path = Path(path)
@@ -54,14 +58,15 @@ def parse_capture(
         report.error(transforms, "", *str(error).split("; ", 1))
         return Parsed(path)
     if file.is_file():
-        if is_blender_file(file):
-            return parse_blender([file], path, report, background)
-        return parse_transforms(file, path, report, background)
+        document = load_document(file, path, report)
+        if is_blender(document):
+            return parse_blender({file: document}, path, background)
+        return parse_transforms(document, file.parent, path, background)
     if transforms != "transforms.json":
         report.error(transforms, "", "no such file", "name a transforms file of the capture")
         return Parsed(path)
     if blender_files := [file for file in _blender_files(path) if file.is_file()]:
-        return parse_blender(blender_files, path, report, background)
+        return parse_blender({file: load_document(file, path, report) for file in blender_files}, path, background)
     if (model := find_model(path)) is not None:
         return parse_colmap(model, path, report)
     if is_endonerf_folder(path):

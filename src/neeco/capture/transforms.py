@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,30 +14,23 @@ import torch
 from neeco.capture.images import image_size
 from neeco.capture.instruments import declared_instruments, parse_instruments, seen_instruments
 from neeco.capture.model import Frame, State
-from neeco.capture.parsed import Parsed, Place
-from neeco.capture.paths import inside
+from neeco.capture.nodes import Node
+from neeco.capture.parsed import Parsed, Place, inside, relative_name
 from neeco.capture.points import read_ply
-from neeco.capture.problems import Node, Report, shown
+from neeco.capture.poses import swap_camera_axes
+from neeco.capture.problems import ProblemReport, shown
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.raster.types import Camera
 
 SCHEMA = "neeco-capture/1"
+LARGEST_SIZE = 65_535  # px
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
 
 
-def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
-    """Turn a camera pose [4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or back.
-
-    The only place where the two conventions meet.
-    """
-    return world_from_camera * _FLIP_YZ
-
-
-def load_document(file: Path, root: Path, report: Report) -> Node:
+def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
     name = relative_name(file, root)
     try:
@@ -52,18 +45,13 @@ def load_document(file: Path, root: Path, report: Report) -> Node:
     return node if node.is_object() else Node({}, name, "", report)
 
 
-def relative_name(file: Path, root: Path) -> str:
-    """How messages call a file of the capture."""
-    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
-
-
-def parse_transforms(file: Path, root: Path, report: Report, background: float = 1.0) -> Parsed:
-    """Read one transforms file of the capture at `root`; problems go to `report`. Relative paths start at the file."""
-    document = load_document(file, root, report)
+def parse_transforms(document: Node, folder: Path, root: Path, background: float = 1.0) -> Parsed:
+    """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
+    file."""
     parsed = Parsed(root)
     parse_header(document, parsed)
-    parse_frames(document, file.parent, parsed, background=background)
-    parse_points(document, file.parent, parsed)
+    parse_frames(document, folder, parsed, background=background)
+    parse_points(document, folder, parsed)
     parsed.instruments = seen_instruments(parsed.frames, declared_instruments(document))
     return parsed
 
@@ -80,6 +68,7 @@ def parse_header(document: Node, parsed: Parsed) -> None:
     if registration not in ("world", "unregistered"):
         document.child("instrument_frame").error(f"is {shown(registration)}", "write 'world' or 'unregistered'")
     parsed.registered = registration != "unregistered"
+    parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA
 
 
 def parse_frames(
@@ -96,11 +85,11 @@ def parse_frames(
     if nodes.value is None:
         nodes.error("is missing", "list the images and their cameras there")
         return
-    splits = _Splits(document, split)
-    timed = 0
     if not isinstance(nodes.value, list):
         nodes.error(f"expected a list, found {shown(nodes.value)}")
         return
+    splits, shared = _Splits(document, split), _Shared(document, nodes.value)
+    timed = 0
     for index, node in enumerate(nodes.items()):
         if not node.is_object():
             continue
@@ -111,14 +100,21 @@ def parse_frames(
         time = node.child("time").number() if node.has("time") else float(index)
         timed += node.has("time")
         instruments = parse_instruments(node)
-        if image_path is None or name is None or pose is None or time is None or instruments is None:
+        if image_path is None:
             continue
-        camera = _camera(node, document, pose, image_path)
-        if camera is None:
+        camera = _camera(node, shared, image_path)
+        if name is None or time is None or instruments is None:
             continue
+        if pose is None or camera is None:
+            parsed.without_camera.add(len(parsed.frames))
+        camera = camera or _stand_in(image_path)
+        if pose is not None:
+            opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
+            camera = replace(camera, world_from_camera=opencv)
         state = State(instruments, time)
         parsed.frames.append(Frame(image_path, camera, state, name, mask_path, background))
         parsed.places.append(Place(node.file, node.field))
+    shared.tell()
     if nodes.value == []:
         nodes.error("is empty", "list the images and their cameras there")
     elif timed < len(nodes.value):
@@ -215,22 +211,51 @@ def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()
     return None
 
 
-def _camera(frame: Node, document: Node, pose: np.ndarray, image_path: Path) -> Camera | None:
-    """The frame's pinhole camera, intrinsics from the frame or else from the top level. `pose` has OpenGL axes."""
-    numbers = _Intrinsics(frame, document)
-    if not numbers.is_pinhole():
-        return None
+class _Shared(ProblemReport):
+    """What is wrong with the camera at the file's top level: told once, with how many frames it concerns.
+
+    A number that neither a frame nor the top level gives counts as the top level's.
+    """
+
+    def __init__(self, document: Node, frames: list[Any]) -> None:
+        super().__init__()
+        self.document = Node(document.value, document.file, document.field, self)
+        self.report, self.first, self.frames = document.report, len(document.report.problems), frames
+
+    def tell(self) -> None:
+        """Pass the problems on, each once, before those of the frames."""
+        told = []
+        for problem, count in Counter(self.problems).items():
+            concerned = "" if len(self.frames) == 1 else f", for {count} of {len(self.frames)} frames"
+            told.append(replace(problem, message=problem.message + concerned))
+        self.report.problems[self.first : self.first] = told
+
+
+def _camera(frame: Node, shared: _Shared, image_path: Path) -> Camera | None:
+    """The frame's pinhole camera at the origin, intrinsics from the frame or else from the top level."""
+    numbers = _Intrinsics(frame, shared.document)
+    is_pinhole = numbers.is_pinhole()
     size = numbers.size(image_path)
-    if size is None:
-        return None
-    width, height = size
+    width, height = size or _stand_in_size(image_path)
     fx = numbers.focal("fl_x", "camera_angle_x", width)
     fy = numbers.focal("fl_y", "camera_angle_y", height) if numbers.has("fl_y", "camera_angle_y") else fx
     cx, cy = numbers.center("cx", width), numbers.center("cy", height)
-    if fx is None or fy is None or cx is None or cy is None:
+    if size is None or fx is None or fy is None or cx is None or cy is None or not is_pinhole:
         return None
-    world_from_camera = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
-    return Camera(world_from_camera, fx, fy, cx, cy, width, height)
+    return Camera(torch.eye(4), fx, fy, cx, cy, width, height)
+
+
+def _stand_in(image_path: Path) -> Camera:
+    """A camera of the image's size, where the frame's own is wrong: images and states can still be checked."""
+    width, height = _stand_in_size(image_path)
+    return Camera(torch.eye(4), width, width, width / 2, height / 2, width, height)
+
+
+def _stand_in_size(image_path: Path) -> tuple[int, int]:
+    try:
+        return image_size(image_path)
+    except NeecoError:  # told when the images are checked
+        return LARGEST_SIZE, LARGEST_SIZE
 
 
 class _Intrinsics:
@@ -243,7 +268,7 @@ class _Intrinsics:
         return any(self.frame.has(key) or self.document.has(key) for key in keys)
 
     def node(self, key: str) -> Node:
-        return (self.frame if self.frame.has(key) or not self.document.has(key) else self.document).child(key)
+        return (self.frame if self.frame.has(key) else self.document).child(key)
 
     def is_pinhole(self) -> bool:
         """False (and reported) for distorted images: undistorting belongs before the capture."""
@@ -275,7 +300,7 @@ class _Intrinsics:
         width, height = (self._positive(key) for key in ("w", "h"))
         if width is None or height is None:
             return None
-        if width % 1 or height % 1 or max(width, height) > 65_535:
+        if width % 1 or height % 1 or max(width, height) > LARGEST_SIZE:
             self.node("w").error(f"image size {width:g} x {height:g} is not usable", "write whole numbers of pixels")
             return None
         return int(width), int(height)
@@ -310,12 +335,3 @@ class _Intrinsics:
             node.error(f"is {value:g}, must be positive")
             return None
         return value
-
-
-def parses_as_json(file: Path) -> dict[str, Any]:
-    """The JSON object in a file, {} when there is none; for deciding what a file is, without reporting."""
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}

@@ -13,7 +13,8 @@ import torch
 from neeco.capture.images import has_alpha, write_image
 from neeco.capture.model import Capture, Frame
 from neeco.capture.points import write_ply
-from neeco.capture.transforms import SCHEMA, swap_camera_axes
+from neeco.capture.poses import swap_camera_axes
+from neeco.capture.transforms import SCHEMA
 from neeco.errors import NeecoError
 from neeco.files import write_atomically, write_json
 

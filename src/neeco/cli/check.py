@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from neeco.capture.check import Problem, Summary
+    from neeco.capture.check import CaptureSummary, Problem
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ def run(arguments: Arguments) -> int:
     """Print the problems of a capture; 1 when there are errors, else 0."""
     from neeco.capture.check import errors_only, inspect_capture
 
-    problems, summary = inspect_capture(arguments.capture, arguments.transforms)
+    checked = inspect_capture(arguments.capture, arguments.transforms)
+    problems, summary = checked.problems, checked.summary
     errors = len(errors_only(problems))
     if arguments.json:
         report = {"capture": str(arguments.capture), "errors": errors, "warnings": len(problems) - errors}
@@ -42,7 +43,7 @@ def run(arguments: Arguments) -> int:
     return 1 if errors else 0
 
 
-def _print(problems: list[Problem], errors: int, summary: Summary) -> None:
+def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> None:
     console = Console(soft_wrap=True, highlight=False)
     for problem in problems:
         style = "bold red" if problem.severity == "error" else "yellow"
@@ -56,7 +57,7 @@ def _print(problems: list[Problem], errors: int, summary: Summary) -> None:
         console.print(Text(line))
 
 
-def _summary_lines(summary: Summary) -> list[str]:
+def _summary_lines(summary: CaptureSummary) -> list[str]:
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
     for name, travel in summary.travel_mm.items():

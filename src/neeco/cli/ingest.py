@@ -127,8 +127,7 @@ def _recording(args: Ingest) -> Recording:
 
 
 def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
-    from neeco.capture import check_capture
-    from neeco.capture.check import errors_only
+    from neeco.capture.check import errors_only, inspect_capture
     from neeco.ingest.pipeline import ingest
     from neeco.report.ingest_page import write_ingest_page
 
@@ -149,15 +148,15 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
         report("writing the page", 0, 0)
-        write_ingest_page(result, output / PAGE)
+        checked = inspect_capture(output)
+        write_ingest_page(result, output / PAGE, checked.capture)
     if as_json:
         print(json.dumps(result.as_json(), indent=2))
         return 0
     _print(result)
-    problems = check_capture(output)
-    for problem in errors_only(problems):
+    for problem in errors_only(checked.problems):
         print(f"wrong: {problem}")
-    print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
+    print(f"capture: {output}  ({len(checked.problems)} remarks by `neeco check`)")
     print(f"how good it is: {output / PAGE}")
     return 0
 

@@ -11,14 +11,12 @@ from pathlib import Path
 
 import torch
 
-from neeco.capture.colmap import find_model
-from neeco.capture.endonerf import MASKS, folder_images, is_endonerf_folder
+from neeco.capture.endonerf import MASKS, folder_images
 from neeco.capture.images import read_mask, write_labels
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Frame
 from neeco.capture.parsed import Parsed
-from neeco.capture.problems import Problem, Report
-from neeco.capture.reader import parse_capture, stand_in_points
-from neeco.capture.transforms import SCHEMA, parses_as_json
+from neeco.capture.problems import Problem, ProblemReport
+from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 
@@ -33,13 +31,12 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     folder, output = Path(folder), Path(output)
     if os.path.lexists(output) and not _is_empty_folder(output):
         raise NeecoError(f"{output}: exists already; choose another --output or remove it")
-    report = Report()
+    report = ProblemReport()
     parsed = parse_capture(folder, report)
     if not parsed.frames and not report.problems:
         report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
-    tool_masks = _tool_masks(parsed, report) if _is_endonerf(folder) else []
+    tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
     report.raise_first(folder)
-    points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}."))
@@ -47,30 +44,21 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         raise NeecoError(f"{output}: cannot write here: {error.strerror or error}") from error
     try:
         frames = _with_tool_masks(parsed.frames, tool_masks, work / "tool")
-        capture = Capture(parsed.root, tuple(frames), parsed.instruments, points, parsed.registered)
-        write_capture(capture, work / "capture")
+        write_capture(replace(capture_of(parsed), frames=tuple(frames)), work / "capture")
         os.chmod(work / "capture", 0o755)
         os.replace(work / "capture", output)
     except OSError as error:
         raise NeecoError(f"{output}: cannot write: {error.strerror or error}") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return (*_lacking(parsed, folder, masked=bool(tool_masks)), *_warnings(report))
+    return (*_lacking(parsed, masked=bool(tool_masks)), *_warnings(report))
 
 
 def _is_empty_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink() and not any(path.iterdir())
 
 
-def _is_endonerf(folder: Path) -> bool:
-    """Whether the reader takes this folder as EndoNeRF's: the other formats come first."""
-    if not is_endonerf_folder(folder) or find_model(folder) is not None:
-        return False
-    names = ("transforms.json", *(f"transforms_{split}.json" for split in ("train", "val", "test")))
-    return not any((folder / name).is_file() for name in names)
-
-
-def _tool_masks(parsed: Parsed, report: Report) -> list[Path]:
+def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
     """Each frame's tool mask, in the order of the sorted names; [] where there are none."""
     paths = folder_images(parsed.root, MASKS, report)
     if paths and len(paths) != len(parsed.frames):
@@ -92,7 +80,7 @@ def _with_tool_masks(frames: list[Frame], tool_masks: list[Path], work: Path) ->
     return masked
 
 
-def _lacking(parsed: Parsed, folder: Path, *, masked: bool) -> list[str]:
+def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
     """What the capture lacks, and what that costs."""
     sentences = []
     if not parsed.instruments:
@@ -105,7 +93,7 @@ def _lacking(parsed: Parsed, folder: Path, *, masked: bool) -> list[str]:
             sentences.append(f"{instrument.name} has no joint readings: its jaws can only move with its pose.")
     if parsed.instruments and not parsed.registered:
         sentences.append("Instrument poses stay in their own frame (instrument_frame: unregistered), not the cameras'.")
-    if not _says_units(folder):
+    if not parsed.says_units:
         sentences.append(
             "The source names no unit of length: numbers are kept and read as mm, so lengths may be off by one factor."
         )
@@ -121,13 +109,7 @@ def _lacking(parsed: Parsed, folder: Path, *, masked: bool) -> list[str]:
     return sentences
 
 
-def _says_units(folder: Path) -> bool:
-    file = folder if folder.is_file() else folder / "transforms.json"
-    document = parses_as_json(file)
-    return document.get("units") is not None or document.get("schema") == SCHEMA
-
-
-def _warnings(report: Report) -> list[str]:
+def _warnings(report: ProblemReport) -> list[str]:
     """The reader's warnings, without those that `_lacking` says or that converting settles."""
     said = {"instruments", "units"}
 

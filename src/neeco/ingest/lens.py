@@ -10,18 +10,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
+from neeco.capture.nodes import as_float
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.requirements import optional_module
+from neeco.raster.types import Camera
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
+LARGEST = 1e9  # of any of a lens's numbers
 COUNTS = (0, 4, 5, 8, 12, 14)  # distortion coefficients that OpenCV's model comes with
 
 
@@ -40,6 +44,17 @@ class Lens:
     @property
     def distorted(self) -> bool:
         return any(self.distortion)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fl_x, fl_y, cx, cy."""
+        return self.fl_x, self.fl_y, self.cx, self.cy
+
+    def camera(self, world_from_camera: np.ndarray) -> Camera:
+        """A pinhole's camera at a pose [4, 4] with OpenCV axes."""
+        assert self.size is not None
+        assert not self.distorted
+        return Camera(torch.from_numpy(world_from_camera.copy()), *self.intrinsics, *self.size)
 
     def check_size(self, size: tuple[int, int], source: object) -> None:
         """Raise NeecoError when measured on images of another size than (width, height). source: named in it."""
@@ -173,8 +188,8 @@ def _opencv(path: Path, document: Any) -> Lens:
 def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int] | None) -> Lens:
     for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
         for value in given:
-            ok = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
-            if not ok:  # NaN compares false
+            number = as_float(value)
+            if number is None or not abs(number) < LARGEST:  # NaN compares false
                 raise NeecoError(f"{source}: {field}: {shown(value)} is not a usable number; calibrate again")
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")

@@ -15,8 +15,10 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import binary_dilation
 from scipy.spatial import QhullError
 
+from neeco.ingest.lens import Lens
 from neeco.ingest.requirements import optional_module
-from neeco.ingest.sfm import Pinhole, SfmResult
+from neeco.ingest.sfm import SfmResult
+from neeco.raster.pinhole import project, project_world
 
 STEP = 4  # px between the places where flow is compared
 NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
@@ -27,10 +29,12 @@ CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid
 COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
 MARGIN = 6  # px about its projection
+NEAREST = 1e-3  # mm; what is less deep is not in front of the camera
+TINY = 1e-9  # depth in SfM's unit that may be divided by
 
 
 @dataclass(frozen=True)
-class Shape:
+class RoughShape:
     """Points [K, 3] mm of an instrument in its tracked frame, the grid's spacing mm, and how often the images agree."""
 
     points: np.ndarray
@@ -38,7 +42,7 @@ class Shape:
     agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
 
 
-def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pinhole, rows: np.ndarray) -> np.ndarray:
+def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens, rows: np.ndarray) -> np.ndarray:
     """[R, h, w] share of neighbours, at every STEP-th pixel, against which the pixel moved otherwise than tissue would.
 
     load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted.
@@ -60,7 +64,7 @@ def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pi
     return evidence
 
 
-def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Pinhole) -> np.ndarray:
+def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> np.ndarray:
     """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
     cv2 = optional_module("cv2")
     estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
@@ -79,7 +83,7 @@ def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: P
     return motion
 
 
-def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Pinhole) -> Shape | None:
+def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
     """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
 
     evidence [R, h, w] from `moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
@@ -102,11 +106,11 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     if best < 2 * background or best < 0.3:
         return None
     belongs = share > max(COVERED * best, 2 * background)
-    return Shape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
+    return RoughShape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
 
 
 def project_mask(
-    shape: Shape, camera_from_instrument: np.ndarray, pinhole: Pinhole, size: tuple[int, int]
+    shape: RoughShape, camera_from_instrument: np.ndarray, pinhole: Lens, size: tuple[int, int]
 ) -> np.ndarray:
     """[H, W] bool: pixels the shape may cover in a frame of `size` (width, height), with a margin."""
     width, height = size
@@ -120,34 +124,21 @@ def project_mask(
     return np.kron(mask, np.ones((STEP, STEP), dtype=bool))[:height, :width]
 
 
-def project_points(
-    points: np.ndarray, world_from_camera: np.ndarray, pinhole: Pinhole
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [K, 2] and depths [K] of points [K, 3]."""
-    camera = (points - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
-    z = np.where(np.abs(camera[:, 2]) < 1e-9, 1e-9, camera[:, 2])
-    pixels = camera[:, :2] / z[:, None] * [pinhole.fl_x, pinhole.fl_y] + [pinhole.cx, pinhole.cy]
-    return pixels, camera[:, 2]
-
-
 def _project(
-    points: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Pinhole, shape: tuple[int, ...]
+    points: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Column, row and insideness [K] of points on the STEP-spaced raster of `shape` (rows, columns)."""
     camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
-    z = np.maximum(camera[:, 2], 1e-6)
-    x = np.floor((pinhole.fl_x * camera[:, 0] / z + pinhole.cx) / STEP)
-    y = np.floor((pinhole.fl_y * camera[:, 1] / z + pinhole.cy) / STEP)
-    inside = (camera[:, 2] > 1e-3) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    x, y = (np.floor(place / STEP) for place in project(camera, *pinhole.intrinsics, nearest=NEAREST))
+    inside = (camera[:, 2] > NEAREST) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
 
 
-def _still_depth(sfm: SfmResult, row: int, pinhole: Pinhole, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _still_depth(sfm: SfmResult, row: int, pinhole: Lens, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """[h, w] depth of the still scene at pixels u, v: between the points this frame sees, nearest beyond them."""
     seen = sfm.observations[:, 0] == row
-    spots, depth = project_points(
-        sfm.points[sfm.observations[seen, 1].astype(int)], sfm.world_from_camera[row], pinhole
-    )
+    points = sfm.points[sfm.observations[seen, 1].astype(int)]
+    spots, depth = project_world(points, pinhole.camera(sfm.world_from_camera[row]), nearest=TINY)
     near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
     keep = (depth > 0.3 * near) & (depth < 3 * near)
     spots, inverse = spots[keep], 1 / depth[keep]
@@ -166,7 +157,7 @@ def _still_flow(
     world_from_first: np.ndarray,
     world_from_second: np.ndarray,
     depth: np.ndarray,
-    pinhole: Pinhole,
+    pinhole: Lens,
     u: np.ndarray,
     v: np.ndarray,
 ) -> np.ndarray:
@@ -176,6 +167,5 @@ def _still_flow(
     )
     relative = np.linalg.inv(world_from_second) @ world_from_first
     moved = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
-    z = np.maximum(moved[..., 2], 1e-9)
-    x, y = pinhole.fl_x * moved[..., 0] / z + pinhole.cx, pinhole.fl_y * moved[..., 1] / z + pinhole.cy
+    x, y = project(moved, *pinhole.intrinsics, nearest=TINY)
     return np.stack([x - u - 0.5, y - v - 0.5], -1)

@@ -21,20 +21,12 @@ from neeco.files import new_folder
 from neeco.ingest.border import SAMPLES, visible_mask
 from neeco.ingest.clocks import offset_from_instrument
 from neeco.ingest.lens import Lens, read_lens
-from neeco.ingest.moving import (
-    FRAMES,
-    Shape,
-    carve_shape,
-    motion_between,
-    moving_pixels,
-    project_mask,
-    project_points,
-)
+from neeco.ingest.moving import FRAMES, RoughShape, carve_shape, motion_between, moving_pixels, project_mask
 from neeco.ingest.recording import FEWEST_FRAMES, Recording, Splits
 from neeco.ingest.registration import Registration, register_with_laparoscope
 from neeco.ingest.result import IngestResult
 from neeco.ingest.select import choose_frames, look_over
-from neeco.ingest.sfm import Pinhole, Progress, SfmResult, StructureFromMotion
+from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.splits import LEFT_OUT, Assigned, assign_splits
 from neeco.ingest.work import (
     States,
@@ -47,13 +39,13 @@ from neeco.ingest.work import (
     states_at,
     states_for_choice,
 )
-from neeco.raster.types import Camera
+from neeco.raster.pinhole import project_world
 
 MOST_FRAMES = 400  # kept unless the recording asks for another number
 SCENE_MM = 100.0  # from the cameras to the tissue, taken when nothing measures it
 
 
-def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResult:
+def ingest(recording: Recording, output: Path, progress: StageProgress) -> IngestResult:
     """Make the capture `output` from a recording and say how good it is.
 
     Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and
@@ -70,19 +62,18 @@ def ingest(recording: Recording, output: Path, progress: Progress) -> IngestResu
         sfm_folder = folder / "sfm"
         sfm_folder.mkdir()
         visible = _visible(work, kept, lens, names)
-        pinhole = _pinhole(lens, work.video.size)
+        pinhole = lens.pinhole(work.video.size) if lens else None
         motion = StructureFromMotion(sfm_folder, work.video.path, folder / "raw", names, pinhole, visible)
         sfm = motion.reconstruct(progress)
         if pinhole is None:
             fl_x, fl_y, cx, cy, *distortion = (float(value) for value in sfm.camera_params)
             lens = Lens(fl_x, fl_y, cx, cy, tuple(distortion))
-            pinhole = _pinhole(lens, work.video.size)
+            pinhole = lens.pinhole(work.video.size)
             work.notes.append(
                 f"intrinsics were estimated by structure from motion (focal lengths {lens.fl_x:.1f} x {lens.fl_y:.1f} "
                 "px); a calibration is better"
             )
             _write_images(work, kept, lens)
-        assert pinhole is not None
         registration = _register(work, kept, sfm)
         _clocks_from_instruments(work, kept, motion, sfm, pinhole)
         doubtful, shapes = _on_instruments(work, kept, motion, sfm, pinhole, registration)
@@ -178,13 +169,6 @@ def _visible(work: Work, kept: np.ndarray, lens: Lens | None, names: list[str]) 
     return folder
 
 
-def _pinhole(lens: Lens | None, size: tuple[int, int]) -> Pinhole | None:
-    if lens is None:
-        return None
-    straight = lens.pinhole(size)
-    return Pinhole(straight.fl_x, straight.fl_y, straight.cx, straight.cy)
-
-
 def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | None:
     """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
     scope = work.logs.scope
@@ -219,7 +203,7 @@ def _loader(work: Work, motion: StructureFromMotion, sfm: SfmResult) -> Callable
 
 
 def _clocks_from_instruments(
-    work: Work, kept: np.ndarray, motion: StructureFromMotion, sfm: SfmResult, pinhole: Pinhole
+    work: Work, kept: np.ndarray, motion: StructureFromMotion, sfm: SfmResult, pinhole: Lens
 ) -> None:
     """Clocks that neither `sync` nor the scope told: from how the instruments move in the images."""
     unknown = {log.clock: log for log in work.logs.poses.values() if log.clock not in work.clocks}
@@ -239,9 +223,9 @@ def _on_instruments(
     kept: np.ndarray,
     motion: StructureFromMotion,
     sfm: SfmResult,
-    pinhole: Pinhole,
+    pinhole: Lens,
     registration: Registration | None,
-) -> tuple[np.ndarray, dict[str, Shape]]:
+) -> tuple[np.ndarray, dict[str, RoughShape]]:
     """bool [Q]: observations on an instrument, whose rough shape is carved from what moves with its pose."""
     doubtful = np.zeros(len(sfm.observations), dtype=bool)
     if registration is None:
@@ -267,13 +251,13 @@ def _on_instruments(
 
 
 def _observations_on(
-    shape: Shape,
+    shape: RoughShape,
     sfm: SfmResult,
     cameras: np.ndarray,
     camera_from_instrument: np.ndarray,
     valid: np.ndarray,
     registration: Registration,
-    pinhole: Pinhole,
+    pinhole: Lens,
     work: Work,
 ) -> np.ndarray:
     """bool [Q]: observations that lie on the projected shape."""
@@ -283,7 +267,8 @@ def _observations_on(
     for row in np.flatnonzero(valid):
         mine = np.flatnonzero(sfm.observations[:, 0] == row)
         mask = project_mask(shape, camera_from_instrument[row], pinhole, (width, height))
-        spots, _ = project_points(points[sfm.observations[mine, 1].astype(int)], cameras[row], pinhole)
+        camera = pinhole.camera(cameras[row])
+        spots, _ = project_world(points[sfm.observations[mine, 1].astype(int)], camera, nearest=camera.near)
         x = np.clip(spots[:, 0].astype(int), 0, width - 1)
         y = np.clip(spots[:, 1].astype(int), 0, height - 1)
         on[mine] = mask[y, x]
@@ -295,9 +280,9 @@ def _finish(
     output: Path,
     kept: np.ndarray,
     sfm: SfmResult,
-    pinhole: Pinhole,
+    pinhole: Lens,
     registration: Registration | None,
-    shapes: dict[str, Shape],
+    shapes: dict[str, RoughShape],
     visible: Path | None,
 ) -> IngestResult:
     """States at every frame's time, splits, and the capture on disk."""
@@ -313,11 +298,10 @@ def _finish(
     chosen = usable & (np.array(rule.names) != LEFT_OUT)
     for frame in frames[usable & ~chosen]:
         work.dropped[int(frame)] = "beside an unseen frame"
-    optics = (pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy)
     capture_frames = tuple(
         Frame(
             work.folder / "raw" / f"{frames[i]:06d}.png",
-            Camera(torch.from_numpy(cameras[i].copy()), *optics, *work.video.size),
+            pinhole.camera(cameras[i]),
             state_of(states, int(i), float(times[i])),
             rule.names[i],
             visible / f"{frames[i]:06d}.png.png" if visible else None,

@@ -9,11 +9,12 @@ from typing import Any
 
 import yaml
 
+from neeco.capture.nodes import as_float
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.sections import Section, close_match, joint_columns, pose_columns
+from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, pose_columns
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 TRACKER_CLOCK = "em"
@@ -207,7 +208,8 @@ def _intrinsics(top: Section) -> Path | tuple[float, float, float, float] | None
     value = top.value.get("intrinsics")
     if value is None or isinstance(value, str):
         return top.path("intrinsics")
-    numbers = top.numbers("intrinsics", 4, "fl_x, fl_y, cx, cy in pixels, or a calibration file")
+    numbers = top.node.child("intrinsics").numbers(4, "fl_x, fl_y, cx, cy in pixels, or a calibration file")
+    assert numbers is not None
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
@@ -275,12 +277,13 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
     for (group, key), number in entries.items():
         place = f"{group}.{key}" if group else str(key)
         clock = _clock_of(source, place, str(key).removesuffix(_SUFFIX), clocks)
-        if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) < 1e12:
+        seconds = as_float(number)
+        if seconds is None or not abs(seconds) < LARGEST:
             raise source.error(place, f"{shown(number)} is not an offset in seconds; t_log = t_video + offset")
         if clock is None:
             notes.append(f"{source.file.name}: {shown(place)} belongs to no log of this recording; ignored")
         else:
-            offsets[clock] = float(number)
+            offsets[clock] = seconds
     return offsets, tuple(notes)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.clocks import ClockOffset
-from neeco.ingest.moving import Shape
+from neeco.ingest.moving import RoughShape
 from neeco.ingest.registration import Registration
 
 
@@ -30,7 +30,7 @@ class IngestResult:
     registered_frames: np.ndarray  # [R] row of `kept` of each entry of `registration.used`; -1: not in the capture
     reprojection_px: float | None  # None: cameras were not found by SfM
     points: int
-    shapes: dict[str, Shape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
+    shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
 

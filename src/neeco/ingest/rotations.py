@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.poses import rotation_error
 from neeco.ingest.columns import EULER, MATRIX, QUATERNION_WXYZ, QUATERNION_XYZW, ROTATION_MATRIX
 
 NORM_TOLERANCE = 0.02  # of a quaternion's length: two decimals pass
-RIGID_TOLERANCE = 0.02  # of R^T R - I
+ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals, and the rows become exact rotations here
 
 
 def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -29,8 +30,8 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
     if form in (ROTATION_MATRIX, MATRIX):
         matrices = cells.reshape(-1, 3, 3)
         with np.errstate(all="ignore"):
-            off = np.abs(np.swapaxes(matrices, 1, 2) @ matrices - np.eye(3)).max(axis=(1, 2))
-            good = finite & (off <= RIGID_TOLERANCE) & (np.linalg.det(np.where(finite[:, None, None], matrices, 0)) > 0)
+            good = finite & (rotation_error(matrices) <= ROUNDED_TOLERANCE)
+            good &= np.linalg.det(np.where(finite[:, None, None], matrices, 0)) > 0
         rotations = Rotation.from_matrix(matrices[good]) if good.any() else None
     else:
         # beyond this, angles are something else (or the sine of them is noise)

@@ -8,20 +8,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from neeco.capture.problems import shown
+from neeco.capture.nodes import Node
+from neeco.capture.problems import Refusal, shown
 from neeco.errors import NeecoError
-from neeco.ingest.columns import (
-    EULER,
-    FORMS,
-    MATRIX,
-    JointColumns,
-    PoseColumns,
-    Units,
-    quaternion_form,
-)
+from neeco.ingest.columns import EULER, FORMS, MATRIX, JointColumns, PoseColumns, Units, quaternion_form
 from neeco.ingest.units import KINDS, canonical_unit
 
 _EULER = re.compile(r"^(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})$")  # no axis twice in a row
+LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
 
 
 def close_match(name: str, names: Iterable[str]) -> str | None:
@@ -31,15 +25,14 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
 
 
 class Section:
-    """A mapping in a file. Raises NeecoError when it is none or has keys other than `keys`."""
+    """A mapping in a file: what is absent reads as None, what is wrong raises NeecoError, as keys other than `keys`
+    do."""
 
     def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...]) -> None:
         self.file, self.place = file, place
+        self.node = Node(value, str(file), place, Refusal())
         if not isinstance(value, dict):
-            where = f"{file}: {place}" if place else str(file)
-            raise NeecoError(
-                f"{where}: expected keys such as `{keys[0]}:`, found {shown(value)}; write them as key: value"
-            )
+            self.node.error(f"expected keys such as `{keys[0]}:`, found {shown(value)}", "write them as key: value")
         self.value: dict[str, Any] = value
         for key in value:
             if key not in keys:
@@ -52,14 +45,15 @@ class Section:
         return NeecoError(" ".join(f"{self.file}: {place}: {message}".split()))
 
     def text(self, key: str, required: bool = False) -> str | None:
-        value = self.value.get(key)
-        if value is None and not required:
+        """A name; YAML makes whole numbers of some."""
+        if not self.node.has(key):
+            if required:
+                raise self.error(key, "missing; give it")
             return None
-        if value is None:
-            raise self.error(key, "missing; give it")
-        if isinstance(value, bool) or not isinstance(value, str | int) or not str(value).strip():
-            raise self.error(key, f"expected a name, found {shown(value)}; put it in quotes if it is one")
-        return str(value)
+        value = self.value[key]
+        if isinstance(value, int) and not isinstance(value, bool):
+            return str(value)
+        return self.node.child(key).text("put it in quotes if it is a name")
 
     def path(self, key: str, required: bool = False) -> Path | None:
         """An existing file or folder, relative to this file."""
@@ -76,36 +70,16 @@ class Section:
         return path
 
     def number(
-        self, key: str, above: float | None = None, least: float | None = None, below: float | None = None
+        self, key: str, above: float | None = None, least: float | None = None, below: float = LARGEST
     ) -> float | None:
-        value = self.value.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-            raise self.error(key, f"{shown(value)} is not a usable number; correct it")
-        wrong = []
-        wrong += [f"above {above:g}"] if above is not None and value <= above else []
-        wrong += [f"{least:g} or more"] if least is not None and value < least else []
-        wrong += [f"below {below:g}"] if below is not None and value >= below else []
-        if wrong:
-            raise self.error(key, f"{value:g} is out of range; give a number {wrong[0]}")
-        return float(value)
+        return self.node.child(key).number(above, least, below) if self.node.has(key) else None
 
     def integer(self, key: str, least: int) -> int | None:
-        value = self.number(key)
-        if value is not None and (value != int(value) or value < least):
-            raise self.error(key, f"{value:g} is out of range; give a whole number, {least} or more")
-        return None if value is None else int(value)
+        return self.node.child(key).integer(least) if self.node.has(key) else None
 
-    def numbers(self, key: str, count: int, what: str) -> list[float]:
-        value = self.value.get(key)
-        good = isinstance(value, list) and len(value) == count
-        good = good and all(
-            isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e12 for x in value or ()
-        )
-        if not good:
-            raise self.error(key, f"expected {count} numbers ({what}), found {shown(value)}; correct it")
-        return [float(x) for x in value or ()]
+    def range(self, key: str, unit: str) -> tuple[float, float] | None:
+        """Least and greatest of something."""
+        return self.node.child(key).range(unit) if self.node.has(key) else None
 
     def names(self, key: str, counts: tuple[int, ...]) -> tuple[str, ...] | None:
         """Names of columns, as a list or, for one, alone."""
@@ -120,13 +94,6 @@ class Section:
         if len({str(item) for item in items}) < len(items):
             raise self.error(key, "names a column twice; list different columns")
         return tuple(str(item) for item in items)
-
-    def range(self, key: str, unit: str) -> tuple[float, float]:
-        """Least and greatest of something."""
-        low, high = self.numbers(key, 2, f"least and greatest, {unit}")
-        if low >= high:
-            raise self.error(key, f"{low:g} is not below {high:g}; give the least first, in {unit}")
-        return low, high
 
     def ranges(self, key: str) -> tuple[tuple[int, int], ...]:
         """Frame numbers and ranges such as "30-40", as (first, last)."""
@@ -192,13 +159,11 @@ def joint_columns(parent: Section, key: str, value: Any, clock: str, poses: Pose
     if poses is not None and file == poses.path:
         clock = poses.clock
     columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), ("time", "value"))
-    limits = None
-    if section.value.get("limits") is not None:
-        limits = section.range("limits", "rad")
     names = columns.names("value", (1,))
     return JointColumns(
         file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
-        _units(section), section.number("rate_hz", above=0.0), section.path("calibration"), limits,
+        _units(section), section.number("rate_hz", above=0.0), section.path("calibration"),
+        section.range("limits", "rad"),
     )  # fmt: skip
 
 

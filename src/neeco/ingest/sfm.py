@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.ingest.lens import Lens
 from neeco.ingest.recording import FEWEST_FRAMES
 from neeco.ingest.requirements import require_installed
 
@@ -25,17 +26,7 @@ FEATURES = 1200  # per image
 # run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
-Progress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """Intrinsics px of undistorted images."""
-
-    fl_x: float
-    fl_y: float
-    cx: float
-    cy: float
+StageProgress = Callable[[str, int, int], None]  # what, how many done, of how many (0: not known)
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ class StructureFromMotion:
         source: Path,
         folder: Path,
         names: Sequence[str],
-        pinhole: Pinhole | None,
+        pinhole: Lens | None,
         masks: Path | None = None,
     ) -> None:
         require_installed("pycolmap")
@@ -105,12 +96,12 @@ class StructureFromMotion:
             "masks": str(masks) if masks else "",
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "OPENCV",
-            "camera_params": [pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy] if pinhole else [],
+            "camera_params": [*pinhole.intrinsics] if pinhole else [],
             "features": FEATURES,
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
 
-    def reconstruct(self, progress: Progress) -> SfmResult:
+    def reconstruct(self, progress: StageProgress) -> SfmResult:
         """Cameras and points, not yet adjusted together.
 
         Raises NeecoError when fewer than FEWEST_FRAMES images get a camera.
@@ -119,14 +110,14 @@ class StructureFromMotion:
         keys = [self.names[index] for index in keyframes(len(self.names))]
         return self._run(self.job | {"pairs": pairs, "keyframes": keys}, progress)
 
-    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: Progress) -> SfmResult:
+    def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: StageProgress) -> SfmResult:
         """The same after bundle adjustment without the observations marked in `doubtful` [Q]."""
         rows = found.observations[doubtful]
         names = [self.names[index] for index in found.indices]
         drop = [(names[int(row)], int(number)) for row, number in zip(rows[:, 0], rows[:, 4], strict=True)]
         return self._run(self.job | {"drop": drop}, progress)
 
-    def _run(self, job: dict[str, Any], progress: Progress) -> SfmResult:
+    def _run(self, job: dict[str, Any], progress: StageProgress) -> SfmResult:
         job_file, result = self.work / "job.json", self.work / "result.npz"
         result.unlink(missing_ok=True)
         job_file.write_text(json.dumps(job))
@@ -139,7 +130,7 @@ class StructureFromMotion:
         return _load(result, self.names, self.source)
 
 
-def run_worker(job_file: Path, source: Path, progress: Progress) -> None:
+def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
     """Pass the worker's events on; kill it when we are interrupted. Raises NeecoError naming `source` when it fails."""
     log_file = job_file.with_name("worker.log")
     with (

@@ -14,7 +14,7 @@ from neeco.ingest.clocks import LONGEST, ClockOffset
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
-from neeco.ingest.sfm import Progress
+from neeco.ingest.sfm import StageProgress
 from neeco.ingest.video import VideoSource
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
@@ -46,7 +46,7 @@ class Work:
 
     recording: Recording
     folder: Path  # for everything temporary
-    progress: Progress
+    progress: StageProgress
     video: VideoSource
     times: np.ndarray  # [V] s, every video frame
     logs: Logs
@@ -55,7 +55,7 @@ class Work:
     dropped: dict[int, str] = field(default_factory=dict)  # video frame -> why
 
 
-def begin(recording: Recording, folder: Path, progress: Progress) -> Work:
+def begin(recording: Recording, folder: Path, progress: StageProgress) -> Work:
     """Read the logs (quick, and wrong ones are found before the video is touched), then the video's times."""
     progress("reading logs", 0, 0)
     tracked = {item.name: read_pose_log(item.poses) for item in recording.instruments if item.poses is not None}

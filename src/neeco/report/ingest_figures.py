@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFilter
 
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import outline
-from neeco.ingest.moving import Shape
+from neeco.ingest.moving import RoughShape
 from neeco.raster.types import Camera
 from neeco.report.figures import MAX_WIDTH, jpeg
 
@@ -42,7 +42,7 @@ class SampleFigure:
     frame: Frame
 
 
-def main_axes(capture: Capture, shapes: Mapping[str, Shape]) -> dict[str, MainAxis]:
+def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, MainAxis]:
     """The long axis of each shape, through its points' mean along their first principal component.
 
     An instrument comes in from outside the image, so the tip is the end that more frames have in view, or else the one
@@ -66,7 +66,7 @@ def main_axes(capture: Capture, shapes: Mapping[str, Shape]) -> dict[str, MainAx
 
 
 def sample_figures(
-    capture: Capture, shapes: Mapping[str, Shape], axes: Mapping[str, MainAxis], length: float
+    capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> list[SampleFigure]:
     """Up to FIGURES frames, evenly spread over time. Frame axes are `length` mm long; unregistered poses are not drawn.
 
@@ -117,7 +117,7 @@ def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
 
 
 def _draw(
-    frame: Frame, capture: Capture, shapes: Mapping[str, Shape], axes: Mapping[str, MainAxis], length: float
+    frame: Frame, capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> str:
     pixels = np.clip(np.rint(frame.load_image().numpy() * 255), 0, 255).astype(np.uint8)
     # drawn at twice the size shown, then shrunk: smooth lines
@@ -136,7 +136,7 @@ def _draw(
     return jpeg(np.asarray(image))
 
 
-def _draw_outline(image: Image.Image, shape: Shape, pose: np.ndarray, camera: Camera, scale: float) -> None:
+def _draw_outline(image: Image.Image, shape: RoughShape, pose: np.ndarray, camera: Camera, scale: float) -> None:
     """The outline of the shape's points, each as large as the grid cell it stands for."""
     pixels, depth = _project(shape.points @ pose[:3, :3].T + pose[:3, 3], camera)
     mask = Image.new("L", image.size)

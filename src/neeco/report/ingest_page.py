@@ -38,13 +38,13 @@ from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
-def write_ingest_page(result: IngestResult, path: Path) -> None:
+def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None = None) -> None:
     """Write one HTML file about an ingest: style, pictures, curves and the view in 3D are inside it.
 
-    The capture is read from `result.capture`. Raises NeecoError when it or one of the images shown cannot be read, or
-    the page cannot be written.
+    capture: what lies at `result.capture`, read here unless given. Raises NeecoError when it or one of the images shown
+    cannot be read, or the page cannot be written.
     """
-    capture = read_capture(result.capture)
+    capture = capture or read_capture(result.capture)
     axes = main_axes(capture, result.shapes)
     write_page(
         path,

@@ -13,13 +13,13 @@ import torch
 from neeco.capture import read_capture
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Frame, State
+from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
 from neeco.labels.composited import composited_parts
 from neeco.raster.types import Camera
 from neeco.synthesis.samplers import states_file
-from neeco.synthesis.statefile import read_states
 from neeco.synthesis.views import moved_camera
 
 if TYPE_CHECKING:

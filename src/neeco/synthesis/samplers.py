@@ -12,13 +12,13 @@ import torch
 from numpy.random import Generator
 
 from neeco.capture.model import State
+from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.labels.drawing import surface_depth
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.synthesis.acceptance import shows_working_end
 from neeco.synthesis.settings import PATH_PREFIX, Views
-from neeco.synthesis.statefile import read_states
 from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, Listed, StateSampler
 from neeco.synthesis.views import (
     OrbitViews,

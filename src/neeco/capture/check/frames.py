@@ -6,13 +6,13 @@ from collections import Counter
 from pathlib import Path
 
 from neeco.capture.parsed import Parsed, Place
-from neeco.capture.problems import Report, shown
+from neeco.capture.problems import ProblemReport, shown
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 
 
-def check_frames(parsed: Parsed, report: Report) -> None:
+def check_frames(parsed: Parsed, report: ProblemReport) -> None:
     """Report splits, frame counts, times and repeated files."""
     _check_splits(parsed, report)
     _check_times(parsed, report)
@@ -24,7 +24,7 @@ def check_frames(parsed: Parsed, report: Report) -> None:
             report.error(place.file, f"{place.field}.file_path", message, "list every image once")
 
 
-def _check_splits(parsed: Parsed, report: Report) -> None:
+def _check_splits(parsed: Parsed, report: ProblemReport) -> None:
     file = parsed.places[0].file
     counts = Counter(frame.split for frame in parsed.frames)
     if not counts["train"]:
@@ -40,7 +40,7 @@ def _check_splits(parsed: Parsed, report: Report) -> None:
         report.warning(file, "frames", "split 'test' is empty", "without it nothing tells how good the scene is")
 
 
-def _check_times(parsed: Parsed, report: Report) -> None:
+def _check_times(parsed: Parsed, report: ProblemReport) -> None:
     file = parsed.places[0].file
     if not parsed.timed:
         report.warning(file, "frames", "not every frame has a time; the order stands in", "add `time` in seconds")

@@ -12,8 +12,9 @@ import numpy as np
 
 from neeco.capture.check.states import states_of
 from neeco.capture.parsed import Parsed, Place
-from neeco.capture.problems import Report, errors_only, shown
-from neeco.capture.transforms import swap_camera_axes
+from neeco.capture.poses import swap_camera_axes
+from neeco.capture.problems import ProblemReport, errors_only, shown
+from neeco.raster.pinhole import project
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene
@@ -21,6 +22,7 @@ SEEN_RARELY = 0.1  # a share of the points, or of the frames, that makes one loo
 SEEN_SURELY = 0.7  # a share that settles it
 SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
 METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
+BEHIND = 1e-9  # mm; what is less deep is not in front of a camera
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
 
 
@@ -45,10 +47,11 @@ class _Cameras:
         """Which camera has which point in its image, bool [F, P]; points [P, 3], or [F, P, 3] one set per camera."""
         poses = self.poses if poses is None else poses
         local = np.einsum("fpi,fij->fpj", points - poses[:, None, :3, 3], poses[:, :3, :3])
-        depth = np.where(local[..., 2] > 1e-9, local[..., 2], np.nan)
+        fx, fy, cx, cy = self.intrinsics.T[..., None]  # each [F, 1]
+        width, height = self.sizes.T[..., None]
         with np.errstate(all="ignore"):
-            pixels = local[..., :2] / depth[..., None] * self.intrinsics[:, None, :2] + self.intrinsics[:, None, 2:]
-            return ((pixels > 0) & (pixels < self.sizes[:, None])).all(axis=-1)
+            u, v = project(local, fx, fy, cx, cy, nearest=BEHIND)
+            return (local[..., 2] > BEHIND) & (u > 0) & (u < width) & (v > 0) & (v < height)
 
     def scaled(self, factor: float) -> np.ndarray:
         return _scaled(self.poses, factor)
@@ -68,16 +71,19 @@ def _inverted(poses: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def check_geometry(parsed: Parsed, report: Report) -> None:
-    """Check cameras against points, then instruments against both (not against cameras that are wrong)."""
+def check_geometry(parsed: Parsed, report: ProblemReport) -> None:
+    """Check points, cameras against points, then instruments against both (not against cameras that are wrong)."""
     before = len(errors_only(report.problems))
-    check_cameras(parsed, report)
-    if len(errors_only(report.problems)) == before:
-        check_instruments(parsed, report)
+    points = usable_points(parsed, report)
+    placed = parsed.with_cameras()
+    if points is not None and placed.frames:
+        check_cameras(placed, points, report)
+    if placed.frames and len(errors_only(report.problems)) == before:
+        check_instruments(placed, report)
 
 
-def check_cameras(parsed: Parsed, report: Report) -> None:
-    """Report points that are too few or in one spot, cameras far from them, and mistakes in camera poses."""
+def usable_points(parsed: Parsed, report: ProblemReport) -> np.ndarray | None:
+    """The measured points [P, 3] float64. Reports that there are none, few, or all in one spot; None when unusable."""
     place = parsed.points_place
     if parsed.points is None or not parsed.points.measured:
         already = any(problem.file == place.file and problem.field == place.field for problem in report.problems)
@@ -85,18 +91,28 @@ def check_cameras(parsed: Parsed, report: Report) -> None:
             report.warning(
                 place.file, place.field, "no sparse points", "training starts from random ones, and gets less"
             )
-        return
+        return None
     points = parsed.points.positions.astype(np.float64)
     if len(points) == 0:
         report.error(place.file, place.field, "holds no points", "add SfM points or drop ply_file_path")
-        return
+        return None
     if len(points) < FEW_POINTS:
         message = f"few sparse points: {len(points)}, fewer than {FEW_POINTS}"
         report.warning(place.file, place.field, message, "give SfM's whole cloud if you can")
-    scene = _Scene.of(parsed, points)
-    if scene.spread < 1e-9:
+    if _spread(points) < 1e-9:
         report.error(place.file, place.field, "all points are in one spot", "repair the point cloud")
-        return
+        return None
+    return points
+
+
+def _spread(points: np.ndarray) -> float:
+    """mm, 90% of the points [P, 3] are within this of their centre."""
+    return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
+
+
+def check_cameras(parsed: Parsed, points: np.ndarray, report: ProblemReport) -> None:
+    """Report cameras far from the points, and mistakes in camera poses."""
+    scene = _Scene.of(parsed, points)
     if parsed.instruments and scene.distance < METRES:
         message = f"cameras are {scene.distance:.3g} mm from the points: metres?"
         report.error(parsed.places[0].file, "frames", message, "give cameras, points and poses in mm")
@@ -118,16 +134,15 @@ class _Scene:
     def of(cls, parsed: Parsed, points: np.ndarray) -> _Scene:
         cameras = _Cameras.of(parsed)
         center = np.median(points, axis=0)
-        spread = float(np.quantile(np.linalg.norm(points - center, axis=1), 0.9))
         distance = float(np.median(np.linalg.norm(cameras.poses[:, :3, 3] - center, axis=1)))
-        return cls(cameras, points[:: max(1, len(points) // 500)], center, spread, distance)
+        return cls(cameras, points[:: max(1, len(points) // 500)], center, _spread(points), distance)
 
     @property
     def size(self) -> float:
         return max(self.spread, self.distance)
 
 
-def _check_camera_views(parsed: Parsed, scene: _Scene, report: Report) -> None:
+def _check_camera_views(parsed: Parsed, scene: _Scene, report: ProblemReport) -> None:
     cameras, points = scene.cameras, scene.points
     seen = cameras.sees(points[None]).mean(axis=1)  # [F] share of the points in each image
     file = parsed.places[0].file
@@ -180,7 +195,7 @@ def _camera_mistake(scene: _Scene, given: float) -> tuple[str, str] | None:
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def check_instruments(parsed: Parsed, report: Report) -> None:
+def check_instruments(parsed: Parsed, report: ProblemReport) -> None:
     """Report instruments far from the scene or outside every image, and the mistakes behind it."""
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
@@ -198,7 +213,7 @@ def check_instruments(parsed: Parsed, report: Report) -> None:
             _check_placement(parsed, instrument.name, np.array(has), poses, [place for place, _ in found], report)
 
 
-def _report_metres(name: str, poses: np.ndarray, place: Place, report: Report) -> bool:
+def _report_metres(name: str, poses: np.ndarray, place: Place, report: ProblemReport) -> bool:
     """Report an instrument that moves, but never a millimetre from its frame's origin; True if so."""
     origins = poses[:, :3, 3]
     farthest = float(np.linalg.norm(origins, axis=1).max())
@@ -210,7 +225,7 @@ def _report_metres(name: str, poses: np.ndarray, place: Place, report: Report) -
 
 
 def _check_placement(
-    parsed: Parsed, name: str, has: np.ndarray, poses: np.ndarray, places: list[Place], report: Report
+    parsed: Parsed, name: str, has: np.ndarray, poses: np.ndarray, places: list[Place], report: ProblemReport
 ) -> None:
     """Check one registered instrument; poses [I, 4, 4] of the frames that have it."""
     everyone = _Cameras.of(parsed)
@@ -241,7 +256,7 @@ def _how_many(seen: np.ndarray) -> str:
     return "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
 
 
-def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place], report: Report) -> bool:
+def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place], report: ProblemReport) -> bool:
     """Report poses far from the points; True when there were any."""
     distances = np.linalg.norm(poses[:, :3, 3] - scene.center, axis=1)
     limit = FAR * scene.size + SENSOR_REACH_MM * (scene.distance > METRES)
@@ -252,7 +267,9 @@ def _report_far(name: str, poses: np.ndarray, scene: _Scene, places: list[Place]
     return bool((distances > limit).any())
 
 
-def _report_never_seen(name: str, cameras: _Cameras, poses: np.ndarray, places: list[Place], report: Report) -> None:
+def _report_never_seen(
+    name: str, cameras: _Cameras, poses: np.ndarray, places: list[Place], report: ProblemReport
+) -> None:
     """An origin outside every image: a sensor away from the instrument's visible part, or a wrong frame."""
     field = "frames[*].instruments[*].pose"
     message = f"the origin of {shown(name)} is outside every image"
@@ -310,7 +327,7 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: Report) -> None:
+def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: ProblemReport) -> None:
     """Single poses far away from all others, and out of view: tracker drop-outs."""
     origins = poses[:, :3, 3]
     distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)

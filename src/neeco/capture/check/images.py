@@ -12,7 +12,7 @@ import torch
 from neeco.capture.images import read_image
 from neeco.capture.model import Frame
 from neeco.capture.parsed import Parsed, Place
-from neeco.capture.problems import Report
+from neeco.capture.problems import ProblemReport
 from neeco.errors import NeecoError
 
 
@@ -26,14 +26,15 @@ class _Looked:
     mask_error: str = ""
 
 
-def check_images(parsed: Parsed, report: Report) -> None:
+def check_images(parsed: Parsed, report: ProblemReport) -> None:
     """Decode every image and mask and report what is wrong with them."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         looked = list(pool.map(_look, parsed.frames))
+    told = {(problem.file, problem.field) for problem in report.problems}  # by the reader, of sizes not stated
     first: dict[bytes, int] = {}
     for index, (found, place) in enumerate(zip(looked, parsed.places, strict=True)):
         field = f"{place.field}.file_path"
-        if found.image_error:
+        if found.image_error and (place.file, field) not in told:
             report.error(place.file, field, *found.image_error.split("; ", 1))
         if found.mask_error:
             report.error(place.file, f"{place.field}.mask_path", *found.mask_error.split("; ", 1))
@@ -62,7 +63,7 @@ def _look(frame: Frame) -> _Looked:
     return _Looked(digest, flat, image_error, mask_error)
 
 
-def _report_twin(parsed: Parsed, first: int, second: int, report: Report) -> None:
+def _report_twin(parsed: Parsed, first: int, second: int, report: ProblemReport) -> None:
     """Two files with the same pixels: harmless only when everything else is the same as well."""
     one, two, place = parsed.frames[first], parsed.frames[second], parsed.places[second]
     if one.image_path == two.image_path:
@@ -91,7 +92,7 @@ def _same_state(one: Frame, two: Frame) -> bool:
     )
 
 
-def _check_masks_complete(parsed: Parsed, report: Report) -> None:
+def _check_masks_complete(parsed: Parsed, report: ProblemReport) -> None:
     without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
     if without and len(without) < len(parsed.frames):
         message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"

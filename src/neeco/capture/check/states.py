@@ -7,16 +7,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from neeco.capture.instruments import passes_limits
 from neeco.capture.model import Instrument, InstrumentState
 from neeco.capture.parsed import Parsed, Place
-from neeco.capture.problems import Report, key_name, shown
+from neeco.capture.problems import ProblemReport, key_name, shown
 
-LIMIT_TOLERANCE = 1e-3  # rad
 FULL_TURN = 2 * math.pi
 STILL = 1e-9  # mm or rad; a state that changes less does not change
 
 
-def check_states(parsed: Parsed, report: Report) -> None:
+def check_states(parsed: Parsed, report: ProblemReport) -> None:
     """Report missing instruments and joints, limits passed, degrees, and states that never change."""
     for instrument in parsed.instruments:
         _check_present(parsed, instrument, report)
@@ -34,7 +34,7 @@ def states_of(parsed: Parsed, name: str) -> Iterator[tuple[Place, InstrumentStat
             yield Place(place.file, f"{place.field}.instruments[{index}]"), state
 
 
-def _check_present(parsed: Parsed, instrument: Instrument, report: Report) -> None:
+def _check_present(parsed: Parsed, instrument: Instrument, report: ProblemReport) -> None:
     without = [
         place
         for frame, place in zip(parsed.frames, parsed.places, strict=True)
@@ -52,7 +52,7 @@ def _check_present(parsed: Parsed, instrument: Instrument, report: Report) -> No
         report.error(place.file, f"{place.field}.instruments", message, "give its pose or drop the frame")
 
 
-def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: Report) -> None:
+def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: ProblemReport) -> None:
     limits = instrument.joints[joint]
     is_length = joint.endswith("_mm")  # a sliding joint
     if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
@@ -65,7 +65,7 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: Rep
             report.error(place.file, field, "is missing", "give its value in every frame, or drop the frame")
             continue
         value = state.joints[joint]
-        if limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE:
+        if limits is not None and passes_limits(value, limits):
             message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
             report.error(place.file, field, message, "repair the reading (radians?) or the limits")
         if largest is None or abs(value) > abs(largest[0]):
@@ -76,7 +76,7 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: Rep
         report.error(largest[1].file, largest[1].field, message, remedy)
 
 
-def _check_changes(parsed: Parsed, report: Report) -> None:
+def _check_changes(parsed: Parsed, report: ProblemReport) -> None:
     """A state that is always the same teaches nothing about other states."""
     changing = 0
     still: list[str] = []

@@ -13,7 +13,7 @@ from neeco.capture.problems import key_name
 
 
 @dataclass(frozen=True)
-class Summary:
+class CaptureSummary:
     """Counts and ranges of what could be read."""
 
     splits: dict[str, int]  # name -> frames
@@ -26,7 +26,7 @@ class Summary:
         return asdict(self)
 
 
-def summarize(parsed: Parsed) -> Summary:
+def summarize(parsed: Parsed) -> CaptureSummary:
     """Count frames and points, and find the range of each joint and each instrument's travel."""
     joints: dict[str, tuple[float, float]] = {}
     travel: dict[str, float] = {}
@@ -42,7 +42,7 @@ def summarize(parsed: Parsed) -> Summary:
             if values:
                 joints[f"{instrument.name}.{key_name(joint)}"] = (min(values), max(values))
     points = parsed.points
-    return Summary(
+    return CaptureSummary(
         splits=dict(Counter(frame.split for frame in parsed.frames)),
         points=len(points.positions) if points is not None and points.measured else 0,
         registered=parsed.registered,

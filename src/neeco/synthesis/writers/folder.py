@@ -15,10 +15,10 @@ import torch
 from PIL import Image
 
 from neeco.capture.images import write_image, write_labels
+from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.files import write_atomically, write_json, write_text
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import Drawing
-from neeco.synthesis.statefile import camera_to_json, state_to_json
 
 Record = dict[str, Any]
 

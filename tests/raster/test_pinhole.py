@@ -1,0 +1,75 @@
+"""Points fall where a pinhole camera shows them, as tensors and as arrays."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from neeco.raster.pinhole import project, project_world
+from neeco.raster.reference import camera_from_world
+from neeco.raster.types import Camera
+
+
+def a_camera() -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix())
+    pose[:3, 3] = torch.tensor([5.0, -3.0, -90.0])
+    return Camera(pose, 200.0, 210.0, 80.0, 64.0, 160, 128)
+
+
+def test_a_point_on_the_axis_falls_on_the_principal_point_and_one_beside_it_by_its_slope():
+    u, v = project(np.array([[0.0, 0.0, 50.0], [10.0, -5.0, 50.0]]), 100.0, 200.0, 32.0, 24.0)
+    assert u.tolist() == [32.0, 52.0]
+    assert v.tolist() == [24.0, 4.0]
+
+
+def test_tensors_and_arrays_agree_to_the_last_bit_and_follow_the_stated_order():
+    points = np.random.default_rng(0).normal(size=(50, 3)) + np.array([0.0, 0.0, 9.0])
+    u, v = project(points, 101.3, 99.7, 31.1, 23.9)
+    tensor_u, tensor_v = project(torch.from_numpy(points), 101.3, 99.7, 31.1, 23.9)
+    assert np.array_equal(tensor_u.numpy(), u)
+    assert np.array_equal(tensor_v.numpy(), v)
+    assert np.array_equal(u, points[:, 0] / points[:, 2] * 101.3 + 31.1)
+
+
+def test_every_camera_may_have_its_own_intrinsics():
+    points = torch.tensor([[1.0, 1.0, 2.0], [2.0, 4.0, 4.0]]).expand(3, 2, 3)
+    fx = torch.tensor([[1.0], [10.0], [100.0]])
+    u, _ = project(points, fx, fx, 0.0, 0.0)
+    assert u.tolist() == [[0.5, 0.5], [5.0, 5.0], [50.0, 50.0]]
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_points_behind_are_held_at_the_nearest_depth_when_asked(kind):
+    points = kind([[1.0, 2.0, -4.0], [1.0, 2.0, 0.5]])
+    u, v = project(points, 10.0, 10.0, 0.0, 0.0, nearest=1.0)
+    assert u.tolist() == [10.0, 10.0]
+    assert v.tolist() == [20.0, 20.0]
+    assert project(points, 10.0, 10.0, 0.0, 0.0)[0].tolist() == [-2.5, 20.0]
+
+
+def test_points_of_the_world_fall_where_the_reference_draws_them():
+    camera = a_camera()
+    points = torch.from_numpy(np.random.default_rng(1).uniform(-20, 20, (30, 3)))
+    pixels, depths = project_world(points, camera)
+    rotation, translation = camera_from_world(camera.world_from_camera)
+    local = points @ rotation.T + translation
+    assert torch.allclose(depths, local[:, 2])
+    assert torch.allclose(pixels[:, 0], camera.fx * local[:, 0] / local[:, 2] + camera.cx)
+    assert torch.allclose(pixels[:, 1], camera.fy * local[:, 1] / local[:, 2] + camera.cy)
+    as_arrays = project_world(points.numpy(), camera)
+    assert np.allclose(as_arrays[0], pixels)
+    assert np.allclose(as_arrays[1], depths)
+
+
+def test_single_points_and_batches_keep_their_shape_and_type():
+    camera = a_camera()
+    pixel, depth = project_world(np.zeros(3), camera)
+    assert pixel.shape == (2,)
+    assert math.isfinite(depth)
+    pixels, depths = project_world(torch.zeros(4, 5, 3), camera)
+    assert pixels.shape == (4, 5, 2)
+    assert depths.shape == (4, 5)
+    assert pixels.dtype == torch.float32
