@@ -48,8 +48,8 @@ def run(args: Arguments) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.experiments.ablation_run import AblationPlan, run_ablations
     from neeco.experiments.ablation_tables import write_tables
+    from neeco.experiments.label_ways import score_label_ways
     from neeco.report.ablation_page import write_ablation_report
-    from neeco.synthesis.label_ways import score_label_ways
 
     plan = AblationPlan(
         args.capture,

@@ -18,10 +18,11 @@ from neeco.evaluation.align import align_frame, moved_by
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips, find_lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
-from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, draw, photograph, score
+from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.composited import LABEL_THRESHOLD
+from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.scene.drawable import gaussian_scene
 

@@ -33,7 +33,7 @@ def _overlap(mask: Tensor, truth: Tensor, counted: Tensor | None) -> tuple[int, 
 
 def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tensor:
     """Renumber part ids [H, W] (column index + 1) to the truth's numbers; parts the truth does not name become 0."""
-    table = torch.zeros(len(label_names) + 1, dtype=torch.uint8)
+    table = torch.zeros(len(label_names) + 1, dtype=torch.uint8, device=parts.device)
     for index, (_, part) in enumerate(label_names):
         table[index + 1] = TRUTH_PARTS.get(part, 0)
     return table[parts.long()]

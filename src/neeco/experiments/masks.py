@@ -14,9 +14,9 @@ from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.scoring import draw
 from neeco.evaluation.truth import REFERENCE_FOLDER
 from neeco.files import write_json
+from neeco.labels.drawing import draw
 from neeco.training.run import Run
 
 NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument

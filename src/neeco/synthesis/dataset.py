@@ -18,16 +18,9 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.files import new_folder, read_json, write_json
 from neeco.labels.annotation import KEYPOINTS, annotate
-from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.labels.drawing import (
-    CompositedLabels,
-    DeltaThresholds,
-    Drawing,
-    Labeller,
-    ThresholdLabels,
-    draw,
-    instruments_of,
-)
+from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels, instruments_of
+from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers
+from neeco.labels.threshold import DeltaThresholds, ThresholdLabels
 from neeco.scene.drawable import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.preview import write_preview
@@ -191,12 +184,12 @@ def make_sample(
 
 def _first_acceptable(
     scene: Scene, labeller: Labeller, sampler: Sampler, acceptance: Acceptance, settings: Settings, index: int
-) -> tuple[Drawing | None, Counter[str]]:
+) -> tuple[LayeredDrawing | None, Counter[str]]:
     rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
     refused: Counter[str] = Counter()
     for _ in range(1 if sampler.fixed(index) else settings.tries):
         state, camera = sampler(index, rng)
-        drawing = draw(scene, labeller, state, camera, settings.speckle)
+        drawing = draw_layers(scene, labeller, state, camera, settings.speckle)
         reason = acceptance.why_refused(scene, drawing)
         if reason is None:
             return drawing, refused

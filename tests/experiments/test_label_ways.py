@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from neeco.capture.writer import write_capture
-from neeco.synthesis.label_ways import score_label_ways
+from neeco.experiments.label_ways import score_label_ways
 from neeco.training.options import training_config
 from neeco.training.train import train
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco_mask
 
-from neeco.labels.geometry import (
+from neeco.labels.contours import (
     bounding_box,
     joined_polygon,
     minimum_rectangle,

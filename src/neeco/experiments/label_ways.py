@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.truth import load_reference
-from neeco.labels.drawing import CompositedLabels, Labeller, ThresholdLabels, draw
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import Labeller, draw_layers
+from neeco.labels.threshold import ThresholdLabels
 from neeco.scene.drawable import gaussian_scene
 from neeco.synthesis.settings import Settings
 from neeco.training.run import load_run
@@ -41,8 +41,8 @@ def score_label_ways(run_path: Path, splits: Sequence[str]) -> Scores:
                 for frame in capture.split(split):
                     reference = load_reference(capture, frame)
                     if reference is not None:
-                        drawing = draw(scene, labeller, frame.state, frame.camera, speckle)
-                        values.append(iou(torch.from_numpy(drawing.parts > 0), reference.mask, frame.load_mask()))
+                        drawing = draw_layers(scene, labeller, frame.state, frame.camera, speckle)
+                        values.append(iou(drawing.parts > 0, reference.mask, frame.load_mask()))
                 mean = mean_of(values)
                 scores[way][split] = None if mean != mean else round(mean, 6)  # NaN is unequal to itself
     return scores
