@@ -48,7 +48,6 @@ def run(args: Arguments) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.experiments.ablation_run import AblationPlan, run_ablations
     from neeco.experiments.ablation_tables import write_tables
-    from neeco.experiments.label_ways import score_label_ways
     from neeco.report.ablation_page import write_ablation_report
 
     plan = AblationPlan(
@@ -62,7 +61,7 @@ def run(args: Arguments) -> int:
         args.set,
     )
     with _Bar() as bar:
-        ablation = run_ablations(plan, score_label_ways, args.workers, bar.show)
+        ablation = run_ablations(plan, args.workers, bar.show)
     write_tables(args.output, ablation)
     page = write_ablation_report(args.output, ablation)
     _print_tables(Console(), ablation)

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Column, Table
 
 if TYPE_CHECKING:
+    from neeco.capture import Capture
     from neeco.training.run import Run
 
 COLUMNS = (
@@ -54,14 +55,15 @@ def run(args: Evaluate) -> int:
 
     console = Console()
     trained = load_run(args.run)
+    capture = trained.capture()
     with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
         checked.enter_context(new_folder(args.run))
         if args.json is not None:
             if args.json.is_dir():
                 raise NeecoError(f"--json: {args.json} is a folder; name a file")
             checked.enter_context(new_folder(args.json.parent))
-        evaluation = _evaluated(args, trained)
-        page = write_report(args.run, evaluation, trained.capture(), trained.scene)
+        evaluation = _evaluated(args, trained, capture)
+        page = write_report(args.run, evaluation, capture, trained.scene)
         if args.json is not None:
             write_json(args.json, evaluation)
     console.print(_table(evaluation))
@@ -71,7 +73,7 @@ def run(args: Evaluate) -> int:
     return 0
 
 
-def _evaluated(args: Evaluate, trained: Run) -> dict[str, Any]:
+def _evaluated(args: Evaluate, trained: Run, capture: Capture) -> dict[str, Any]:
     """What `evaluate_run` finds, with a bar for every split."""
     from neeco.evaluation.evaluate import evaluate_run
 
@@ -85,7 +87,9 @@ def _evaluated(args: Evaluate, trained: Run) -> dict[str, Any]:
                 tasks[what] = bar.add_task(what, total=total)
             bar.update(tasks[what], completed=done, total=total)
 
-        return evaluate_run(trained, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=report)
+        return evaluate_run(
+            trained, capture, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=report
+        )
     finally:
         if bar.live.is_started:
             bar.stop()

@@ -87,8 +87,8 @@ class _Problem:
         return self.scene.at(self.moved_state(parameters))
 
     def draw(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
-        """The image [h, w, 3] at the moved camera."""
-        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color
+        """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
+        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
 
 
 @torch.no_grad()

@@ -14,6 +14,7 @@ import torch
 from neeco.capture.model import Capture, Frame
 from neeco.experiments.machine import machine
 from neeco.raster import rasterize
+from neeco.raster.threads import synchronise
 from neeco.raster.types import Gaussians
 from neeco.scene.drawable import gaussian_scene
 from neeco.training.run import Run
@@ -84,10 +85,10 @@ def _timed(run: Run, frames: Sequence[Frame], backend: str) -> list[float]:
 def _draw(run: Run, frame: Frame, backend: str) -> None:
     if backend == "cuda":
         scene = gaussian_scene(run.scene, "backend cuda")
-        rasterize(_on_cuda(scene.at(frame.state)), scene.camera(frame.camera), backend=backend)
-        torch.cuda.synchronize()
+        drawn = rasterize(_on_cuda(scene.at(frame.state)), scene.camera(frame.camera), backend=backend)
     else:
-        run.scene.draw(frame.state, frame.camera)
+        drawn = run.scene.draw(frame.state, frame.camera)
+    synchronise(drawn.color.device)
 
 
 def _on_cuda(gaussians: Gaussians) -> Gaussians:

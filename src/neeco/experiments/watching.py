@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import psnr
-from neeco.experiments.memory import peak_memory_mb
+from neeco.experiments.machine import peak_memory_mb
 from neeco.files import read_json, write_json, write_text
 from neeco.labels.drawing import draw
 

@@ -13,7 +13,8 @@ from typing import Any
 import neeco
 from neeco.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.experiments.ablation_tables import agreement, csv_text, grid
-from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.ablations import ABLATIONS
+from neeco.experiments.families import PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.files import write_text
 from neeco.report.charts import Series, chart, download, legend
 from neeco.report.style import CHART_STYLE, STYLE, html_page
