@@ -94,8 +94,8 @@ def _train(capture: Path, output: Path, minutes: float) -> Run:
 
 
 def _synthesize(trained: Run, output: Path) -> None:
+    from neeco.cli._bars import counting
     from neeco.synthesis.dataset import synthesize
-    from neeco.synthesis.progress import counting
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
