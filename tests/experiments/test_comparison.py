@@ -47,7 +47,7 @@ def without_times(value):
 
 def test_a_comparison_holds_what_its_runs_hold(spec: ComparisonSpec) -> None:
     stages: set[str] = set()
-    result = compared(spec, stage=lambda what, done, total: stages.add(what))
+    result = compared(spec, progress=lambda what, done, total: stages.add(what))
     output = spec.output
     assert result == json.loads((output / "comparison.json").read_text())
     assert result["schema"] == "neeco-comparison/1"

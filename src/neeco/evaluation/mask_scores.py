@@ -13,10 +13,8 @@ import numpy as np
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.evaluation.boundary import boundary_f
-from neeco.evaluation.boxes import average_precision, boxes_of
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
-from neeco.evaluation.mask_metrics import TRUTH_PARTS, mean_of
+from neeco.evaluation.mask_metrics import TRUTH_PARTS, average_precision, boundary_f, boxes_of, mean_of
 
 SCHEMA = "neeco-mask-scores/1"
 SCORES = ("iou", "dice", "boundary_f", "box_ap", "box_ap50")
@@ -72,8 +70,8 @@ def score_masks(
     splits: of a capture; None: those of which `predicted` has an image. classes, truth_classes: part by id, where ids
     differ from ours. components: a box per connected group instead of one per id. progress: told (done, of).
     An image without a prediction counts as predicted empty. Per region the mean over the images where either side
-    shows it: `iou`, `dice`, `boundary_f` (`boundary.boundary_f`); over the whole folder `box_ap`, `box_ap50`
-    (`boxes.average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
+    shows it: `iou`, `dice`, `boundary_f`; over the whole folder `box_ap`, `box_ap50`
+    (`average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
     2020, github.com/BCV-Uniandes/ISINet): per image the mean IoU of the classes its truth shows, mean over the images
     that show any; `isinet_iou` counts classes that either shows, `mean_class_iou` is the mean over classes of each
     one's mean over images. None is "not known", never zero. Raises NeecoError for what cannot be read or compared.

@@ -52,7 +52,7 @@ def photograph(
 def score(drawing: Drawing, photo: Photograph, networks: dict[str, Lpips]) -> dict[str, float | None]:
     """All numbers of one frame, by the names in SCORES; None where there is nothing to compare with."""
     image, mask = drawing.image, photo.mask
-    counted = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+    counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((photo.tissue & counted).sum())
     row: dict[str, float | None] = dict.fromkeys(SCORES)
     row["psnr"] = psnr(image, photo.image, counted)

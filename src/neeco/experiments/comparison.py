@@ -13,7 +13,7 @@ from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
-from neeco.evaluation.evaluate import EVALUATION_FILE, held_out_splits
+from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.jobs import (
     JOB_FILE,
@@ -39,9 +39,6 @@ from neeco.training.run import load_run
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
 COMPARISON_FILE = "comparison.json"
-
-Progress = Callable[[JobNews], None]
-Stage = Callable[[str, int, int], None]  # what is done after the jobs, how many done, of how many
 
 
 @dataclass(frozen=True)
@@ -101,27 +98,29 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     return ComparisonPlan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
 
 
-def compare(plan: ComparisonPlan, progress: Progress | None = None, stage: Stage | None = None) -> dict[str, Any]:
+def compare(
+    plan: ComparisonPlan, news: Callable[[JobNews], None] | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
     """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
 
     Given again after an interruption, it goes on where it stopped; given again with more methods or seeds, it adds
     them. A method that fails is told in its place. comparison.json is complete at every moment; `complete` says whether
-    all is in it.
+    all is in it. news: told of the jobs; progress: of what follows them.
     """
     spec = plan.spec
-    report = stage or (lambda what, done, total: None)
+    report = progress or (lambda what, done, total: None)
     with new_folder(spec.output):
         finished = _finished_before(plan)
 
         def write() -> None:  # what is known is on disk at every moment
             write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
 
-        def keep(news: JobNews) -> None:
-            if news.result is not None:
-                finished[news.index] = news.result
+        def keep(latest: JobNews) -> None:
+            if latest.result is not None:
+                finished[latest.index] = latest.result
                 write()
-            if progress:
-                progress(news)
+            if news:
+                news(latest)
 
         write()
         results = run_jobs(plan.jobs, spec.workers, keep, {spec.capture: plan.capture})
@@ -271,7 +270,7 @@ def _distance(plan: ComparisonPlan, results: Sequence[Mapping[str, Any]]) -> lis
     return rows
 
 
-def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Stage) -> None:
+def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> None:
     """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
     folder = plan.spec.output
     done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]

@@ -24,8 +24,6 @@ ROUNDS = 3  # every run is drawn in turn, so often: a slow moment of the machine
 DRAWS = 7  # timed per run and round
 PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer draws
 
-Progress = Callable[[int, int], None]
-
 
 def backends() -> tuple[str, ...]:
     """The rasteriser's backends that this machine can draw with at speed."""
@@ -35,7 +33,7 @@ def backends() -> tuple[str, ...]:
 
 @torch.no_grad()
 def measure_speed(
-    runs: Sequence[tuple[str, int, Run]], capture: Capture, progress: Progress | None = None
+    runs: Sequence[tuple[str, int, Run]], capture: Capture, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
     """Frames per second of every (name, seed, run), posing included, in one go.
 

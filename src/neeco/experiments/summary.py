@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.model import Capture, Frame
+from neeco.labels.drawing import to_numpy
 
 SPLIT_METRICS = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou")
 RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")
@@ -98,6 +99,6 @@ def _coordinates_of(frame: Frame, instruments: tuple[str, ...]) -> list[float]:
     values: list[float] = []
     for name in instruments:
         state = frame.state.instruments[name]
-        values += state.pose[:3].double().numpy().ravel().tolist()
+        values += to_numpy(state.pose[:3]).ravel().tolist()
         values += [state.joints[joint] for joint in sorted(state.joints)]
     return values

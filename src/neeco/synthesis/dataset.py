@@ -53,8 +53,8 @@ REMEDIES = {  # where every given state was refused
 
 
 @dataclass(frozen=True)
-class Summary:
-    """What came of it."""
+class Synthesized:
+    """What was made, and where it lies."""
 
     output: Path
     images: int
@@ -70,7 +70,7 @@ def synthesize(
     formats: tuple[Format, ...] = ("coco", "yolo"),
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
-) -> Summary:
+) -> Synthesized:
     """Write a labelled data set of `settings.count` images of the run's scene to `output`.
 
     Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C) or failing, it keeps and indexes what
@@ -246,7 +246,7 @@ def _write_indexes(
     formats: tuple[Format, ...],
     complete: bool,
     made: int = 0,
-) -> Summary:
+) -> Synthesized:
     """(Re)write everything that is about the whole data set, from the records."""
     drawn = _drawn(records)
     skipped = [record["index"] for record in records if record.get("skipped")]
@@ -277,7 +277,7 @@ def _write_indexes(
             "skipped": skipped,
         },
     )
-    return Summary(output, len(drawn), made, _refusals(records), skipped)
+    return Synthesized(output, len(drawn), made, _refusals(records), skipped)
 
 
 @torch.no_grad()
