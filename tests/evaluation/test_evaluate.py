@@ -9,6 +9,7 @@ import torch
 from neeco.capture.images import write_labels
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.evaluation import evaluate
 from neeco.evaluation.evaluate import evaluate_run
 
 
@@ -179,3 +180,10 @@ def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "photographs it never saw. " in (run.path / "report.html").read_text()
+
+
+def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):
+    waited = []
+    monkeypatch.setattr(evaluate, "synchronise", waited.append)
+    evaluated(make_run(world, tmp_path), ["test"])
+    assert waited == [torch.device("cpu")] * (evaluate.TIMED_DRAWS + 2)

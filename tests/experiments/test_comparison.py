@@ -84,6 +84,11 @@ def test_a_comparison_holds_what_its_runs_hold(spec: ComparisonSpec) -> None:
     assert "lpips: no weights" in (output / "comparison.md").read_text()
 
 
+def test_jobs_of_this_process_are_handed_the_capture(spec: ComparisonSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jobs_module, "read_capture", lambda *_: pytest.fail("read again"))
+    assert compared(replace(spec, methods=("3dgs",), seeds=1))["complete"]
+
+
 def test_interrupted_it_goes_on_to_the_same_comparison(
     spec: ComparisonSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
