@@ -71,7 +71,7 @@ def test_such_a_folder_is_learned_on_its_white_scored_and_drawn(folder: Path, tm
     with torch.no_grad():
         away = rasterize(scene.at(frame.state), _turned_round(frame.camera)).color
     assert torch.equal(away, torch.ones(SIZE, SIZE, 3))  # where nothing is, the images' white and no floaters
-    scores = evaluate_run(load_run(run_path), ["test"])["given"]["test"]
+    scores = evaluate_run(load_run(run_path), read_capture(folder), ["test"])["given"]["test"]
     assert scores["frames"] == 2
     assert scores["psnr"] > 12
 

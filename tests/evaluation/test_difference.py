@@ -1,9 +1,8 @@
 """Pictures of errors."""
 
 import numpy as np
-import pytest
 
-from neeco.evaluation.difference import contact_sheet, difference_map, outline, overlay_outline, overlay_parts
+from neeco.evaluation.difference import difference_map, outline, overlay_outline, overlay_parts
 
 
 def test_equal_images_are_black_and_larger_differences_brighter():
@@ -44,15 +43,3 @@ def test_overlays_leave_tissue_alone_and_tint_each_part_differently():
     truth = overlay_outline(drawn, parts == 1)
     assert (truth[1, 1] == (255, 255, 0)).all()
     assert (drawn[1, 1] == 255).all()  # the input stays as it was
-
-
-def test_a_contact_sheet_places_images_row_by_row():
-    images = [np.full((2, 3, 3), value, np.uint8) for value in (10, 20, 30)]
-    sheet = contact_sheet(images, columns=2, gap=1)
-    assert sheet.shape == (5, 7, 3)
-    assert (sheet[0, 0] == 10).all()
-    assert (sheet[0, 4] == 20).all()
-    assert (sheet[3, 0] == 30).all()
-    assert (sheet[3, 4] == 255).all()
-    with pytest.raises(ValueError, match="at least one"):
-        contact_sheet([], 2)

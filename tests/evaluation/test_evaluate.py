@@ -9,6 +9,7 @@ import torch
 from neeco.capture.images import write_labels
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.evaluation import evaluate
 from neeco.evaluation.evaluate import evaluate_run
 
 
@@ -22,10 +23,14 @@ def make_run(world, folder, splits=("train", "train", "test", "unseen"), **optio
     return world.TinyRun(folder, world.TinyScene(**options), capture)
 
 
+def evaluated(run, *splits, **options):
+    return evaluate_run(run, run.capture(), *splits, **options)
+
+
 def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
     run = make_run(world, tmp_path)
     seen = []
-    evaluation = evaluate_run(run, progress=lambda *event: seen.append(event))
+    evaluation = evaluated(run, progress=lambda *event: seen.append(event))
     numbers = evaluation["given"]["test"]
     assert set(evaluation["given"]) == {"test", "unseen"}
     assert numbers["psnr"] > 45  # 8 bit rounding
@@ -45,7 +50,7 @@ def test_a_scene_scored_on_its_own_drawings_is_nearly_perfect(world, tmp_path):
 
 
 def test_the_numbers_are_written_into_the_run_folder(world, tmp_path):
-    evaluation = evaluate_run(make_run(world, tmp_path), ["test"])
+    evaluation = evaluated(make_run(world, tmp_path), ["test"])
     assert json.loads((tmp_path / "evaluation.json").read_text()) == evaluation
     assert "aligned" not in evaluation
 
@@ -54,7 +59,7 @@ def test_aligned_scores_forgive_the_tracker_and_given_scores_do_not(world, tmp_p
     run = make_run(world, tmp_path, ("train", "test"))
     wrong = world.moved(run.recorded.frames[1], world.translation(0.9, 0.6), world.translation())
     run.recorded = replace(run.recorded, frames=(run.recorded.frames[0], wrong))
-    evaluation = evaluate_run(run, align=True)
+    evaluation = evaluated(run, align=True)
     given, aligned = evaluation["given"]["test"], evaluation["aligned"]["test"]
     assert aligned["psnr_instrument"] > given["psnr_instrument"] + 3
     assert aligned["mask_iou"] >= given["mask_iou"]
@@ -64,7 +69,7 @@ def test_aligned_scores_forgive_the_tracker_and_given_scores_do_not(world, tmp_p
 
 
 def test_without_truth_the_mask_numbers_are_null_and_a_note_says_so(world, tmp_path):
-    evaluation = evaluate_run(make_run(world, tmp_path, truth=False), ["test"])
+    evaluation = evaluated(make_run(world, tmp_path, truth=False), ["test"])
     numbers = evaluation["given"]["test"]
     assert numbers["mask_iou"] is None
     assert numbers["psnr_instrument"] is None
@@ -77,7 +82,7 @@ def test_reference_masks_of_some_frames_are_used_and_counted(world, tmp_path):
     mask = torch.zeros(world.HEIGHT, world.WIDTH, dtype=torch.uint8)
     mask[:10] = 255
     write_labels(run.recorded.root / "reference_masks" / "001.png", mask)
-    evaluation = evaluate_run(run, ["test"])
+    evaluation = evaluated(run, ["test"])
     numbers = evaluation["given"]["test"]
     assert numbers["mask_frames"] == 1
     assert 0 <= numbers["mask_iou"] < 1
@@ -86,7 +91,7 @@ def test_reference_masks_of_some_frames_are_used_and_counted(world, tmp_path):
 
 
 def test_a_scene_without_labels_has_no_mask_numbers(world, tmp_path):
-    evaluation = evaluate_run(make_run(world, tmp_path, labelled=False), ["test"])
+    evaluation = evaluated(make_run(world, tmp_path, labelled=False), ["test"])
     assert evaluation["given"]["test"]["mask_iou"] is None
     assert evaluation["given"]["test"]["psnr_instrument"] is not None
     assert any("carries no labels" in note for note in evaluation["notes"])
@@ -108,7 +113,7 @@ def test_ignored_pixels_do_not_count(world, tmp_path):
     scores = []
     for candidate in (open_frame, masked_frame):
         run.recorded = replace(run.recorded, frames=(run.recorded.frames[0], candidate))
-        scores.append(evaluate_run(run, ["test"])["given"]["test"])
+        scores.append(evaluated(run, ["test"])["given"]["test"])
     assert scores[0]["psnr"] < 30
     assert scores[1]["psnr"] > 45
     assert scores[1]["ssim"] > 0.99 > scores[0]["ssim"]
@@ -117,10 +122,10 @@ def test_ignored_pixels_do_not_count(world, tmp_path):
 def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
     run = make_run(world, tmp_path)
     with pytest.raises(NeecoError, match="no split 'tset'; it has train, test, unseen"):
-        evaluate_run(run, ["tset"])
+        evaluated(run, ["tset"])
     only_training = make_run(world, tmp_path / "other", ("train",))
     with pytest.raises(NeecoError, match="all frames are training frames"):
-        evaluate_run(only_training)
+        evaluated(only_training)
 
 
 def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
@@ -142,7 +147,7 @@ def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_p
         monkeypatch.setattr(evaluate, "find_lpips", lambda folder: {"alexnet": network})
         monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
         monkeypatch.setattr(lpips, "conv2d", noting("lpips", lpips.conv2d))
-        evaluate_run(make_run(world, tmp_path), ["test"])
+        evaluated(make_run(world, tmp_path), ["test"])
         assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
     finally:
         torch.set_num_threads(before)
@@ -175,3 +180,10 @@ def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "photographs it never saw. " in (run.path / "report.html").read_text()
+
+
+def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):
+    waited = []
+    monkeypatch.setattr(evaluate, "synchronise", waited.append)
+    evaluated(make_run(world, tmp_path), ["test"])
+    assert waited == [torch.device("cpu")] * (evaluate.TIMED_DRAWS + 2)

@@ -12,9 +12,8 @@ from PIL import Image
 
 from neeco import cli
 from neeco.errors import NeecoError
-from neeco.evaluation.boundary import boundary_f, boundary_pixels
-from neeco.evaluation.boxes import average_precision, box_ious, boxes_of
 from neeco.evaluation.mask_folders import parse_classes, read_ids
+from neeco.evaluation.mask_metrics import average_precision, boundary_f, boundary_pixels, box_ious, boxes_of
 from neeco.evaluation.mask_scores import score_masks
 
 TINY_MASKS = arrays(bool, st.tuples(st.integers(2, 9), st.integers(2, 9)))

@@ -23,11 +23,11 @@ from neeco.training import train as train_module
 from neeco.training.run import read_config
 
 SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
-NEVER = "labels were not asked for"
 
 
-def no_labels(path: Path, splits) -> dict:
-    raise AssertionError(NEVER)
+@pytest.fixture(autouse=True)
+def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ablation_run, "score_label_ways", lambda *_: pytest.fail("labels were not asked for"))
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Abla
 
 def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
     told: set[str] = set()
-    ablation = run_ablations(plan, no_labels, progress=lambda news: told.add(news.job.name))
+    ablation = run_ablations(plan, progress=lambda news: told.add(news.job.name))
     names = ["neeco-no-uniform-motion", "neeco", "neeco-no-density"]
     assert [run["name"] for run in ablation["runs"]] == names
     assert told == set(names)
@@ -64,9 +64,9 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
 
 
 def test_a_second_start_trains_nothing_and_says_the_same(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = run_ablations(plan, no_labels)
+    first = run_ablations(plan)
     monkeypatch.setattr(jobs, "train", lambda *_, **__: pytest.fail("trained again"))
-    assert run_ablations(plan, no_labels) == first
+    assert run_ablations(plan) == first
 
 
 def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +78,7 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
         return real(capture, folder, *rest, **more)
 
     monkeypatch.setattr(jobs, "train", fails)
-    ablation = run_ablations(plan, no_labels)
+    ablation = run_ablations(plan)
     assert ablation["failures"] == [{"run": "neeco-no-density", "error": "the loss became nan"}]
     off, on = ablation["tables"][1]["rows"]
     assert (off["values"], off["agrees"]) == ({}, {"psnr.test": None})
@@ -89,15 +89,16 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
 def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def score(path: Path, splits) -> dict:
-        asked.append(path.name)
+    def score(run, capture, splits) -> dict:
+        asked.append(run.path.name)
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
     labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL)
     monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
+    monkeypatch.setattr(ablation_run, "score_label_ways", score)
     for _ in range(2):
-        table = run_ablations(labels, score)["tables"][0]
+        table = run_ablations(labels)["tables"][0]
     assert asked == ["neeco"]
     assert table["rows"][0]["values"] == {"mask_iou.test": 0.6, "mask_iou.unseen": 0.6}
     assert table["rows"][0]["difference"]["mask_iou.test"] == pytest.approx(-0.3)
@@ -122,7 +123,7 @@ def _neeco(job) -> bool:
 )
 def test_what_cannot_be_run_is_refused_before_anything_is_written(changes: dict, named: str, plan) -> None:
     with pytest.raises(NeecoError, match=named.replace("(", r"\(")):
-        run_ablations(AblationPlan(**{**vars(plan), **changes}), no_labels)
+        run_ablations(AblationPlan(**{**vars(plan), **changes}))
     assert not plan.output.exists()
 
 
@@ -130,14 +131,14 @@ def test_a_damaged_capture_is_refused_before_anything_is_written(plan: AblationP
     image = next((plan.capture / "images").iterdir())
     image.write_bytes(b"no image")
     with pytest.raises(NeecoError, match=rf"{image.name}: not an image file"):
-        run_ablations(plan, no_labels)
+        run_ablations(plan)
     assert not plan.output.exists()
 
 
 def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
-    run_ablations(plan, no_labels)
+    run_ablations(plan)
     with pytest.raises(NeecoError, match="12 iterations, not 13 iterations; give another --output"):
-        run_ablations(AblationPlan(**{**vars(plan), "iterations": 13}), no_labels)
+        run_ablations(AblationPlan(**{**vars(plan), "iterations": 13}))
 
 
 def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_meanings() -> None:
@@ -204,7 +205,7 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
 
 
 def test_fewer_frames_are_spread_over_the_recording_and_all_others_stay(capture: Path, tmp_path: Path) -> None:
-    made = derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "half")
+    made = derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, tmp_path / "half")
     before, after = read_capture(capture), read_capture(made)
     train = [frame.name for frame in before.split("train")]
     assert [frame.name for frame in after.split("train")] == [train[0], train[2], train[5]]
@@ -217,7 +218,7 @@ def test_fewer_frames_are_spread_over_the_recording_and_all_others_stay(capture:
 def test_noise_is_seeded_grows_with_its_level_and_spares_held_out_frames(capture: Path, tmp_path: Path) -> None:
     def moved(level: float, seed: int) -> dict[str, torch.Tensor]:
         recipe = Derived(f"noise-{level}", noise_mm=level)
-        made = derive_capture(capture, "transforms.json", recipe, seed, tmp_path / f"{level}-{seed}")
+        made = derive_capture(read_capture(capture), "transforms.json", recipe, seed, tmp_path / f"{level}-{seed}")
         pairs = zip(read_capture(capture).frames, read_capture(made).frames, strict=True)
         return {
             f"{old.split} {old.name}": new.state.instruments["bar"].pose - old.state.instruments["bar"].pose
@@ -236,13 +237,13 @@ def test_noise_is_seeded_grows_with_its_level_and_spares_held_out_frames(capture
 
 
 def test_a_derived_capture_is_kept_and_another_recipe_refused(capture: Path, tmp_path: Path) -> None:
-    made = derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "made")
+    made = derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, tmp_path / "made")
     written = (made / "transforms.json").stat().st_mtime_ns
-    assert derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, made) == made
+    assert derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, made) == made
     assert (made / "transforms.json").stat().st_mtime_ns == written
     with pytest.raises(NeecoError, match=r"derived.json: train_share: is 0.5, not 0.25; give another --output"):
-        derive_capture(capture, "transforms.json", Derived("half", 0.25), 0, made)
+        derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.25), 0, made)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.txt").write_text("all of it")
     with pytest.raises(NeecoError, match="not empty, and not made by ablate"):
-        derive_capture(capture, "transforms.json", Derived("half", 0.5), 0, tmp_path / "taken")
+        derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, tmp_path / "taken")

@@ -21,9 +21,9 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.experiments import jobs as jobs_module
-from neeco.experiments.comparison import ComparisonSpec, compare
-from neeco.experiments.distance import distances_to_training
+from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
 from neeco.experiments.jobs import Budget
+from neeco.experiments.summary import distances_to_training
 from neeco.training.session import Session
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "machine", "milliseconds")
@@ -32,6 +32,10 @@ TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "mach
 @pytest.fixture
 def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
     return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2)
+
+
+def compared(spec: ComparisonSpec, **told):
+    return compare(plan_comparison(spec), **told)
 
 
 def without_times(value):
@@ -43,7 +47,7 @@ def without_times(value):
 
 def test_a_comparison_holds_what_its_runs_hold(spec: ComparisonSpec) -> None:
     stages: set[str] = set()
-    result = compare(spec, stage=lambda what, done, total: stages.add(what))
+    result = compared(spec, progress=lambda what, done, total: stages.add(what))
     output = spec.output
     assert result == json.loads((output / "comparison.json").read_text())
     assert result["schema"] == "neeco-comparison/1"
@@ -80,10 +84,15 @@ def test_a_comparison_holds_what_its_runs_hold(spec: ComparisonSpec) -> None:
     assert "lpips: no weights" in (output / "comparison.md").read_text()
 
 
+def test_jobs_of_this_process_are_handed_the_capture(spec: ComparisonSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jobs_module, "read_capture", lambda *_: pytest.fail("read again"))
+    assert compared(replace(spec, methods=("3dgs",), seeds=1))["complete"]
+
+
 def test_interrupted_it_goes_on_to_the_same_comparison(
     spec: ComparisonSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = compare(replace(spec, output=tmp_path / "whole"))
+    expected = compared(replace(spec, output=tmp_path / "whole"))
     step, steps = Session.step, [0]
 
     def interrupted(session: Session):
@@ -96,11 +105,11 @@ def test_interrupted_it_goes_on_to_the_same_comparison(
     with monkeypatch.context() as patched:
         patched.setattr(Session, "step", interrupted)
         with pytest.raises(KeyboardInterrupt, match=r"job 2 of 4 \(3dgs\+dta, seed 0\), at iteration 5; run the same"):
-            compare(spec)
+            compared(spec)
     half = json.loads((spec.output / "comparison.json").read_text())
     assert not half["complete"]
     assert [job["name"] for job in half["jobs"]] == ["3dgs"]
-    result = compare(spec)
+    result = compared(spec)
     for key in ("jobs", "summary", "distance", "splits", "methods", "notes"):
         assert without_times(result[key]) == without_times(expected[key])
 
@@ -108,7 +117,7 @@ def test_interrupted_it_goes_on_to_the_same_comparison(
 def test_more_seeds_and_methods_are_added_without_training_the_others_again(
     spec: ComparisonSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compare(replace(spec, methods=("3dgs",), seeds=1))
+    compared(replace(spec, methods=("3dgs",), seeds=1))
     trained: list[str] = []
     train = jobs_module.train
 
@@ -117,7 +126,7 @@ def test_more_seeds_and_methods_are_added_without_training_the_others_again(
         return train(capture, output, *rest, **options)
 
     monkeypatch.setattr(jobs_module, "train", counted)
-    result = compare(replace(spec, methods=("3dgs", "3dgs+dta"), seeds=1))
+    result = compared(replace(spec, methods=("3dgs", "3dgs+dta"), seeds=1))
     assert trained == ["3dgs+dta-seed0"]
     assert len(result["jobs"]) == 2
 
@@ -149,7 +158,7 @@ def test_a_failed_run_is_told_in_its_place_and_ends_with_status_1(
 
 def test_masks_of_others_stand_in_the_same_table(spec: ComparisonSpec, tmp_path: Path) -> None:
     shutil.copytree(spec.capture / "truth" / "masks", tmp_path / "perfect")
-    result = compare(replace(spec, methods=("kinematic",), seeds=1, masks={"perfect": tmp_path / "perfect"}))
+    result = compared(replace(spec, methods=("kinematic",), seeds=1, masks={"perfect": tmp_path / "perfect"}))
     rows = {(row["name"], row["split"]): row for row in result["summary"]}
     for key in ("iou", "challenge_iou", "challenge_iou_parts", "dice", "boundary_f", "box_ap"):
         assert rows["perfect", "test"][key]["mean"] == 1.0
@@ -211,19 +220,19 @@ def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(
 
 def test_an_output_that_holds_something_else_is_refused(spec: ComparisonSpec, tmp_path: Path) -> None:
     short = replace(spec, methods=("3dgs",), seeds=1)
-    compare(short)
+    compared(short)
     with pytest.raises(NeecoError, match="budget: compares after 10 iterations, not 11 iterations; give another"):
-        compare(replace(short, budget=Budget(None, 11)))
+        compared(replace(short, budget=Budget(None, 11)))
     other = shutil.copytree(spec.capture, tmp_path / "other")
     with pytest.raises(NeecoError, match="capture: compares methods on"):
-        compare(replace(short, capture=other))
+        compared(replace(short, capture=other))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("do not touch")
     with pytest.raises(NeecoError, match="not empty, and no comparison"):
-        compare(replace(short, output=tmp_path / "full"))
+        compared(replace(short, output=tmp_path / "full"))
     (tmp_path / "file").write_text("")
     with pytest.raises(NeecoError, match="is a file"):
-        compare(replace(short, output=tmp_path / "file"))
+        compared(replace(short, output=tmp_path / "file"))
 
 
 def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: ComparisonSpec) -> None:
@@ -234,12 +243,12 @@ def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: Compar
         frame.pop("instruments")
     path.write_text(json.dumps(document))
     with pytest.raises(NeecoError, match="--methods: neeco needs instrument states"):
-        compare(replace(spec, methods=("3dgs", "neeco")))
+        compared(replace(spec, methods=("3dgs", "neeco")))
 
 
 def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None:
     given = ("tissue_budget=70", "deformation.width=16")
-    result = compare(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
+    result = compared(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
     configs = {
         name: yaml.safe_load((spec.output / "runs" / f"{name}-seed0" / "config.yaml").read_text())
         for name in ("3dgs", "neeco")
@@ -253,12 +262,12 @@ def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None
 @pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.moments=4", "no_such_field=1"])
 def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given: str) -> None:
     with pytest.raises(NeecoError, match="--set"):
-        compare(replace(spec, assignments=(given,)))
+        compared(replace(spec, assignments=(given,)))
     assert not spec.output.exists()
 
 
 def test_workers_without_ray_are_refused_before_anything_is_written(spec: ComparisonSpec, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(NeecoError, match=r"neeco\[cluster\]"):
-        compare(replace(spec, workers=2))
+        compared(replace(spec, workers=2))
     assert not spec.output.exists()

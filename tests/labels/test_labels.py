@@ -4,23 +4,15 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.labels.annotation import annotate, project, visibility
-from neeco.labels.drawing import (
-    CompositedLabels,
-    DeltaThresholds,
-    ThresholdLabels,
-    draw,
-    find_thresholds,
-    otsu_of_magnitudes,
-)
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import draw, draw_layers
+from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
 from neeco.raster.types import Camera
-from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, buried_depth, find_tolerance
-
-ACCEPTANCE = Acceptance(min_share=0.005, tolerance_mm=2.0)
 
 
 def labelled(scene, state, camera, labeller=None):
     labeller = labeller or CompositedLabels(scene)
-    drawing = draw(scene, labeller, state, camera, 0.01)
+    drawing = draw_layers(scene, labeller, state, camera, 0.01)
     (label,) = annotate(scene, drawing, labeller.names)
     return drawing, label
 
@@ -128,12 +120,12 @@ def test_thresholds_given_are_used(scene, state):
 
 def test_otsu_falls_between_two_clusters_orders_of_magnitude_apart():
     rng = np.random.default_rng(0)
-    low, high = 1e-3 * rng.lognormal(0, 0.5, 900), 5.0 * rng.lognormal(0, 0.3, 100)
-    limit = otsu_of_magnitudes(np.concatenate([low, high]))
+    low, high = (torch.from_numpy(x) for x in (1e-3 * rng.lognormal(0, 0.5, 900), 5.0 * rng.lognormal(0, 0.3, 100)))
+    limit = otsu_of_magnitudes(torch.cat([low, high]))
     assert low.max() < limit < high.min()
-    assert otsu_of_magnitudes(np.concatenate([np.zeros(900), high])) < high.min()
-    assert otsu_of_magnitudes(np.zeros(10)) is None
-    assert otsu_of_magnitudes(np.ones(10)) is None
+    assert otsu_of_magnitudes(torch.cat([torch.zeros(900), high])) < high.min()
+    assert otsu_of_magnitudes(torch.zeros(10)) is None
+    assert otsu_of_magnitudes(torch.ones(10)) is None
 
 
 def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monkeypatch):
@@ -146,56 +138,15 @@ def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monke
         find_thresholds(scene)
 
 
-def test_recorded_states_are_acceptable(scene, camera):
-    for recorded in scene.recorded.states[:4]:
-        drawing, _ = labelled(scene, recorded, camera)
-        assert ACCEPTANCE.why_refused(scene, drawing) is None
-
-
-@pytest.mark.parametrize(
-    ("placed", "reason"),
-    [
-        ({"x": 60.0}, LEAVES_IMAGE),
-        ({"y": 60.0}, LEAVES_IMAGE),  # the shaft crosses the image, the working end is below it
-        ({"z": 110.0}, ENTERS_TISSUE),  # wholly behind the wall
-        ({"z": 99.0}, None),  # touching
-    ],
-)
-def test_states_out_of_the_image_or_behind_the_tissue_are_refused(scene, state, camera, placed, reason):
-    drawing, _ = labelled(scene, state(**placed, jaw=0.0), camera)
-    assert ACCEPTANCE.why_refused(scene, drawing) == reason
-
-
-def test_a_tip_in_the_tissue_is_refused_unless_the_check_is_off(scene, state, camera):
-    dipping = state(z=97.0, jaw=0.8)  # the jaw turns its tips away from the camera, 7 mm deeper than the hinge
-    drawing, _ = labelled(scene, dipping, camera)
-    assert ACCEPTANCE.why_refused(scene, drawing) == ENTERS_TISSUE
-    assert Acceptance(0.005, None).why_refused(scene, drawing) is None
-    assert Acceptance(0.005, 20.0).why_refused(scene, drawing) is None
-
-
-def test_buried_depth_is_how_far_the_tip_lies_behind_the_surface(scene, state, camera):
-    drawing, _ = labelled(scene, state(z=97.0, jaw=0.8), camera)
-    assert buried_depth(scene, drawing) == pytest.approx(97 + 10 * np.sin(0.8) - 100, abs=0.5)
-    drawing, _ = labelled(scene, state(z=70.0), camera)
-    assert buried_depth(scene, drawing) == 0
-
-
-def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camera, monkeypatch):
-    labeller = CompositedLabels(scene)
-    assert find_tolerance(scene, labeller) == 2.0
-    from neeco.scene import Recording
-
-    dipping = (state(z=96.0, jaw=0.8),) * 3
-    monkeypatch.setattr(scene, "recorded", Recording(("0",) * 3, ("train",) * 3, dipping, (camera,) * 3))
-    tolerance = find_tolerance(scene, labeller)
-    assert 2.5 < tolerance < 4.5
-    drawing, _ = labelled(scene, dipping[0], camera)
-    assert Acceptance(0.005, tolerance).why_refused(scene, drawing) is None
-
-
 def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camera):
     labeller = ThresholdLabels(scene, DeltaThresholds(means=1e6, quats=None, scales=None))
     drawing, label = labelled(scene, state(), camera, labeller)
     assert not drawing.parts.any()
     assert label.shape is None
+
+
+def test_a_drawing_and_its_layers_agree(scene, state, camera):
+    layered = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.0)
+    drawing = draw(scene, state(), camera)
+    assert (drawing.image == layered.image).all()
+    assert (drawing.parts == layered.parts).all()

@@ -30,7 +30,7 @@ def reported(world, tmp_path_factory):
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)) + '\n{"iteration": 5')
     (folder / "config.yaml").write_text("method: tiny\nnote: <b>\n")
-    evaluation = evaluate_run(world.TinyRun(folder, scene, capture), align=True)
+    evaluation = evaluate_run(world.TinyRun(folder, scene, capture), capture, align=True)
     path = write_report(folder, evaluation, capture, scene, synthesis_preview=capture.frames[0].image_path)
     return folder, capture, scene, evaluation, path
 

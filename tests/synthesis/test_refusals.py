@@ -14,7 +14,6 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.progress import counting
 from neeco.synthesis.settings import Settings
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, tries=3)
@@ -139,15 +138,6 @@ def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monke
     assert not [path for path in cut.rglob(".*") if path.is_file()]  # no half-written file
     assert synthesize(run, cut, SETTINGS, resume=True).made_now == 3
     assert contents(cut) == contents(whole)
-
-
-def test_a_progress_bar_says_nothing_before_there_is_news(capsys):
-    with pytest.raises(NeecoError), counting("synthesize", 3):
-        raise NeecoError("bad input")
-    assert capsys.readouterr().err == ""
-    with counting("synthesize", 3) as advance:
-        advance(3)
-    assert "3/3" in capsys.readouterr().err
 
 
 def test_a_given_state_with_its_own_camera_is_tried_once_and_not_counted_as_drawn(run, tmp_path, state):

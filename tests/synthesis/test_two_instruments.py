@@ -6,7 +6,9 @@ import torch
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
-from neeco.labels.drawing import CompositedLabels, ThresholdLabels, draw
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import draw_layers
+from neeco.labels.threshold import ThresholdLabels
 from neeco.scene import CanonicalGaussians, Recording, Scene
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
 from neeco.synthesis.states import Inside
@@ -64,7 +66,7 @@ def bars(request) -> Scene:
 @pytest.mark.parametrize(("front", "state"), [("upright", at(60, 70)), ("level", at(70, 60))])
 def test_the_instrument_in_front_hides_the_other(bars, camera, front, state):
     labeller = CompositedLabels(bars)
-    drawing = draw(bars, labeller, state, camera, 0.01)
+    drawing = draw_layers(bars, labeller, state, camera, 0.01)
     labels = {label.name: label for label in annotate(bars, drawing, labeller.names)}
     assert drawing.parts[24, 32] == {"upright": 1, "level": 2}[front]
     back = "level" if front == "upright" else "upright"
@@ -81,7 +83,7 @@ def test_threshold_labels_tell_instruments_apart_by_nearness(bars, camera):
     assert (owners[:WALL] == -1).all()
     assert (owners[WALL : WALL + BAR] == 0).all()
     assert (owners[WALL + BAR :] == 1).all()
-    assert draw(bars, labeller, state, camera, 0.01).parts[24, 32] == 1
+    assert draw_layers(bars, labeller, state, camera, 0.01).parts[24, 32] == 1
 
 
 def test_bodies_sampled_together_are_moved_together(bars):

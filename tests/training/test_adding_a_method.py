@@ -95,7 +95,7 @@ def test_it_beats_a_still_scene_where_tissue_breathes(tmp_path: Path) -> None:
     for name, assignments in (("breathing", ["deformation.period=2.1"]), ("3dgs", [])):
         config = training_config(name, {"iterations": 150}, assignments)
         run = load_run(train(capture, tmp_path / name, config))
-        scores[name] = evaluate_run(run, ["test"])["given"]["test"]["psnr"]
+        scores[name] = evaluate_run(run, run.capture(), ["test"])["given"]["test"]["psnr"]
     assert scores["breathing"] > scores["3dgs"] + 3
     learned = load_scene(tmp_path / "breathing" / "scene.safetensors").deformation
     assert float(learned.log_period.exp()) == pytest.approx(PERIOD, rel=0.05)

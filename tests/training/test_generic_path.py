@@ -1,9 +1,10 @@
-"""Training through plain torch (loss, Adam, the reference rasteriser), as on any device, learns what the kernels learn."""
+"""Training through plain torch (loss, Adam, the reference rasteriser), as on any device, learns what kernels learn."""
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -15,11 +16,11 @@ from neeco.raster.native import Family
 from neeco.scene.learning import Session, Start
 from neeco.scene.methods import METHODS
 from neeco.training.initial import gaussian_session
+from neeco.training.instruments import discovery
 from neeco.training.options import training_config
 from neeco.training.views import TrainingViews
 
 STEPS = 200
-FIRST = 20  # steps over which differences of rounding have not grown
 SMALL = {
     "neeco": ["deformation.depth=3", "deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
@@ -42,13 +43,19 @@ def begun(method: str, folder: Path) -> Session:
 
 
 @pytest.mark.parametrize("method", list(METHODS))
-def test_two_hundred_steps_agree(method: str, tmp_path: Path) -> None:
+def test_two_hundred_steps_agree(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Losses within float32's rounding. A field's first gradients are noise, whose sign Adam follows: there, the end."""
+    monkeypatch.setattr(discovery, "SEEDS", 300)  # the reference sees every Gaussian at every pixel
     losses: dict[Family, torch.Tensor] = {}
     sizes: dict[Family, int | None] = {}
-    for family in ("native", "torch"):
+    for family in get_args(Family):
         session = begun(method, tmp_path / "capture")
         with kernels(family):
             losses[family] = torch.tensor([session.step().loss for _ in range(STEPS)])
         sizes[family] = session.scene.num_gaussians
     native, plain = losses["native"], losses["torch"]
-    print(method, ((plain - native).abs() / native)[:FIRST].max(), (plain - native).abs().max(), native[-20:].mean(), plain[-20:].mean(), native[:20].mean(), sizes)
+    assert sizes["native"] == sizes["torch"]
+    if METHODS[method].has_gaussians:
+        assert float((plain - native).abs().max()) < 1e-4
+    assert float(plain[-20:].mean()) == pytest.approx(float(native[-20:].mean()), rel=5e-3)
+    assert float(native[-20:].mean()) < 0.97 * float(native[:20].mean())  # and they learn

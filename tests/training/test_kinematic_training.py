@@ -67,7 +67,7 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
     assert abs(float(pivot[2]) - PIVOT_MM) < 6
 
     run = load_run(first)  # images of two sizes all the way
-    evaluation = evaluate_run(run, ("test",), align=True)
+    evaluation = evaluate_run(run, run.capture(), ("test",), align=True)
     assert evaluation["given"]["test"]["frames"] == 4
     synthesize(run, tmp_path / "dataset", Settings(count=4, tissue_check=False, min_share=1e-4))
 

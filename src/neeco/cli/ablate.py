@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.text import Text
 
 from neeco.cli._tables import fitted
-
-if TYPE_CHECKING:
-    from neeco.experiments.jobs import JobNews
 
 
 @dataclass(frozen=True)
@@ -46,10 +43,10 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
+    from neeco.cli._bars import Bars
     from neeco.experiments.ablation_run import AblationPlan, run_ablations
     from neeco.experiments.ablation_tables import write_tables
     from neeco.report.ablation_page import write_ablation_report
-    from neeco.synthesis.label_ways import score_label_ways
 
     plan = AblationPlan(
         args.capture,
@@ -61,43 +58,14 @@ def run(args: Arguments) -> int:
         args.transforms,
         args.set,
     )
-    with _Bar() as bar:
-        ablation = run_ablations(plan, score_label_ways, args.workers, bar.show)
+    with Bars() as bars:
+        ablation = run_ablations(plan, args.workers, bars.job)
     write_tables(args.output, ablation)
     page = write_ablation_report(args.output, ablation)
     _print_tables(Console(), ablation)
     for line in (f"tables: {args.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
         print(line)
     return 1 if ablation["failures"] else 0
-
-
-class _Bar:
-    """All runs as one bar on stderr; it appears with the first news, so that bad input ends in its one line alone."""
-
-    def __init__(self) -> None:
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = [BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()]
-        self.bar = Progress(*columns, console=Console(stderr=True))
-        self.task = self.bar.add_task("starting", total=None)
-        self.shares: dict[int, float] = {}
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar.live.is_started:
-            self.bar.stop()
-
-    def show(self, news: JobNews) -> None:
-        """One piece of news from the jobs; training counts as nine tenths of a run."""
-        self.bar.start()
-        share = {"training": 0.9 * news.share, "evaluating": 0.9 + 0.1 * news.share}.get(news.stage, 1.0)
-        self.shares[news.index] = share
-        text = f"run {news.index + 1} of {news.total}: {news.job.name}  {news.stage}  {news.text}"
-        self.bar.update(self.task, total=news.total, completed=sum(self.shares.values()), description=text)
-        if news.stage == "failed":
-            self.bar.console.print(f"failed: {news.job.name}: {news.text}", style="red", markup=False)
 
 
 def _print_tables(console: Console, ablation: dict[str, Any]) -> None:

@@ -57,16 +57,16 @@ class Compare:
 
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
-    from neeco.capture import read_capture
-    from neeco.cli._jobs import JobBars
-    from neeco.experiments.comparison import compare, failures
+    from neeco.cli._bars import Bars
+    from neeco.experiments.comparison import compare, failures, plan_comparison
     from neeco.experiments.comparison_tables import absent_notes, budget_words, tables_of
     from neeco.report.comparison_page import write_comparison_report
 
-    with JobBars() as bars:
-        comparison = compare(_spec(args), bars.show, bars.stage)
+    with Bars() as bars:
+        plan = plan_comparison(_spec(args))
+        comparison = compare(plan, bars.job, bars.stage)
         bars.stage("report", 0, 1)
-        page = write_comparison_report(args.output, comparison, read_capture(args.capture, args.transforms))
+        page = write_comparison_report(args.output, comparison, plan.capture)
         bars.stage("report", 1, 1)
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)

@@ -95,8 +95,8 @@ def _train(capture: Path, output: Path, minutes: float) -> Run:
 
 
 def _synthesize(trained: Run, output: Path) -> None:
+    from neeco.cli._bars import counting
     from neeco.synthesis.dataset import synthesize
-    from neeco.synthesis.progress import counting
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
@@ -109,9 +109,10 @@ def _evaluate(trained: Run, dataset: Path) -> Path:
     from neeco.report import write_report
 
     print("4/4 evaluate on frames kept from training")
-    evaluation = evaluate_run(trained)
+    capture = trained.capture()
+    evaluation = evaluate_run(trained, capture)
     for split, numbers in evaluation["given"].items():
         iou = "" if numbers["mask_iou"] is None else f", mask IoU {numbers['mask_iou']:.3f}"
         print(f"  {split}: PSNR {numbers['psnr']:.2f} dB{iou}")
     preview = dataset / "preview.png"
-    return write_report(trained.path, evaluation, trained.capture(), trained.scene, synthesis_preview=preview)
+    return write_report(trained.path, evaluation, capture, trained.scene, synthesis_preview=preview)

@@ -5,15 +5,11 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
-
-if TYPE_CHECKING:
-    from neeco.training.run import Run
 
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),
@@ -47,21 +43,27 @@ class Evaluate:
 
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
+    from neeco.cli._bars import Bars
     from neeco.errors import NeecoError
+    from neeco.evaluation.evaluate import evaluate_run
     from neeco.files import new_folder, write_json
     from neeco.report import write_report
     from neeco.training.run import load_run
 
     console = Console()
     trained = load_run(args.run)
+    capture = trained.capture()
     with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
         checked.enter_context(new_folder(args.run))
         if args.json is not None:
             if args.json.is_dir():
                 raise NeecoError(f"--json: {args.json} is a folder; name a file")
             checked.enter_context(new_folder(args.json.parent))
-        evaluation = _evaluated(args, trained)
-        page = write_report(args.run, evaluation, trained.capture(), trained.scene)
+        with Bars() as bars:
+            evaluation = evaluate_run(
+                trained, capture, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=bars.stage
+            )
+        page = write_report(args.run, evaluation, capture, trained.scene)
         if args.json is not None:
             write_json(args.json, evaluation)
     console.print(_table(evaluation))
@@ -69,36 +71,6 @@ def run(args: Evaluate) -> int:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
     console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
     return 0
-
-
-def _evaluated(args: Evaluate, trained: Run) -> dict[str, Any]:
-    """What `evaluate_run` finds, with a bar for every split."""
-    from neeco.evaluation.evaluate import evaluate_run
-
-    bar = _progress()
-    try:
-        tasks: dict[str, TaskID] = {}
-
-        def report(what: str, done: int, total: int) -> None:
-            bar.start()  # not before: bad input ends in its one line alone
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done, total=total)
-
-        return evaluate_run(trained, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=report)
-    finally:
-        if bar.live.is_started:
-            bar.stop()
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    )
 
 
 def _table(evaluation: dict[str, Any]) -> Table:

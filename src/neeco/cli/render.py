@@ -26,7 +26,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Draw, and say where it lies."""
-    from neeco.synthesis.progress import counting
+    from neeco.cli._bars import counting
     from neeco.synthesis.render import STATES_FOLDER, render, split_views, state_views
     from neeco.training.run import load_run
 

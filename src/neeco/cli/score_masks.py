@@ -42,11 +42,11 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Score, print a table."""
+    from neeco.cli._bars import counting
     from neeco.errors import NeecoError
     from neeco.evaluation.mask_folders import parse_classes
     from neeco.evaluation.mask_scores import score_masks
     from neeco.files import new_folder, write_json
-    from neeco.synthesis.progress import counting
 
     with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
         if arguments.json is not None:

@@ -52,8 +52,8 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
+    from neeco.cli._bars import counting
     from neeco.synthesis.dataset import synthesize
-    from neeco.synthesis.progress import counting
     from neeco.training.run import load_run
 
     settings = Settings(**{name: getattr(arguments, name) for name in Settings.__dataclass_fields__})

@@ -87,8 +87,8 @@ class _Problem:
         return self.scene.at(self.moved_state(parameters))
 
     def draw(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
-        """The image [h, w, 3] at the moved camera."""
-        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color
+        """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
+        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
 
 
 @torch.no_grad()
@@ -182,7 +182,7 @@ def _scale(config: AlignConfig) -> float:
 
 def _smooth(difference: Tensor, weight: Tensor) -> Tensor:
     """A 3x3 binomial blur of the counted pixels of [h, w, 3]: an edge's residual stays linear over a larger shift."""
-    taps = torch.tensor([0.25, 0.5, 0.25], dtype=difference.dtype)
+    taps = difference.new_tensor([0.25, 0.5, 0.25])
     kernel = (taps[:, None] * taps)[None, None]
     planes = (difference * weight[..., None]).permute(2, 0, 1)[:, None]
     return conv2d(planes, kernel, padding=1)[:, 0].permute(1, 2, 0)

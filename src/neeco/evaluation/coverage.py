@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
 from neeco.labels.composited import composited_parts
-from neeco.raster.types import Camera
+from neeco.raster.types import Camera, Rendering
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
@@ -77,7 +77,7 @@ def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
     for frame in chosen:
         camera = _small(frame.camera)
         rendering = scene.draw(frame.state, camera)
-        drawn.append((scene.camera(camera), _filled(rendering.depth, rendering.alpha)))
+        drawn.append((scene.camera(camera), _filled(rendering)))
     height = max((camera.height for camera, _ in drawn), default=1)
     width = max((camera.width for camera, _ in drawn), default=1)
     depths = torch.zeros(len(drawn), height, width)
@@ -85,7 +85,7 @@ def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
         depths[index, : depth.shape[0], : depth.shape[1]] = depth
     cameras = [camera for camera, _ in drawn]
     return Coverage(
-        _stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras], (4, 4)),
+        _stack([torch.linalg.inv(camera.world_from_camera.cpu().double()).float() for camera in cameras], (4, 4)),
         torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras]).reshape(-1, 4),
         depths,
         torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.long).reshape(-1, 2),
@@ -103,8 +103,8 @@ def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Te
     rendering = scene.draw(frame.state, camera, labels=True)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
-        tissue = composited_parts(rendering) == 0
-    points = _backproject(_filled(rendering.depth, rendering.alpha), scene.camera(camera))  # [h, w, 3]
+        tissue = composited_parts(rendering).cpu() == 0
+    points = _backproject(_filled(rendering), scene.camera(camera))  # [h, w, 3]
     unseen = torch.zeros_like(tissue)
     unseen[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)
@@ -116,20 +116,21 @@ def _small(camera: Camera) -> Camera:
     return resize_camera(camera, min(1.0, max(FACTOR, MIN_SIDE / min(camera.width, camera.height))))
 
 
-def _filled(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Depth [h, w], thin or empty pixels (alpha < 0.5) taking the nearest solid pixel's; unchanged if none is solid."""
-    hollow = (alpha < 0.5).numpy()
+def _filled(rendering: Rendering) -> Tensor:
+    """Depth [h, w] mm on the CPU, thin or empty pixels (alpha < 0.5) taking the nearest solid pixel's; as drawn if none
+    is solid."""
+    depth, hollow = rendering.depth.cpu().float(), (rendering.alpha.cpu() < 0.5).numpy()
     if not hollow.any() or hollow.all():
-        return depth.float()
+        return depth
     rows, columns = distance_transform_edt(hollow, return_distances=False, return_indices=True)
-    return depth.float()[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
+    return depth[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
 
 
 def _backproject(depth: Tensor, camera: Camera) -> Tensor:
     """World points [h, w, 3] (mm) of a depth map [h, w]."""
     rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     rays = torch.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1)
-    pose = camera.world_from_camera.float()
+    pose = camera.world_from_camera.cpu().float()
     return (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 
 

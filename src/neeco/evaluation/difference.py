@@ -1,8 +1,6 @@
-"""Pictures that show where a drawing is wrong: difference maps, masks over images, contact sheets."""
+"""Pictures that show where a drawing is wrong: difference maps, masks over images."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,20 +66,6 @@ def outline(mask: np.ndarray) -> np.ndarray:
     padded = np.pad(mask, 1, mode="edge")
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return mask & ~inner
-
-
-def contact_sheet(images: Sequence[Pixels], columns: int, gap: int = 4, background: int = 255) -> Pixels:
-    """Lay out images (uint8 [h, w, 3], any sizes) row by row on one sheet; cells take the largest image's size."""
-    if not images:
-        raise ValueError("a contact sheet needs at least one image")
-    height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
-    rows = -(-len(images) // columns)
-    columns = min(columns, len(images))
-    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), background, np.uint8)
-    for index, image in enumerate(images):
-        top, left = (index // columns) * (height + gap), (index % columns) * (width + gap)
-        sheet[top : top + image.shape[0], left : left + image.shape[1]] = image
-    return sheet
 
 
 def _colored(fraction: np.ndarray) -> Pixels:

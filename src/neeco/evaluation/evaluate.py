@@ -18,10 +18,12 @@ from neeco.evaluation.align import align_frame, moved_by
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips, find_lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
-from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, draw, photograph, score
+from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.composited import LABEL_THRESHOLD
+from neeco.labels.drawing import draw
+from neeco.raster.threads import synchronise
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 
@@ -56,20 +58,21 @@ class _Context:
 
 def evaluate_run(
     run: Run,
+    capture: Capture,
     splits: Sequence[str] | None = None,
     *,
     align: bool = False,
     lpips_weights: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Score a trained run on splits of its capture (None: all but `train`) and write `evaluation.json` into its folder.
+    """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
     "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}. None is
     "not known", never zero. psnr* in dB. Raises NeecoError for unknown splits, wrong LPIPS folders, unreadable frames.
     """
-    capture, scene = run.capture(), run.scene
-    splits = _chosen_splits(capture, splits)
+    scene = run.scene
+    splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")
     networks = find_lpips(lpips_weights)  # these keep torch's threads, the rest of the scoring takes fewer
@@ -115,11 +118,15 @@ def _evaluate_splits(
     return cleaned
 
 
-def _chosen_splits(capture: Capture, splits: Sequence[str] | None) -> tuple[str, ...]:
+def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tuple[str, ...]:
+    """The splits to score: `splits`, or all but `train`. Raises NeecoError for none, or one that the capture lacks."""
     if splits is None:
         splits = tuple(name for name in capture.splits if name != "train")
-        if not splits:
-            raise NeecoError(f"{capture.root}: split: all frames are training frames; score those with --splits train")
+    if not splits:
+        raise NeecoError(
+            f"{capture.root}: split: all frames are training frames; keep some for scoring (split test), or give "
+            "--splits train"
+        )
     for name in splits:
         if name not in capture.splits:
             raise NeecoError(f"--splits: {capture.root} has no split {name!r}; it has {', '.join(capture.splits)}")
@@ -189,7 +196,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     for index in range(TIMED_DRAWS + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
-        scene.draw(frame.state, frame.camera)
+        synchronise(scene.draw(frame.state, frame.camera).color.device)
         seconds.append(time.perf_counter() - start)
         if len(seconds) > 1 and sum(seconds) > TIMED_SECONDS:
             break

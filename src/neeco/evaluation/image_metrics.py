@@ -42,7 +42,10 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim_map(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """SSIM per pixel and channel, [H, W, 3]; arguments as in `ssim`."""
+    """SSIM per pixel and channel, [H, W, 3]; arguments as in `ssim`.
+
+    Not the loss's (`raster.losses.ssim_map`), which sums its window in another order: scores keep their last bits.
+    """
     if mask is not None:
         image = torch.where(mask[..., None], image, target)
     x = image.permute(2, 0, 1)  # [3, H, W]
@@ -59,14 +62,14 @@ def ssim_map(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tenso
 
 def _blur(planes: Tensor) -> Tensor:
     """Gaussian blur of [C, H, W] planes with zero padding; the window is separable, so two passes of 11 taps."""
-    window = _window(planes.dtype)
+    window = _window(planes.dtype, planes.device)
     pad = SSIM_WINDOW // 2
     rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))
     return conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
 
 
 @lru_cache(maxsize=2)
-def _window(dtype: torch.dtype) -> Tensor:
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
     offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    return (weights / weights.sum()).to(dtype)
+    return (weights / weights.sum()).to(device, dtype)

@@ -55,10 +55,11 @@ class Lpips:
     @torch.no_grad()
     def features(self, image: Tensor) -> list[Tensor]:
         """Unit-normalised feature maps, each [C, h, w], of an image [H, W, 3] in [0, 1]."""
-        shift = torch.tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
-        scale = torch.tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
+        image = image.float()
+        shift = image.new_tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
+        scale = image.new_tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
         maps: list[Tensor] = []
-        x = ((image.float().permute(2, 0, 1) * 2 - 1 - shift) / scale)[None]
+        x = ((image.permute(2, 0, 1) * 2 - 1 - shift) / scale)[None]
         with torch_threads(self.threads):
             for index, layer in enumerate(self.layers):
                 if layer.pool is not None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from neeco.capture import read_capture
 from neeco.capture.images import open_image, read_labels, read_mask
-from neeco.capture.model import Frame
+from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
 from neeco.evaluation.truth import REFERENCE_FOLDER
@@ -112,18 +112,26 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
     return _guessed(path, files, suffix == "", option)
 
 
-def open_truth(path: Path, classes: Mapping[int, str] | None = None, splits: Sequence[str] | None = None) -> Masks:
+def read_truth(path: Path) -> Capture | Path:
+    """The capture in the folder, or the folder itself where it holds masks and no capture. Raises NeecoError."""
+    if not path.is_dir():
+        raise NeecoError(f"{path}: no such folder; give a capture or a folder of masks")
+    is_capture = any((path / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER))
+    return read_capture(path) if is_capture else path
+
+
+def open_truth(
+    truth: Capture | Path, classes: Mapping[int, str] | None = None, splits: Sequence[str] | None = None
+) -> Masks:
     """The truth: a capture (`truth/masks`, else `reference_masks`, and its ignored pixels) or a folder of masks.
 
     splits: which frames of a capture; all that have a mask when None. Raises NeecoError.
     """
-    if not path.is_dir():
-        raise NeecoError(f"{path}: no such folder; give a capture or a folder of masks")
-    if not any((path / name).exists() for name in ("transforms.json", "truth", REFERENCE_FOLDER)):
+    if isinstance(truth, Path):
         if splits is not None:
-            raise NeecoError(f"--splits: {path} is a folder of masks and has no splits; give the capture instead")
-        return open_masks(path, classes, "--truth-classes")
-    capture = read_capture(path)
+            raise NeecoError(f"--splits: {truth} is a folder of masks and has no splits; give the capture instead")
+        return open_masks(truth, classes, "--truth-classes")
+    capture, path = truth, truth.root
     for split in splits or ():
         if split not in capture.splits:
             raise NeecoError(f"--splits: {path} has no split {split!r}; it has {', '.join(capture.splits)}")

@@ -1,4 +1,7 @@
-"""How well masks agree: intersection over union, Dice, and the same per part."""
+"""How well masks agree: intersection over union, Dice, and the same per part; contours; boxes.
+
+Boundary F and box AP are our own on purpose: DAVIS's contours to the pixel, and an AP of boxes without confidence.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from torch import Tensor
 
 TRUTH_PARTS: Mapping[str, int] = {"shaft": 1, "wrist": 2, "jaw_left": 3, "jaw_right": 4}
 PART_SCORES = ("shaft", "wrist", "jaw_left", "jaw_right", "jaws")
+BOUNDARY_TOLERANCE = 0.008  # of the image's diagonal, as DAVIS
+COCO_THRESHOLDS = tuple(np.linspace(0.5, 0.95, 10).round(2))
+RECALLS = np.linspace(0, 1, 101)
 
 
 def iou(mask: Tensor, truth: Tensor, counted: Tensor | None = None) -> float:
@@ -33,7 +42,7 @@ def _overlap(mask: Tensor, truth: Tensor, counted: Tensor | None) -> tuple[int, 
 
 def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tensor:
     """Renumber part ids [H, W] (column index + 1) to the truth's numbers; parts the truth does not name become 0."""
-    table = torch.zeros(len(label_names) + 1, dtype=torch.uint8)
+    table = torch.zeros(len(label_names) + 1, dtype=torch.uint8, device=parts.device)
     for index, (_, part) in enumerate(label_names):
         table[index + 1] = TRUTH_PARTS.get(part, 0)
     return table[parts.long()]
@@ -77,3 +86,86 @@ def mean_of(values: Sequence[float | None]) -> float:
     """Mean of the values that are numbers; NaN when there are none."""
     numbers = [value for value in values if value is not None and not math.isnan(value)]
     return sum(numbers) / len(numbers) if numbers else math.nan
+
+
+def boundary_pixels(mask: np.ndarray) -> np.ndarray:
+    """Contour of a bool mask [H, W], one pixel wide: pixels that differ from their right, lower or lower right
+    neighbour. What the image's edge cuts off is no contour."""
+    padded = np.pad(mask, ((0, 1), (0, 1)), mode="edge")
+    right, lower, diagonal = padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]
+    return (mask ^ right) | (mask ^ lower) | (mask ^ diagonal)
+
+
+def boundary_f(
+    mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None = None, tolerance: float = BOUNDARY_TOLERANCE
+) -> float:
+    """F-measure of two contours: harmonic mean of the shares of each that lie near the other (Perazzi et al., "A
+    benchmark dataset and evaluation methodology for video object segmentation", CVPR 2016, section 4.1).
+
+    mask, truth [H, W] bool; near: at most ceil(tolerance * diagonal) pixels apart, centre to centre. counted [H, W]:
+    contour pixels outside it need no counterpart, but may be one. NaN when neither mask has a pixel; 1 when there are
+    pixels but neither has a contour (both fill the image), 0 when only one has.
+    """
+    if not (mask.any() or truth.any()):
+        return math.nan
+    contours = boundary_pixels(mask), boundary_pixels(truth)
+    everywhere = np.ones(mask.shape, bool) if counted is None else counted
+    judged = [int((contour & everywhere).sum()) for contour in contours]
+    if not judged[0] or not judged[1]:
+        return float(judged[0] == judged[1] and mask.any() == truth.any())
+    radius = math.ceil(tolerance * math.hypot(*mask.shape))
+    window = _window(contours[0] | contours[1])  # distances outside it are never asked for
+    first, second, inside = (image[window] for image in (*contours, everywhere))
+    near_second = ndimage.distance_transform_edt(~second) <= radius
+    near_first = ndimage.distance_transform_edt(~first) <= radius
+    precision = int((first & inside & near_second).sum()) / judged[0]
+    recall = int((second & inside & near_first).sum()) / judged[1]
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _window(pixels: np.ndarray) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
+    """Boxes [n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about a bool mask [H, W].
+
+    One about all its pixels, or with `components` one about each group that touches by side or corner.
+    """
+    labels = ndimage.label(mask, np.ones((3, 3)))[0] if components else mask.astype(np.uint8)
+    found = [(x.start, y.start, x.stop, y.stop) for y, x in ndimage.find_objects(labels)]
+    return np.array(found, np.float64).reshape(-1, 4)
+
+
+def box_ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Intersection over union [n, m] of boxes [n, 4] and [m, 4]."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    both = np.clip(high - low, 0, None).prod(axis=2)
+    areas = [np.prod(some[:, 2:] - some[:, :2], axis=1) for some in (boxes, others)]
+    return both / (areas[0][:, None] + areas[1][None, :] - both)
+
+
+def average_precision(
+    predicted: Sequence[np.ndarray], truth: Sequence[np.ndarray], thresholds: Sequence[float] = COCO_THRESHOLDS
+) -> float:
+    """Average precision over recalls 0, .01 … 1, mean over IoU `thresholds` (Lin et al., "Microsoft COCO", 2014).
+
+    predicted, truth: boxes [n, 4] of each image. Masks carry no confidence, so all boxes rank alike: there is one
+    operating point, its precision holds up to its recall, and as many boxes are matched as the threshold allows
+    (COCO's greedy order would depend on nothing). NaN when no image has a true box.
+    """
+    boxes, wanted = sum(map(len, predicted)), sum(map(len, truth))
+    if not wanted:
+        return math.nan
+    ious = [box_ious(some, others) for some, others in zip(predicted, truth, strict=True)]
+    found = [sum(_matches(table >= threshold) for table in ious) for threshold in thresholds]
+    return float(np.mean([hits / boxes * np.mean(hits / wanted >= RECALLS) if hits else 0.0 for hits in found]))
+
+
+def _matches(fits: np.ndarray) -> int:
+    """How many pairs can be made where each row and each column is used once at most."""
+    if not fits.any():
+        return 0
+    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum())

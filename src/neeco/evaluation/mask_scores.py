@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from neeco import __version__
+from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.evaluation.boundary import boundary_f
-from neeco.evaluation.boxes import average_precision, boxes_of
-from neeco.evaluation.mask_folders import Masks, open_masks, open_truth
-from neeco.evaluation.mask_metrics import TRUTH_PARTS, mean_of
+from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
+from neeco.evaluation.mask_metrics import TRUTH_PARTS, average_precision, boundary_f, boxes_of, mean_of
 
 SCHEMA = "neeco-mask-scores/1"
 SCORES = ("iou", "dice", "boundary_f", "box_ap", "box_ap50")
@@ -58,7 +57,7 @@ class _Image:
 
 def score_masks(
     predicted: Path,
-    truth: Path,
+    truth: Capture | Path,
     *,
     splits: Sequence[str] | None = None,
     classes: Mapping[int, str] | None = None,
@@ -66,27 +65,26 @@ def score_masks(
     components: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Score a folder of masks against a capture's or another folder's, matched by file stem.
+    """Score a folder of masks against a capture's (read, or its folder) or another folder's, matched by file stem.
 
     splits: of a capture; None: those of which `predicted` has an image. classes, truth_classes: part by id, where ids
     differ from ours. components: a box per connected group instead of one per id. progress: told (done, of).
     An image without a prediction counts as predicted empty. Per region the mean over the images where either side
-    shows it: `iou`, `dice`, `boundary_f` (`boundary.boundary_f`); over the whole folder `box_ap`, `box_ap50`
-    (`boxes.average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
+    shows it: `iou`, `dice`, `boundary_f`; over the whole folder `box_ap`, `box_ap50`
+    (`average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
     2020, github.com/BCV-Uniandes/ISINet): per image the mean IoU of the classes its truth shows, mean over the images
     that show any; `isinet_iou` counts classes that either shows, `mean_class_iou` is the mean over classes of each
     one's mean over images. None is "not known", never zero. Raises NeecoError for what cannot be read or compared.
     """
     given = open_masks(predicted, classes)
-    wanted = open_truth(truth, truth_classes)
+    source = read_truth(truth) if isinstance(truth, Path) else truth
+    wanted = open_truth(source, truth_classes, None if isinstance(source, Capture) else splits)
     everything = set(wanted.files)
-    if wanted.frames:
-        wanted = open_truth(truth, truth_classes, splits or _drawn_splits(given, wanted))
-    elif splits is not None:
-        raise NeecoError(f"--splits: {truth} is a folder of masks and has no splits; give the capture instead")
+    if isinstance(source, Capture):
+        wanted = open_truth(source, truth_classes, splits or _drawn_splits(given, wanted))
     if not set(given.files) & set(wanted.files):
         names = f"{next(iter(given.files))!r} and {next(iter(wanted.files))!r}"
-        raise NeecoError(f"{predicted}: no mask is named like one of {truth} (such as {names}); rename the files")
+        raise NeecoError(f"{predicted}: no mask is named like one of {wanted.path} (such as {names}); rename the files")
     regions, reason = shared_regions(given, wanted)
     images = []
     for index, name in enumerate(sorted(wanted.files)):
@@ -105,7 +103,7 @@ def score_masks(
         "schema": SCHEMA,
         "version": __version__,
         "predicted": str(predicted),
-        "truth": str(truth),
+        "truth": str(wanted.path),
         "splits": list(dict.fromkeys(frame.split for frame in wanted.frames.values())) or None,
         "images": len(images),
         **result,

@@ -1,23 +1,18 @@
-"""One frame, drawn and scored."""
+"""One frame, scored."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Frame, State
+from neeco.capture.model import Frame
 from neeco.evaluation.image_metrics import psnr, ssim
 from neeco.evaluation.lpips import MIN_SIZE, Lpips
 from neeco.evaluation.mask_metrics import dice, iou
 from neeco.evaluation.truth import Reference
-from neeco.labels.composited import composited_parts
-from neeco.raster.types import Camera
-
-if TYPE_CHECKING:
-    from neeco.scene import Drawable
+from neeco.labels.drawing import Drawing
 
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
 IMAGE_SCORES = ("psnr", "ssim", "lpips", "lpips_vgg")
@@ -33,14 +28,6 @@ SCORES = (
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """A frame as the scene draws it."""
-
-    image: Tensor  # [H, W, 3] in [0, 1]
-    parts: Tensor | None  # [H, W] uint8, label column + 1; None when the scene has no labels
-
-
-@dataclass(frozen=True)
 class Photograph:
     """A frame as recorded, with all that scoring needs; made once, used for the given and the aligned drawing."""
 
@@ -50,14 +37,6 @@ class Photograph:
     unseen: Tensor  # [H, W] bool, tissue no training frame saw
     tissue: Tensor  # [H, W] bool
     features: dict[str, list[Tensor]]  # LPIPS features by network name
-
-
-@torch.no_grad()
-def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
-    """Draw the scene with its labels, by the one path training and synthesis use too."""
-    rendering = scene.draw(state, camera, labels=True)
-    parts = None if rendering.channels is None else composited_parts(rendering)
-    return Drawing(rendering.color.clamp(0, 1), parts)
 
 
 def photograph(
@@ -73,7 +52,7 @@ def photograph(
 def score(drawing: Drawing, photo: Photograph, networks: dict[str, Lpips]) -> dict[str, float | None]:
     """All numbers of one frame, by the names in SCORES; None where there is nothing to compare with."""
     image, mask = drawing.image, photo.mask
-    counted = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
+    counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((photo.tissue & counted).sum())
     row: dict[str, float | None] = dict.fromkeys(SCORES)
     row["psnr"] = psnr(image, photo.image, counted)

@@ -7,20 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neeco.experiments.ablations import (
-    CHECKPOINTS,
-    PHASE_1_PSNR,
-    PHASE_1_SHARE,
-    Ablation,
-    Comparison,
-    Entry,
-)
+from neeco.experiments.ablations import CHECKPOINTS, PHASE_1_PSNR, Ablation, Comparison, Entry
+from neeco.experiments.families import PHASE_1_SHARE
+from neeco.experiments.masks import LabelScores
 from neeco.experiments.watching import CURVE_FILE
 
 EVEN_DB = 0.1  # differences smaller than this say nothing about a direction
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
 
-LabelScores = Mapping[str, Mapping[str, float | None]]
 Values = dict[str, float | None]
 
 
@@ -116,7 +110,7 @@ def _values(
         return {}
     folder, result = folders[name], results[name]
     values: Values = {}
-    if entry.variant.method == "neeco":
+    if entry.variant.family.phased:
         values[PHASE_1_PSNR] = phase_1_psnr(folder, int(result["iterations"]))
         curve = _rows(folder / CURVE_FILE)
         split = primary_split(splits)

@@ -12,14 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-PUBLISHED_STEPS = 20_000
-PHASE_1_STEPS = 8_000
-PHASE_1_SHARE = PHASE_1_STEPS / PUBLISHED_STEPS
+from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
+
 CHECKPOINTS = (20, 40, 60, 100)  # per cent of the run: the paper's 4k, 8k, 12k and 20k steps
 NOISE_DEGREES_PER_MM = 0.2
-REST_STEPS = 100  # of the network, where its usual share of a short run is less: an empty image throws it out of sight
-LONGEST_REST = 0.25  # of the run
-INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
 
 PHASE_1_PSNR = "phase_1_psnr"  # training frames, as in the paper
 FINAL_PSNR = "psnr.{split}"  # {split}: the first held-out split, `test` where there is one
@@ -43,10 +39,10 @@ class Derived:
 
 @dataclass(frozen=True)
 class Variant:
-    """One run: a method with some settings (as for `--set`) on the capture or on one derived from it."""
+    """One run: a method of a family with some settings (as for `--set`) on the capture or on one derived from it."""
 
     name: str  # of its run folder
-    method: str
+    family: Family
     settings: tuple[str, ...] = ()
     derived: Derived | None = None
 
@@ -54,7 +50,8 @@ class Variant:
 @dataclass(frozen=True)
 class Entry:
     """One line of a comparison. `paper`: published numbers by measure; `expected` -1: the paper shows it to be worse
-    than the comparison's reference, in a figure without numbers."""
+    than the comparison's reference, in a figure without numbers. `label_way`: the labels are scored, of a run on the
+    capture itself."""
 
     label: str
     variant: Variant
@@ -89,17 +86,20 @@ class Ablation:
     level_name: str = ""
 
 
-NEECO = Variant("neeco", "neeco")
-KINEMATIC = Variant("kinematic", "kinematic")
-PAPER_SETTINGS = (f"schedule.published_steps={PUBLISHED_STEPS}", f"schedule.earliest={PHASE_1_STEPS}")
+NEECO = Variant("neeco", NEECO_RUNS)
+KINEMATIC = Variant("kinematic", KINEMATIC_RUNS)
 
 
 def _neeco(name: str, *settings: str) -> Variant:
-    return Variant(f"neeco-{name}", "neeco", settings)
+    return Variant(f"neeco-{name}", NEECO_RUNS, settings)
 
 
 def _kinematic(name: str, *settings: str) -> Variant:
-    return Variant(f"kinematic-{name}", "kinematic", settings)
+    return Variant(f"kinematic-{name}", KINEMATIC_RUNS, settings)
+
+
+def _on(derived: Derived) -> Variant:
+    return Variant(f"kinematic-{derived.name}", KINEMATIC_RUNS, derived=derived)
 
 
 def _schedule_part(title: str, part: str, name: str, plain: float, published: float, inverse: float) -> Comparison:
@@ -265,8 +265,8 @@ OURS = (
                 "all",
                 (
                     Entry("all", KINEMATIC),
-                    Entry("1/2", Variant("kinematic-frames-half", "kinematic", derived=_HALF)),
-                    Entry("1/4", Variant("kinematic-frames-quarter", "kinematic", derived=_QUARTER)),
+                    Entry("1/2", _on(_HALF)),
+                    Entry("1/4", _on(_QUARTER)),
                 ),
             ),
         ),
@@ -284,10 +284,7 @@ OURS = (
                 "0 mm",
                 (
                     Entry("0 mm", KINEMATIC),
-                    *(
-                        Entry(f"{noise.noise_mm:g} mm", Variant(f"kinematic-{noise.name}", "kinematic", derived=noise))
-                        for noise in _NOISE
-                    ),
+                    *(Entry(f"{noise.noise_mm:g} mm", _on(noise)) for noise in _NOISE),
                 ),
             ),
         ),

@@ -13,18 +13,23 @@ from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
-from neeco.evaluation.evaluate import EVALUATION_FILE
+from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
-from neeco.experiments.cluster import require_ray, threads_per_worker
 from neeco.experiments.comparison_tables import write_tables
-from neeco.experiments.distance import distances_to_training
-from neeco.experiments.jobs import JOB_FILE, Budget, Job, JobNews, check_folder, held_out_splits
+from neeco.experiments.jobs import (
+    JOB_FILE,
+    Budget,
+    Job,
+    JobNews,
+    check_folder,
+    check_settings,
+    settings_for,
+)
 from neeco.experiments.machine import machine
 from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
-from neeco.experiments.running import run_jobs
-from neeco.experiments.settings import check_settings, settings_for
+from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
-from neeco.experiments.summary import summarise
+from neeco.experiments.summary import distances_to_training, summarise
 from neeco.experiments.watching import CURVE_FILE, TOTALS
 from neeco.files import new_folder, read_json, write_json
 from neeco.scene.methods import unmet_need
@@ -34,9 +39,6 @@ from neeco.training.run import load_run
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
 COMPARISON_FILE = "comparison.json"
-
-Progress = Callable[[JobNews], None]
-Stage = Callable[[str, int, int], None]  # what is done after the jobs, how many done, of how many
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class ComparisonSpec:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class ComparisonPlan:
     """A checked specification, ready to work on."""
 
     spec: ComparisonSpec
@@ -69,30 +71,60 @@ class _Plan:
     given_masks: tuple[dict[str, Any], ...]  # scores of the folders of masks
 
 
-def compare(spec: ComparisonSpec, progress: Progress | None = None, stage: Stage | None = None) -> dict[str, Any]:
+def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
+    """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
+    spec.budget.check()
+    if spec.seeds < 1:
+        raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
+    if spec.workers < 1:
+        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
+    if spec.workers > 1:
+        require_ray()
+    configs = _configs(spec)
+    capture = _open_capture(spec, configs)
+    networks = find_lpips(spec.lpips_weights)
+    _check_output(spec)
+    jobs = _jobs(spec, configs)
+    for job in jobs:
+        check_folder(job)
+    splits = held_out_splits(capture, spec.splits)
+    check_masks(spec.masks, capture, splits, spec.methods)
+    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
+    scored: list[dict[str, Any]] = []
+    for name, folder in spec.masks.items():
+        rows, told = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
+        scored += rows
+        notes += told
+    return ComparisonPlan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
+
+
+def compare(
+    plan: ComparisonPlan, news: Callable[[JobNews], None] | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
     """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
 
     Given again after an interruption, it goes on where it stopped; given again with more methods or seeds, it adds
     them. A method that fails is told in its place. comparison.json is complete at every moment; `complete` says whether
-    all is in it. Raises NeecoError before any work for whatever cannot be compared.
+    all is in it. news: told of the jobs; progress: of what follows them.
     """
-    plan = _plan(spec)
-    report = stage or (lambda what, done, total: None)
+    spec = plan.spec
+    report = progress or (lambda what, done, total: None)
     with new_folder(spec.output):
         finished = _finished_before(plan)
 
         def write() -> None:  # what is known is on disk at every moment
             write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
 
-        def keep(news: JobNews) -> None:
-            if news.result is not None:
-                finished[news.index] = news.result
+        def keep(latest: JobNews) -> None:
+            if latest.result is not None:
+                finished[latest.index] = latest.result
                 write()
-            if progress:
-                progress(news)
+            if news:
+                news(latest)
 
         write()
-        result = _document(plan, run_jobs(plan.jobs, spec.workers, keep)) | {"complete": True}
+        results = run_jobs(plan.jobs, spec.workers, keep, {spec.capture: plan.capture})
+        result = _document(plan, results) | {"complete": True}
         _measure(plan, result, report)
         write_json(spec.output / COMPARISON_FILE, result)
         write_tables(spec.output, result)
@@ -109,38 +141,11 @@ def failures(comparison: Mapping[str, Any]) -> list[str]:
     return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
 
 
-def _finished_before(plan: _Plan) -> dict[int, dict[str, Any]]:
+def _finished_before(plan: ComparisonPlan) -> dict[int, dict[str, Any]]:
     """What earlier starts left of these jobs, by the job's place."""
     files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
     found = {index: read_json(file) for index, file in files.items() if file.exists()}
     return {index: job for index, job in found.items() if list(job["splits"]) == list(plan.splits)}
-
-
-def _plan(spec: ComparisonSpec) -> _Plan:
-    """Check everything that can be known before the work. Raises NeecoError."""
-    spec.budget.check()
-    if spec.seeds < 1:
-        raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
-    if spec.workers < 1:
-        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    if spec.workers > 1:
-        require_ray()
-    configs = _configs(spec)
-    capture = _open_capture(spec, configs)
-    networks = find_lpips(spec.lpips_weights)
-    _check_output(spec)
-    jobs = _jobs(spec, configs)
-    for job in jobs:
-        check_folder(job)
-    splits = held_out_splits(jobs[0])
-    check_masks(spec.masks, capture, splits, spec.methods)
-    notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
-    scored: list[dict[str, Any]] = []
-    for name, folder in spec.masks.items():
-        rows, told = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
-        scored += rows
-        notes += told
-    return _Plan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
 
 
 def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
@@ -199,11 +204,11 @@ def _check_output(spec: ComparisonSpec) -> None:
         raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; give another --output")
 
 
-def _names(plan: _Plan) -> list[str]:
+def _names(plan: ComparisonPlan) -> list[str]:
     return list(dict.fromkeys([*plan.spec.methods, *plan.spec.masks]))
 
 
-def _document(plan: _Plan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _document(plan: ComparisonPlan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """comparison.json as far as the jobs alone tell it."""
     spec = plan.spec
     threads = threads_per_worker(spec.workers) if spec.workers > 1 else None
@@ -250,7 +255,7 @@ def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[
     return rows
 
 
-def _distance(plan: _Plan, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _distance(plan: ComparisonPlan, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Every held-out frame's scores beside its distance from the training states."""
     distances = distances_to_training(plan.capture)
     rows = []
@@ -265,7 +270,7 @@ def _distance(plan: _Plan, results: Sequence[Mapping[str, Any]]) -> list[dict[st
     return rows
 
 
-def _measure(plan: _Plan, result: dict[str, Any], report: Stage) -> None:
+def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> None:
     """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
     folder = plan.spec.output
     done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
@@ -26,16 +25,15 @@ RECIPE_FILE = "derived.json"
 MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)
 
 
-def derive_capture(source: Path, transforms: str, derived: Derived, seed: int, output: Path) -> Path:
-    """Write the capture that `derived` makes of `source` to folder `output`, true masks included; at once when it is
-    there.
+def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: int, output: Path) -> Path:
+    """Write the capture that `derived` makes of `capture`, read from its file `transforms`, to folder `output`, true
+    masks included; at once when it is there.
 
     The same seed gives the same noise, and the noise of one level is that of another times a number. Raises NeecoError
-    when `output` holds something else, and what reading and writing captures raise.
+    when `output` holds something else, and what writing captures raises.
     """
-    capture = read_capture(source, transforms)
     recipe: dict[str, Any] = {
-        "source": str(source.absolute()),
+        "source": str(capture.root.absolute()),
         "transforms": transforms,
         "states_sha256": _digest(capture),
     }

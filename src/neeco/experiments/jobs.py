@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from neeco.capture import read_capture
+from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.evaluate import evaluate_run
+from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.lpips import find_lpips
-from neeco.experiments.memory import reset_peak_memory
+from neeco.experiments.machine import reset_peak_memory
 from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
 from neeco.files import read_json, write_json, write_text
 from neeco.scene.methods import method_class
@@ -23,6 +24,7 @@ from neeco.training.train import ProgressRow, train
 JOB_SCHEMA = "neeco-job/1"
 JOB_FILE = "job.json"
 UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
+OWN_OPTION = {"transforms": "--transforms", "iterations": "the budget's option", "minutes": "the budget's option"}
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames")
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
@@ -114,17 +116,19 @@ class JobNews:
     result: dict[str, Any] | None = None
 
 
-def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
+def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
     """Train, score, write `folder`/job.json last, and return what it holds; at once when it is there already.
 
     A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
     (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are asked for.
-    Raises NeecoError when `folder` is another job's, and what `train` and `evaluate_run` raise.
+    capture: the job's, where it is read already. Raises NeecoError when `folder` is another job's, and what `train` and
+    `evaluate_run` raise.
     """
     report = progress or (lambda stage, share, text: None)
     job.budget.check()
     check_folder(job)
-    splits = held_out_splits(job)
+    capture = capture or read_capture(job.capture, job.config.transforms)
+    splits = held_out_splits(capture, job.splits)
     networks = sorted(find_lpips(job.lpips_weights))
     file = job.folder / JOB_FILE
     if file.exists():
@@ -134,10 +138,11 @@ def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
         totals = {key: stored[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
         totals["iteration"] = stored["iterations"]
     else:
-        totals = _train(job, splits, report)
+        totals = _train(job, capture, splits, report)
     report("evaluating", 0.0, "")
     evaluation = evaluate_run(
         load_run(job.folder),
+        capture,
         splits,
         lpips_weights=job.lpips_weights,
         progress=lambda what, done, total: report("evaluating", done / max(total, 1), what),
@@ -151,18 +156,6 @@ def run_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
     result |= {"splits": {split: {key: given[split][key] for key in SPLIT_SCORES} for split in splits}}
     write_json(file, result)
     return result
-
-
-def held_out_splits(job: Job) -> tuple[str, ...]:
-    """The splits that `job` scores. Raises NeecoError for one that the capture lacks, or when it has only `train`."""
-    present = read_capture(job.capture, job.config.transforms).splits
-    splits = job.splits if job.splits is not None else tuple(name for name in present if name != "train")
-    if not splits:
-        raise NeecoError(f"{job.capture}: split: all frames are training frames; keep some for scoring (split test)")
-    for name in splits:
-        if name not in present:
-            raise NeecoError(f"--splits: {job.capture} has no split {name!r}; it has {', '.join(present)}")
-    return tuple(dict.fromkeys(splits))
 
 
 def check_folder(job: Job) -> None:
@@ -190,10 +183,9 @@ def check_folder(job: Job) -> None:
         raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 
 
-def _train(job: Job, splits: tuple[str, ...], report: JobProgress) -> dict[str, Any]:
+def _train(job: Job, capture: Capture, splits: tuple[str, ...], report: JobProgress) -> dict[str, Any]:
     """Train or go on training; returns what the run took."""
     reset_peak_memory()
-    capture = read_capture(job.capture, job.config.transforms)
     held_out = HeldOut(capture, splits, field=not method_class(job.config.method).has_gaussians)
     watcher = Watcher(job.folder, held_out, job.budget.clock, job.identity())
 
@@ -230,12 +222,12 @@ def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
     return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
 
 
-def attempt_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]:
+def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
     """`run_job`, a failure told in its result. A failure that no user can cause leaves its traceback beside the
     folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
-        result = run_job(job, progress)
+        result = run_job(job, progress, capture)
     except NeecoError as error:
         return job.identity() | {"error": " ".join(str(error).split()), "splits": {}}
     except Exception as error:
@@ -244,3 +236,24 @@ def attempt_job(job: Job, progress: JobProgress | None = None) -> dict[str, Any]
         return job.identity() | {"error": f"{type(error).__name__}: {told}; see {record}", "splits": {}}
     record.unlink(missing_ok=True)
     return result
+
+
+def check_settings(assignments: Sequence[str], methods: Collection[str], seed_option: str) -> None:
+    """Raises NeecoError for a NAME=VALUE of `--set` that has an option of its own, or that none of `methods` has."""
+    for assignment in assignments:
+        name = assignment.partition("=")[0]
+        if option := (OWN_OPTION | {"seed": seed_option}).get(name):
+            raise NeecoError(f"--set {name}: use {option}; all runs share it")
+        if not any(_takes(method, name) for method in methods):
+            raise NeecoError(f"--set {name}: no such field in the methods {', '.join(methods)}")
+
+
+def settings_for(method: str, assignments: Sequence[str]) -> list[str]:
+    """Those of `assignments`, one list for several methods, that `method` has: `deformation.FIELD` is a method's own,
+    all others are everybody's."""
+    return [assignment for assignment in assignments if _takes(method, assignment.partition("=")[0])]
+
+
+def _takes(method: str, name: str) -> bool:
+    group, _, field = name.partition(".")
+    return group != "deformation" or field in {own.name for own in dataclasses.fields(method_class(method).Settings)}

@@ -1,4 +1,4 @@
-"""The masks of a comparison: those of our runs and those that others made, scored by the same function."""
+"""Masks, scored by the same function whoever made them: those of our runs, of both ways to label them, and others'."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ from neeco.capture.images import write_labels
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
+from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.scoring import draw
-from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.evaluation.truth import REFERENCE_FOLDER, load_reference
 from neeco.files import write_json
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import Labeller, draw, draw_layers
+from neeco.labels.threshold import ThresholdLabels
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.settings import Settings
 from neeco.training.run import Run
 
 NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument
 Row = dict[str, Any]
+LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and split; None where it cannot be told
 
 
 def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:
@@ -56,7 +62,7 @@ def score_folder(
         if not any(frame.name in given.files for frame in capture.split(split)):
             notes.append(f"{name}: no mask of split {split} in {folder}")
             continue
-        scores = score_masks(folder, capture.root, splits=[split])
+        scores = score_masks(folder, capture, splits=[split])
         row = {"name": name, "seed": seed, "split": split, "images": scores["images"]}
         row |= {key: scores["instrument"][key] for key in NAMED_SCORES}
         row["challenge_iou_parts"] = scores["classes"]["challenge_iou"] if scores["classes"] else None
@@ -101,3 +107,32 @@ def score_runs(
                 rows += score_folder(name, seed, folder, capture, [split])[0]
     report(len(runs), len(runs))
     return rows
+
+
+def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> LabelScores:
+    """Mean mask IoU of a run by label way ("composited", "threshold") and split, each as `synthesize` makes its labels.
+
+    None where no frame has a true or reference mask, or where a way cannot label the scene (nothing moves in it).
+    Raises NeecoError for an unreadable mask.
+    """
+    scene = gaussian_scene(run.scene, "label ways")
+    speckle = Settings(count=1).speckle
+    scores: LabelScores = {}
+    with scene.torch_threads():
+        for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
+            try:
+                labeller: Labeller = kind(scene)
+            except NeecoError:  # it has no labels, or its deltas tell nothing apart: a finding, not a failure
+                scores[way] = dict.fromkeys(splits)
+                continue
+            scores[way] = {}
+            for split in splits:
+                values = []
+                for frame in capture.split(split):
+                    reference = load_reference(capture, frame)
+                    if reference is not None:
+                        drawing = draw_layers(scene, labeller, frame.state, frame.camera, speckle)
+                        values.append(iou(drawing.parts > 0, reference.mask, frame.load_mask()))
+                mean = mean_of(values)
+                scores[way][split] = None if mean != mean else round(mean, 6)  # NaN is unequal to itself
+    return scores

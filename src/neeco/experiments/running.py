@@ -1,21 +1,36 @@
-"""Many jobs: one after another in this process, or several at once by Ray."""
+"""Many jobs: one after another in this process, or several at once by Ray: on this machine, or on the cluster that
+RAY_ADDRESS names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+import importlib.util
+import logging
+import os
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.experiments.cluster import run_on_cluster
 from neeco.experiments.jobs import Job, JobNews, attempt_job, check_folder, ended
+from neeco.experiments.machine import usable_cores
+
+CONNECT = 5.0  # s that a cluster's head gets to answer
+GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
 
 def run_jobs(
-    jobs: Sequence[Job], workers: int = 1, progress: Callable[[JobNews], None] | None = None
+    jobs: Sequence[Job],
+    workers: int = 1,
+    progress: Callable[[JobNews], None] | None = None,
+    captures: Mapping[Path, Capture] | None = None,
 ) -> list[dict[str, Any]]:
     """Run every job and return what each wrote, in their order.
 
-    workers 1: in this process, one after another; more: so many at once by Ray. A job that fails does not stop the
+    workers 1: in this process, one after another; more: so many at once by Ray. captures: those of the jobs that are
+    read already, by path, for this process; jobs read the others. A job that fails does not stop the
     others: its place holds {name, method, seed, capture, budget, "error": why, "splits": {}}, and no job.json is
     written, so that the next start tries again. Raises NeecoError before any work when a job's folder is another job's
     or Ray is not there, and KeyboardInterrupt saying which job was stopped.
@@ -27,18 +42,21 @@ def run_jobs(
         job.budget.check()
         check_folder(job)
     if workers > 1:
-        return run_on_cluster(jobs, workers, report)
-    return [_run_here(index, len(jobs), job, report) for index, job in enumerate(jobs)]
+        return _run_on_cluster(jobs, workers, report)
+    known = captures or {}
+    return [_run_here(index, len(jobs), job, known.get(job.capture), report) for index, job in enumerate(jobs)]
 
 
-def _run_here(index: int, total: int, job: Job, report: Callable[[JobNews], None]) -> dict[str, Any]:
+def _run_here(
+    index: int, total: int, job: Job, capture: Capture | None, report: Callable[[JobNews], None]
+) -> dict[str, Any]:
     """One job of `total` in this process."""
 
     def tell(stage: str, share: float, text: str) -> None:
         report(JobNews(index, total, job, stage, share, text))
 
     try:
-        result = attempt_job(job, tell)
+        result = attempt_job(job, tell, capture)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_stopped_line(f"job {index + 1} of {total} ({job.title})", interrupt)) from None
     report(ended(index, total, job, result))
@@ -49,3 +67,101 @@ def _stopped_line(where: str, interrupt: KeyboardInterrupt) -> str:
     """What to tell after Ctrl-C: where it stopped, and that nothing is lost."""
     moment = " ".join(map(str, interrupt.args)).split(";")[0]
     return f"{where}{', ' + moment if moment else ''}; run the same command again to go on, nothing finished is lost"
+
+
+def threads_per_worker(workers: int, cores: int | None = None) -> int:
+    """Each of `workers` gets its share of the cores, at least one thread."""
+    return max(1, (cores or usable_cores()) // workers)
+
+
+def require_ray() -> None:
+    """Raises NeecoError when Ray is not installed, or nobody listens at the HOST:PORT that RAY_ADDRESS names."""
+    if importlib.util.find_spec("ray") is None:
+        raise NeecoError("--workers: several at once need Ray; install neeco[cluster], or leave --workers out")
+    address = os.environ.get("RAY_ADDRESS", "")
+    host, _, port = address.rpartition(":")
+    if "/" in address or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
+        return
+    try:
+        socket.create_connection((host, int(port)), CONNECT).close()
+    except (OSError, OverflowError) as error:
+        raise NeecoError(
+            f"RAY_ADDRESS: no Ray cluster answers at {address} ({error}); start it, or unset RAY_ADDRESS to work here"
+        ) from None
+
+
+def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
+    """`run_jobs` with `workers` jobs at once, each in a process of its own.
+
+    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them.
+    """
+    require_ray()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    import ray
+
+    address = os.environ.get("RAY_ADDRESS")
+    threads = threads_per_worker(workers)
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if address:
+        try:
+            ray.init(address=address, **quiet)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            told = " ".join(str(error).split()) or type(error).__name__
+            raise NeecoError(f"RAY_ADDRESS: {address} is no cluster that can be joined: {told}") from None
+    else:
+        ray.init(num_cpus=threads * workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
+    try:
+        return _run_remotely(ray, jobs, workers, threads, report)
+    finally:
+        ray.shutdown()
+
+
+def _run_remotely(
+    ray: Any, jobs: Sequence[Job], workers: int, threads: int, report: Callable[[JobNews], None]
+) -> list[dict[str, Any]]:
+    """Keep `workers` jobs going until all are done."""
+    # a process serves one job: its peak memory is the job's own, and no thread setting outlives it
+    remote = ray.remote(num_cpus=threads, max_calls=1, max_retries=0)(_run_there)
+    results: list[dict[str, Any] | None] = [None] * len(jobs)
+    waiting = list(range(len(jobs)))
+    running: dict[Any, int] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                index = waiting.pop(0)
+                running[remote.remote(jobs[index], threads)] = index
+                report(JobNews(index, len(jobs), jobs[index], "training"))
+            for reference in ray.wait(list(running), timeout=1.0)[0]:
+                index = running.pop(reference)
+                results[index] = result = _result(ray, reference, jobs[index])
+                report(ended(index, len(jobs), jobs[index], result))
+    except KeyboardInterrupt:
+        with contextlib.suppress(KeyboardInterrupt):  # a second one ends the waiting
+            for reference in running:
+                ray.cancel(reference, force=False)
+            ray.wait(list(running), num_returns=len(running), timeout=GRACE)
+        titles = "; ".join(jobs[index].title for index in running.values())
+        raise KeyboardInterrupt(
+            f"while running {titles}; run the same command again to go on, nothing finished is lost"
+        ) from None
+    return [result for result in results if result is not None]
+
+
+def _result(ray: Any, reference: Any, job: Job) -> dict[str, Any]:
+    """What the job returned; a worker that died is a failure of its job alone."""
+    try:
+        return dict(ray.get(reference))
+    except ray.exceptions.RayError as error:
+        return job.identity() | {"error": f"its worker died: {str(error).strip().splitlines()[0]}", "splits": {}}
+
+
+def _run_there(job: Job, threads: int) -> dict[str, Any]:
+    """In the worker: use no more threads than its share, then run the job."""
+    import torch
+
+    from neeco.raster.threads import keep_freed_memory, set_threads
+
+    set_threads(threads)
+    torch.set_num_threads(threads)
+    keep_freed_memory()
+    return attempt_job(job)

@@ -14,6 +14,7 @@ import torch
 from neeco.capture.model import Capture, Frame
 from neeco.experiments.machine import machine
 from neeco.raster import rasterize
+from neeco.raster.threads import synchronise
 from neeco.raster.types import Gaussians
 from neeco.scene.scene import gaussian_scene
 from neeco.training.run import Run
@@ -22,8 +23,6 @@ WARM_UP = 3  # draws before any is timed
 ROUNDS = 3  # every run is drawn in turn, so often: a slow moment of the machine meets them all
 DRAWS = 7  # timed per run and round
 PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer draws
-
-Progress = Callable[[int, int], None]
 
 
 def backends() -> tuple[str, ...]:
@@ -34,7 +33,7 @@ def backends() -> tuple[str, ...]:
 
 @torch.no_grad()
 def measure_speed(
-    runs: Sequence[tuple[str, int, Run]], capture: Capture, progress: Progress | None = None
+    runs: Sequence[tuple[str, int, Run]], capture: Capture, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Any]:
     """Frames per second of every (name, seed, run), posing included, in one go.
 
@@ -84,10 +83,10 @@ def _timed(run: Run, frames: Sequence[Frame], backend: str) -> list[float]:
 def _draw(run: Run, frame: Frame, backend: str) -> None:
     if backend == "cuda":
         scene = gaussian_scene(run.scene, "backend cuda")
-        rasterize(_on_cuda(scene.at(frame.state)), scene.camera(frame.camera), backend=backend)
-        torch.cuda.synchronize()
+        drawn = rasterize(_on_cuda(scene.at(frame.state)), scene.camera(frame.camera), backend=backend)
     else:
-        run.scene.draw(frame.state, frame.camera)
+        drawn = run.scene.draw(frame.state, frame.camera)
+    synchronise(drawn.color.device)
 
 
 def _on_cuda(gaussians: Gaussians) -> Gaussians:

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.scoring import draw
-from neeco.experiments.memory import peak_memory_mb
+from neeco.experiments.machine import peak_memory_mb
 from neeco.files import read_json, write_json, write_text
+from neeco.labels.drawing import draw
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable

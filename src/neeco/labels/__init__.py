@@ -1,1 +1,1 @@
-"""What a drawing says of instruments and parts: part ids, boxes, polygons, keypoints."""
+"""What a drawing says of instruments and parts: which pixel is which, boxes, polygons, keypoints."""

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.labels.drawing import Drawing, instruments_of
-from neeco.labels.geometry import bounding_box, minimum_rectangle, outer_polygons
+from neeco.labels.composited import instruments_of
+from neeco.labels.contours import bounding_box, minimum_rectangle, outer_polygons
+from neeco.labels.drawing import LayeredDrawing, to_numpy
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
@@ -66,18 +67,19 @@ class InstrumentLabel:
 
 
 @torch.no_grad()
-def annotate(scene: Scene, drawing: Drawing, names: tuple[tuple[str, str], ...]) -> list[InstrumentLabel]:
+def annotate(scene: Scene, drawing: LayeredDrawing, names: tuple[tuple[str, str], ...]) -> list[InstrumentLabel]:
     """Labels of every instrument of the drawn state; `names` are the (instrument, part) of the drawing's part ids."""
     keypoints = scene.keypoints(drawing.state)
     drawn_at = scene.registered(drawing.state)  # the pose that agrees with the pixels
-    camera_from_world = np.linalg.inv(_matrix(drawing.camera.world_from_camera))
+    parts = drawing.parts.numpy()
+    camera_from_world = np.linalg.inv(to_numpy(drawing.camera.world_from_camera))
     labels = []
     for instrument in instruments_of(names):
         if instrument not in drawing.state.instruments:
             continue
-        masks = {part: drawing.parts == k + 1 for k, (owner, part) in enumerate(names) if owner == instrument}
+        masks = {part: parts == k + 1 for k, (owner, part) in enumerate(names) if owner == instrument}
         whole = np.any(list(masks.values()), axis=0)
-        pose = camera_from_world @ _matrix(drawn_at.instruments[instrument].pose)
+        pose = camera_from_world @ to_numpy(drawn_at.instruments[instrument].pose)
         labels.append(
             InstrumentLabel(
                 name=instrument,
@@ -112,12 +114,12 @@ def visibility(seen: np.ndarray, alone: np.ndarray) -> float:
 
 def project(point: np.ndarray, camera: Camera) -> tuple[float, float, float]:
     """Image position (x, y) px and depth mm of a world point [3] mm; depth <= 0 lies behind the camera."""
-    x, y, z = (np.linalg.inv(_matrix(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
+    x, y, z = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
     scale = 1.0 / z if z > camera.near else 0.0
     return float(camera.fx * x * scale + camera.cx), float(camera.fy * y * scale + camera.cy), float(z)
 
 
-def project_keypoints(points: dict[str, Tensor], drawing: Drawing, instrument: str) -> dict[str, Keypoint]:
+def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
     """Where an instrument's keypoints (world mm) fall, and whether anything stands before them.
 
     Of an instrument with no pixel even when drawn alone nothing is hidden: its keypoints are not labelled (OUTSIDE).
@@ -127,7 +129,7 @@ def project_keypoints(points: dict[str, Tensor], drawing: Drawing, instrument: s
     absent = not drawing.alone[instrument].mask.any()
     projected = {}
     for name in sorted(points, key=lambda known: KEYPOINTS.index(known) if known in KEYPOINTS else len(KEYPOINTS)):
-        x, y, z = project(_matrix(points[name]), camera)
+        x, y, z = project(to_numpy(points[name]), camera)
         if absent or z <= camera.near or not (0 <= x < camera.width and 0 <= y < camera.height):
             projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
             continue
@@ -140,10 +142,6 @@ def project_keypoints(points: dict[str, Tensor], drawing: Drawing, instrument: s
 
 def _shape_to_json(shape: Shape) -> dict[str, Any]:
     return {"area": shape.area, "box": list(shape.box), "rectangle": shape.rectangle, "polygons": shape.polygons}
-
-
-def _matrix(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy()
 
 
 def _rounded(values: np.ndarray, digits: int) -> list[list[float]]:

@@ -38,6 +38,12 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def synchronise(device: torch.device) -> None:
+    """Wait until `device` has done all that it was asked: before a clock is read."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 def simd() -> str:
     """Instruction set in use: "sse2", "avx2", "avx512" or "neon". The environment variable NEECO_SIMD forces one."""
     try:

@@ -8,7 +8,8 @@ from typing import Any
 
 from neeco.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.experiments.ablation_tables import agreement, csv_text, grid
-from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.ablations import ABLATIONS
+from neeco.experiments.families import PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.experiments.tables import csv_text as csv_of
 from neeco.report.charts import Series, legend, line_chart
 from neeco.report.render import REPORT_FILE, write_page

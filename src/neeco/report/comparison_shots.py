@@ -14,9 +14,9 @@ from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import difference_map, overlay_outline
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.evaluation.scoring import draw
 from neeco.evaluation.truth import load_reference
 from neeco.experiments.comparison import job_folder
+from neeco.labels.drawing import draw
 from neeco.report.figures import jpeg, png, to_bytes
 from neeco.training.run import load_run
 

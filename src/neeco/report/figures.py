@@ -16,8 +16,8 @@ from PIL import Image
 from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
 from neeco.evaluation.difference import difference_map, overlay_outline, overlay_parts
-from neeco.evaluation.scoring import draw
 from neeco.evaluation.truth import load_reference
+from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.scene import Drawable
 

@@ -10,7 +10,7 @@ import torch
 
 from neeco.capture.model import State
 from neeco.labels.annotation import project
-from neeco.labels.drawing import Drawing, Labeller, draw
+from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers, to_numpy
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
@@ -35,20 +35,20 @@ class Acceptance:
     min_share: float
     tolerance_mm: float | None
 
-    def why_refused(self, scene: Scene, drawing: Drawing) -> str | None:
+    def why_refused(self, scene: Scene, drawing: LayeredDrawing) -> str | None:
         """The reason, or None when the drawing is worth keeping."""
         keypoints = working_ends(scene, drawing.state)
         # first: an instrument wholly behind the tissue shows no pixels either
         if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
             return ENTERS_TISSUE
-        if np.count_nonzero(drawing.parts) < self.min_share * drawing.parts.size:
+        if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
             return LEAVES_IMAGE
         if keypoints and not any(in_image(point, drawing.camera) for points in keypoints.values() for point in points):
             return LEAVES_IMAGE
         return None
 
 
-def buried_depth(scene: Scene, drawing: Drawing) -> float:
+def buried_depth(scene: Scene, drawing: LayeredDrawing) -> float:
     """How far, in mm, the worst instrument lies behind the tissue surface that this camera sees; 0 for none.
 
     Of an instrument's pixels all but the deepest BURIED_SHARE are above this depth (edges are uncertain), of the
@@ -79,7 +79,8 @@ def find_tolerance(scene: Scene, labeller: Labeller) -> float:
     recorded = scene.recorded
     chosen = np.unique(np.linspace(0, len(recorded.states) - 1, TOLERANCE_STATES).astype(int))
     depths = [
-        buried_depth(scene, draw(scene, labeller, recorded.states[k], recorded.cameras[k], speckle=0.0)) for k in chosen
+        buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], speckle=0.0))
+        for k in chosen
     ]
     return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
 
@@ -88,7 +89,7 @@ def find_tolerance(scene: Scene, labeller: Labeller) -> float:
 def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
     """Hinge and jaw tips [3] mm of every instrument for which the scene knows any."""
     ends = {
-        instrument: [points[name].detach().cpu().double().numpy() for name in WORKING_END if name in points]
+        instrument: [to_numpy(points[name]) for name in WORKING_END if name in points]
         for instrument, points in scene.keypoints(state).items()
     }
     return {instrument: points for instrument, points in ends.items() if points}
@@ -98,7 +99,7 @@ def shows_working_end(scene: Scene, state: State, camera: Camera) -> bool:
     """Whether any hinge or tip projects into the image; where none is known, any instrument's origin."""
     ends = [point for points in working_ends(scene, state).values() for point in points]
     if not ends:
-        ends = [instrument.pose[:3, 3].numpy() for instrument in scene.registered(state).instruments.values()]
+        ends = [to_numpy(instrument.pose[:3, 3]) for instrument in scene.registered(state).instruments.values()]
     return any(in_image(point, camera) for point in ends)
 
 

@@ -18,16 +18,9 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.files import new_folder, read_json, write_json
 from neeco.labels.annotation import KEYPOINTS, annotate
-from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.labels.drawing import (
-    CompositedLabels,
-    DeltaThresholds,
-    Drawing,
-    Labeller,
-    ThresholdLabels,
-    draw,
-    instruments_of,
-)
+from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels, instruments_of
+from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers
+from neeco.labels.threshold import DeltaThresholds, ThresholdLabels
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
 from neeco.synthesis.preview import write_preview
@@ -60,8 +53,8 @@ REMEDIES = {  # where every given state was refused
 
 
 @dataclass(frozen=True)
-class Summary:
-    """What came of it."""
+class Synthesized:
+    """What was made, and where it lies."""
 
     output: Path
     images: int
@@ -77,7 +70,7 @@ def synthesize(
     formats: tuple[Format, ...] = ("coco", "yolo"),
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
-) -> Summary:
+) -> Synthesized:
     """Write a labelled data set of `settings.count` images of the run's scene to `output`.
 
     Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C) or failing, it keeps and indexes what
@@ -191,12 +184,12 @@ def make_sample(
 
 def _first_acceptable(
     scene: Scene, labeller: Labeller, sampler: Sampler, acceptance: Acceptance, settings: Settings, index: int
-) -> tuple[Drawing | None, Counter[str]]:
+) -> tuple[LayeredDrawing | None, Counter[str]]:
     rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
     refused: Counter[str] = Counter()
     for _ in range(1 if sampler.fixed(index) else settings.tries):
         state, camera = sampler(index, rng)
-        drawing = draw(scene, labeller, state, camera, settings.speckle)
+        drawing = draw_layers(scene, labeller, state, camera, settings.speckle)
         reason = acceptance.why_refused(scene, drawing)
         if reason is None:
             return drawing, refused
@@ -253,7 +246,7 @@ def _write_indexes(
     formats: tuple[Format, ...],
     complete: bool,
     made: int = 0,
-) -> Summary:
+) -> Synthesized:
     """(Re)write everything that is about the whole data set, from the records."""
     drawn = _drawn(records)
     skipped = [record["index"] for record in records if record.get("skipped")]
@@ -284,7 +277,7 @@ def _write_indexes(
             "skipped": skipped,
         },
     )
-    return Summary(output, len(drawn), made, _refusals(records), skipped)
+    return Synthesized(output, len(drawn), made, _refusals(records), skipped)
 
 
 @torch.no_grad()

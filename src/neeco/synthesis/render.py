@@ -17,7 +17,7 @@ from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
-from neeco.labels.composited import composited_parts
+from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.views import moved_camera
@@ -71,7 +71,6 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
     return [View(f"{k:06d}", line.state, camera) for k, (line, camera) in enumerate(zip(lines, cameras, strict=True))]
 
 
-@torch.no_grad()
 def render(
     scene: Drawable, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
 ) -> Rendered:
@@ -81,12 +80,11 @@ def render(
     done = 0
     with scene.torch_threads():
         for view in views:
-            rendering = scene.draw(view.state, view.camera, labels=True)
-            write_image(folder / f"{view.name}.png", rendering.color)
-            if labelled:
-                parts = composited_parts(rendering).cpu()
-                write_labels(folder / f"{view.name}_parts.png", parts)
-                write_labels(folder / f"{view.name}_mask.png", (parts > 0).to(torch.uint8) * 255)
+            drawing = draw(scene, view.state, view.camera)
+            write_image(folder / f"{view.name}.png", drawing.image)
+            if drawing.parts is not None:
+                write_labels(folder / f"{view.name}_parts.png", drawing.parts)
+                write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
             done += 1
             on_progress(done)
     if labelled:

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from neeco.capture.model import State
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
-from neeco.labels.drawing import surface_depth
+from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.synthesis.acceptance import shows_working_end
@@ -126,10 +126,9 @@ def instrument_axes(scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     for name, points in scene.keypoints(state).items():
         if not {"shaft_far", "shaft_near"} <= set(points):
             continue
-        instrument_from_world = np.linalg.inv(scene.registered(state).instruments[name].pose.double().numpy())
+        instrument_from_world = np.linalg.inv(to_numpy(scene.registered(state).instruments[name].pose))
         far, near = (
-            (instrument_from_world @ np.append(points[end].double().numpy(), 1.0))[:3]
-            for end in ("shaft_far", "shaft_near")
+            (instrument_from_world @ np.append(to_numpy(points[end]), 1.0))[:3] for end in ("shaft_far", "shaft_near")
         )
         if (length := float(np.linalg.norm(near - far))) > 1e-6:
             axes[name] = near, (near - far) / length

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.labels.drawing import to_numpy
 
 JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
 
@@ -75,7 +76,7 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
             if joint in b.joints
         }
         instruments[name] = InstrumentState(
-            torch.from_numpy(interpolate_pose(a.pose.numpy(), b.pose.numpy(), weight)), joints
+            torch.from_numpy(interpolate_pose(to_numpy(a.pose), to_numpy(b.pose), weight)), joints
         )
     return State(instruments, (1 - weight) * first.time + weight * second.time)
 
@@ -123,7 +124,7 @@ class Inside:
         self.means: dict[str, np.ndarray] = {}
         self.bounds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for name in {name for state in self.states for name in state.instruments}:
-            poses = [s.instruments[name].pose.numpy() for s in self.states if name in s.instruments]
+            poses = [to_numpy(s.instruments[name].pose) for s in self.states if name in s.instruments]
             positions = np.stack([pose[:3, 3] for pose in poses])
             self.means[name] = mean_pose(poses)
             self.bounds[name] = positions.min(0), positions.max(0)
@@ -141,11 +142,11 @@ class Inside:
 
     def _angular_spread(self, name: str) -> float:
         mean = Rotation.from_matrix(self.means[name][:3, :3])
-        poses = [s.instruments[name].pose.numpy()[:3, :3] for s in self.states if name in s.instruments]
+        poses = [to_numpy(s.instruments[name].pose)[:3, :3] for s in self.states if name in s.instruments]
         return float((mean.inv() * Rotation.from_matrix(np.stack(poses))).magnitude().max())
 
     def _shaken(self, state: State, rng: Generator) -> State:
-        poses = {name: instrument.pose.numpy() for name, instrument in state.instruments.items()}
+        poses = {name: to_numpy(instrument.pose) for name, instrument in state.instruments.items()}
         centre = np.mean([pose[:3, 3] for pose in poses.values()], axis=0)
         turn = Rotation.from_rotvec(self.shake_rad * rng.standard_normal(3)).as_matrix()
         shift = self.shake_mm * rng.standard_normal(3)
@@ -177,12 +178,10 @@ class Beyond(Inside):
     def __call__(self, index: int, rng: Generator) -> State:
         state = super().__call__(index, rng)
         factor = 1 + 2 * self.margin * float(rng.random())
-        instruments = {
-            name: InstrumentState(
-                torch.from_numpy(interpolate_pose(self.means[name], instrument.pose.numpy(), factor)), instrument.joints
-            )
-            for name, instrument in state.instruments.items()
-        }
+        instruments = {}
+        for name, given in state.instruments.items():
+            pose = interpolate_pose(self.means[name], to_numpy(given.pose), factor)
+            instruments[name] = InstrumentState(torch.from_numpy(pose), given.joints)
         return State(instruments, state.time)
 
 
@@ -221,7 +220,7 @@ class Grid:
             about = np.eye(4)
             about[:3, :3] = Rotation.from_rotvec(roll * direction).as_matrix()
             about[:3, 3] = point - about[:3, :3] @ point
-            instruments[name] = InstrumentState(torch.from_numpy(instrument.pose.numpy() @ about), instrument.joints)
+            instruments[name] = InstrumentState(torch.from_numpy(to_numpy(instrument.pose) @ about), instrument.joints)
 
         def value(name: str, joint: str) -> float:
             joint_range = self.ranges[name, joint]

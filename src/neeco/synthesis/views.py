@@ -12,6 +12,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
 
 
@@ -51,7 +52,7 @@ class PerturbedViews:
         offset = np.eye(4)
         offset[:3, :3] = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
         offset[:3, 3] = self.mm * rng.standard_normal(3)
-        return moved_camera(camera, camera.world_from_camera.detach().cpu().double().numpy() @ offset)
+        return moved_camera(camera, to_numpy(camera.world_from_camera) @ offset)
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class OrbitViews:
 
     def __call__(self, rng: Generator) -> Camera:
         camera = self.recorded(rng)
-        world_from_camera = camera.world_from_camera.detach().cpu().double().numpy()
+        world_from_camera = to_numpy(camera.world_from_camera)
         direction = 2 * np.pi * rng.random()
         # the axis lies in the image plane: the camera moves sideways, it does not roll
         axis = world_from_camera[:3, :3] @ np.array([np.cos(direction), np.sin(direction), 0.0])
@@ -89,4 +90,4 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
     points = np.stack(
         [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z, np.ones_like(z)], -1
     )[z > 0]
-    return (points @ camera.world_from_camera.detach().cpu().double().numpy().T)[:, :3]
+    return (points @ to_numpy(camera.world_from_camera).T)[:, :3]

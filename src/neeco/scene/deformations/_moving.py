@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,13 +52,16 @@ def mark_moving(deformation: Deformation, canonical: CanonicalGaussians, states:
 
 
 def otsu(values: Tensor, bins: int = 256) -> float:
-    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979)."""
+    """Threshold that splits `values` [N] into two classes of greatest between-class variance (Otsu 1979); the middle
+    of the gap between classes that lie apart."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         return high
-    counts = torch.histc(values.float(), bins, low, high)
-    centers = low + (torch.arange(bins, device=values.device) + 0.5) * (high - low) / bins
-    weight = counts.cumsum(0) / counts.sum()
-    mean = (counts * centers).cumsum(0) / counts.sum()
-    between = (mean[-1] * weight - mean).square() / (weight * (1 - weight)).clamp_min(1e-9)
-    return float(centers[between[:-1].argmax()] + (high - low) / (2 * bins))
+    counts, edges = np.histogram(values.detach().cpu().double().numpy(), bins)
+    below = np.cumsum(counts)[:-1].astype(float)
+    above = counts.sum() - below
+    sums = np.cumsum(counts * (edges[:-1] + edges[1:]) / 2)
+    mean_below, mean_above = sums[:-1] / np.maximum(below, 1), (sums[-1] - sums[:-1]) / np.maximum(above, 1)
+    between = below * above * (mean_below - mean_above) ** 2
+    best = np.flatnonzero(between >= between.max() * (1 - 1e-9))  # a gap is a plateau
+    return float(edges[1 + round(float(best.mean()))])

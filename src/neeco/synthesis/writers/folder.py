@@ -18,7 +18,7 @@ from neeco.capture.images import write_image, write_labels
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.files import write_atomically, write_json, write_text
 from neeco.labels.annotation import InstrumentLabel
-from neeco.labels.drawing import Drawing
+from neeco.labels.drawing import LayeredDrawing, to_numpy
 
 Record = dict[str, Any]
 
@@ -39,14 +39,13 @@ def split_of(index: int) -> str:
 
 
 def write_sample(
-    root: Path, index: int, drawing: Drawing, labels: list[InstrumentLabel], refused: Mapping[str, int]
+    root: Path, index: int, drawing: LayeredDrawing, labels: list[InstrumentLabel], refused: Mapping[str, int]
 ) -> Record:
     """Write one image with its masks, part ids and depth, then its record; returns the record. Raises NeecoError."""
     name = f"{stem(index)}.png"
-    parts = torch.from_numpy(drawing.parts)
     write_image(root / "images" / name, drawing.image)
-    write_labels(root / "masks" / name, (parts > 0).to(torch.uint8) * 255)
-    write_labels(root / "parts" / name, parts)
+    write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
+    write_labels(root / "parts" / name, drawing.parts)
     write_depth(root / "depth" / name, drawing.depth)
     camera = drawing.camera
     record = {
@@ -56,7 +55,7 @@ def write_sample(
         "width": camera.width,
         "height": camera.height,
         **state_to_json(drawing.state),
-        "camera": camera_to_json(camera.world_from_camera.detach().cpu().double().numpy()),
+        "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
         "labels": [label.to_json() for label in labels],
         "refused": dict(sorted(refused.items())),

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from neeco.files import write_atomically, write_text
-from neeco.labels.geometry import joined_polygon
+from neeco.labels.contours import joined_polygon
 from neeco.synthesis.writers.folder import Record, stem
 
 FOLDER = "yolo"

@@ -1,19 +1,23 @@
-"""The progress bars of verbs that run many jobs."""
+"""Progress bars on the error stream, so that output can still be piped."""
 
 from __future__ import annotations
 
-from types import TracebackType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from neeco.experiments.jobs import JobNews
+if TYPE_CHECKING:
+    from neeco.experiments.jobs import JobNews
 
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
-class JobBars:
-    """Which job of how many, and how far each running one is; on stderr, and only once there is news."""
+class Bars:
+    """A bar for each thing that is counted, and for each running job; none before there is news, so that bad input ends
+    in its one line alone."""
 
     def __init__(self) -> None:
         columns = (
@@ -24,26 +28,24 @@ class JobBars:
             TimeRemainingColumn(),
         )
         self.bar = Progress(*columns, console=Console(stderr=True))
-        self.running: dict[int, TaskID] = {}
-        self.stages: dict[str, TaskID] = {}
+        self.tasks: dict[str, TaskID] = {}
         self.ended: set[int] = set()
 
-    def __enter__(self) -> JobBars:
+    def __enter__(self) -> Bars:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.bar.live.is_started:
             self.bar.stop()
 
-    def show(self, news: JobNews) -> None:
+    def stage(self, what: str, done: int, total: int | None) -> None:
+        """How many of `what` are done."""
+        self.bar.update(self._task(what), completed=done, total=total, text=f"{done}/{total}")
+
+    def job(self, news: JobNews) -> None:
         """What `run_jobs` tells."""
-        self.bar.start()
         title = f"{news.index + 1}/{news.total} {news.job.title}"
-        if news.index not in self.running:
-            self.running[news.index] = self.bar.add_task(title, total=1.0, text="")
-        task = self.running[news.index]
+        task = self._task(title)
         if news.result is not None:
             self.ended.add(news.index)
             self.bar.update(task, visible=False)
@@ -56,9 +58,16 @@ class JobBars:
             share = 1 - EVALUATION_SHARE * (1 - news.share)
         self.bar.update(task, completed=share, text=f"{news.stage} {news.text}".rstrip())
 
-    def stage(self, what: str, done: int, total: int) -> None:
-        """What follows the jobs."""
+    def _task(self, title: str) -> TaskID:
         self.bar.start()
-        if what not in self.stages:
-            self.stages[what] = self.bar.add_task(what, total=total, text="")
-        self.bar.update(self.stages[what], completed=done, text=f"{done} of {total}")
+        if title not in self.tasks:
+            self.tasks[title] = self.bar.add_task(title, total=1.0, text="")
+        return self.tasks[title]
+
+
+@contextmanager
+def counting(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """A bar from 0 to `total`; yields the function to call with how many are done, and of how many where that was not
+    known before."""
+    with Bars() as bars:
+        yield lambda done, of=total: bars.stage(title, done, of)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco_mask
 
-from neeco.labels.geometry import (
+from neeco.labels.contours import (
     bounding_box,
     joined_polygon,
     minimum_rectangle,
@@ -106,3 +106,12 @@ def test_speckle_goes_and_large_pieces_stay():
     with_speck[1, 1] = True
     assert (without_speckle(with_speck, 0.01) == mask).all()
     assert without_speckle(with_speck, 0.0)[1, 1]
+
+
+def test_polygons_run_along_pixel_edges_and_pixels_that_touch_at_a_corner_are_two_pieces():
+    mask = np.zeros((5, 6), bool)
+    mask[1, 2] = mask[2, 3] = True
+    assert [polygon.tolist() for polygon in outer_polygons(mask)] == [
+        [[2, 1], [3, 1], [3, 2], [2, 2]],
+        [[3, 2], [4, 2], [4, 3], [3, 3]],
+    ]

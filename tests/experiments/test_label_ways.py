@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from neeco.capture.writer import write_capture
-from neeco.synthesis.label_ways import score_label_ways
+from neeco.experiments.masks import score_label_ways
 from neeco.training.options import training_config
+from neeco.training.run import load_run
 from neeco.training.train import train
 
 
@@ -17,8 +18,9 @@ def test_each_way_has_an_overlap_for_each_split_or_none(method: str, known: bool
     root = tmp_path / "capture"
     write_capture(world.make_capture(root, world.TinyScene(), ("train",) * 4 + ("test", "unseen")), root)
     small = ["deformation.width=8", "deformation.depth=2", "deformation.warm_up=0"] if known else []
-    run = train(root, tmp_path / "run", training_config(method, {"iterations": 10}, small))
-    scores = score_label_ways(run, ("test", "unseen"))
+    path = train(root, tmp_path / "run", training_config(method, {"iterations": 10}, small))
+    run = load_run(path)
+    scores = score_label_ways(run, run.capture(), ("test", "unseen"))
     assert list(scores) == ["composited", "threshold"]
     for way in scores.values():
         assert list(way) == ["test", "unseen"]

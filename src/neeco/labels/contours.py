@@ -5,27 +5,27 @@ Coordinates are pixel edges: the pixel in column x, row y covers [x, x + 1] x [y
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 SIMPLIFY_PX = 0.8  # a straight edge drawn in pixels strays less than this from its line
 SIMPLIFY_AREA = 0.02  # a simpler polygon may change the area by this share
+FINE = 4  # times as large are pixels drawn to find their edges
 
 
 def bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     """The box (x, y, width, height) of the extreme pixels of a mask [H, W]; all 0 for an empty mask."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if len(rows) == 0:
-        return 0, 0, 0, 0
-    x, y = int(columns[0]), int(rows[0])
-    return x, y, int(columns[-1]) + 1 - x, int(rows[-1]) + 1 - y
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return x, y, width, height
 
 
 def minimum_rectangle(mask: np.ndarray) -> np.ndarray | None:
     """Corners [4, 2] (x, y) of the smallest rectangle, in any direction, round all pixels of a mask; None when empty.
 
-    Rotating calipers on the convex hull (Toussaint 1983): the smallest rectangle shares a side with the hull.
+    Rotating calipers on the convex hull (Toussaint 1983): the smallest rectangle shares a side with the hull. Our own:
+    cv2.minAreaRect reckons in float32 and leaves corners of pixels outside.
     """
     # the first and last pixel of every row carry the hull
     rows = np.flatnonzero(mask.any(1))
@@ -57,7 +57,7 @@ def without_speckle(mask: np.ndarray, share: float) -> np.ndarray:
 
 def outer_polygons(mask: np.ndarray) -> list[np.ndarray]:
     """The outer contour [P, 2] (x, y) of every piece of a mask, largest first, simplified; holes are filled."""
-    polygons = [_simplified(loop) for loop in _boundary_loops(mask) if signed_area(loop) > 0]
+    polygons = [_simplified(loop) for loop in _outer_loops(mask)] if mask.any() else []
     return sorted(polygons, key=lambda polygon: -abs(signed_area(polygon)))
 
 
@@ -80,43 +80,41 @@ def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
     return joined
 
 
-def _boundary_loops(mask: np.ndarray) -> list[np.ndarray]:
-    """Closed loops of corners round every piece and hole of a mask, along pixel edges, the inside to the right."""
-    padded = np.pad(mask.astype(bool), 1)
-    inside = padded[1:-1, 1:-1]
-    sides = (  # (neighbour outside, start corner, end corner), corners as (dx, dy) from the pixel's
-        (~padded[:-2, 1:-1], (0, 0), (1, 0)),
-        (~padded[1:-1, 2:], (1, 0), (1, 1)),
-        (~padded[2:, 1:-1], (1, 1), (0, 1)),
-        (~padded[1:-1, :-2], (0, 1), (0, 0)),
+def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
+    """A closed loop of corners [P, 2] (x, y) round every (edge-connected) piece of a mask, along pixel edges.
+
+    OpenCV joins the centres of pixels, and pixels that touch at a corner alone. Of pixels drawn FINE times as large
+    every centre has one nearest corner; where two touch at a corner alone, what touches is cut away.
+    """
+    x, y, width, height = bounding_box(mask)
+    inside = mask[y : y + height, x : x + width].astype(np.uint8)
+    fine = np.kron(inside, np.ones((FINE, FINE), np.uint8))
+    upper_left, upper_right, lower_left, lower_right = (
+        inside[:-1, :-1],
+        inside[:-1, 1:],
+        inside[1:, :-1],
+        inside[1:, 1:],
     )
-    onward: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for outside, (sx, sy), (ex, ey) in sides:
-        rows, columns = np.nonzero(inside & outside)
-        for x, y in zip(columns.tolist(), rows.tolist(), strict=True):
-            onward.setdefault((x + sx, y + sy), []).append((x + ex, y + ey))
+    touching = (upper_left == lower_right) & (upper_right == lower_left) & (upper_left != upper_right)
+    for row, column in FINE * (np.argwhere(touching) + 1):
+        fine[row - 1 : row + 1, column - 1 : column + 1] = 0
+    contours, hierarchy = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     loops = []
-    while onward:
-        start = previous = next(iter(onward))
-        loop, here = [start], onward[start].pop()
-        if not onward[start]:
-            del onward[start]
-        while here != start:
-            choices = onward[here]
-            # two pixels that touch at a corner are two pieces: turn right there
-            right = (here[0] - (here[1] - previous[1]), here[1] + (here[0] - previous[0]))
-            step = choices[0] if len(choices) == 1 or choices[0] == right else choices[1]
-            choices.remove(step)
-            if not choices:
-                del onward[here]
-            loop.append(here)
-            previous, here = here, step
-        loops.append(np.array(loop, dtype=float))
+    for contour, (*_, parent) in zip(contours[::-1], hierarchy[0][::-1], strict=True):
+        if parent >= 0:  # a hole
+            continue
+        corners = (contour[::-1, 0] + FINE // 2) // FINE  # clockwise as seen
+        corners = corners[(corners != np.roll(corners, 1, axis=0)).any(1)]
+        first = np.lexsort(corners.T)[0]  # the leftmost of the top row
+        loops.append(np.roll(corners, -first, axis=0) + np.array([x, y], dtype=float))
     return loops
 
 
 def _simplified(loop: np.ndarray) -> np.ndarray:
-    """The loop with fewer corners (Douglas and Peucker 1973), its area kept within SIMPLIFY_AREA."""
+    """The loop with fewer corners (Douglas and Peucker 1973), its area kept within SIMPLIFY_AREA.
+
+    Our own: drawn again, polygons of cv2.approxPolyDP agree less with their masks (mean IoU .976 instead of .978).
+    """
     area = signed_area(loop)
     tolerance = SIMPLIFY_PX
     while tolerance > 0.1:
