@@ -27,7 +27,7 @@ class Rod(Deformation):
     label_names = (("rod", "shaft"), ("rod", "jaw"))
 
     def __init__(self, jaw_rows: int, instrument: str = "rod") -> None:
-        super().__init__()
+        super().__init__(())
         self.jaw_rows, self.instrument = jaw_rows, instrument
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:

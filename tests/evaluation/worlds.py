@@ -24,6 +24,7 @@ class TinyScene:
     """What evaluation needs of a scene: tissue 100 to 110 mm away, a two-part bar at its instrument's origin."""
 
     labelled: bool = True
+    has_gaussians = True
     method: str = "tiny"
     diagnostics: dict[str, Any] = field(default_factory=dict)
 

@@ -24,7 +24,7 @@ from neeco.experiments import jobs as jobs_module
 from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
 from neeco.experiments.jobs import Budget
 from neeco.experiments.summary import distances_to_training
-from neeco.training.session import Session
+from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "machine", "milliseconds")
 
@@ -93,9 +93,9 @@ def test_interrupted_it_goes_on_to_the_same_comparison(
     spec: ComparisonSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = compared(replace(spec, output=tmp_path / "whole"))
-    step, steps = Session.step, [0]
+    step, steps = GaussianSession.step, [0]
 
-    def interrupted(session: Session):
+    def interrupted(session: GaussianSession):
         result = step(session)
         steps[0] += 1
         if steps[0] == 15:  # in the second of four jobs
@@ -103,7 +103,7 @@ def test_interrupted_it_goes_on_to_the_same_comparison(
         return result
 
     with monkeypatch.context() as patched:
-        patched.setattr(Session, "step", interrupted)
+        patched.setattr(GaussianSession, "step", interrupted)
         with pytest.raises(KeyboardInterrupt, match=r"job 2 of 4 \(3dgs\+dta, seed 0\), at iteration 5; run the same"):
             compared(spec)
     half = json.loads((spec.output / "comparison.json").read_text())
@@ -134,14 +134,14 @@ def test_more_seeds_and_methods_are_added_without_training_the_others_again(
 def test_a_failed_run_is_told_in_its_place_and_ends_with_status_1(
     spec: ComparisonSpec, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    step = Session.step
+    step = GaussianSession.step
 
-    def diverging(session: Session):
+    def diverging(session: GaussianSession):
         if session.config.schedule.sh_order == "on":
             raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
         return step(session)
 
-    monkeypatch.setattr(Session, "step", diverging)
+    monkeypatch.setattr(GaussianSession, "step", diverging)
     words = ["compare", str(spec.capture), "--methods", "3dgs", "3dgs+dta", "--iterations", "10"]
     assert main([*words, "--output", str(spec.output)]) == 1
     told = capsys.readouterr()

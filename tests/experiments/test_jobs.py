@@ -23,7 +23,7 @@ from neeco.experiments.running import run_jobs, threads_per_worker
 from neeco.experiments.watching import HeldOut
 from neeco.training import train as train_module
 from neeco.training.options import training_config
-from neeco.training.session import Session
+from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
 
@@ -86,16 +86,16 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
     whole = make_job(folder=tmp_path / "whole")
     expected = run_job(whole)
     cut = make_job(folder=tmp_path / "cut")
-    step = Session.step
+    step = GaussianSession.step
 
-    def interrupted(session: Session):
+    def interrupted(session: GaussianSession):
         result = step(session)
         if session.iteration == stop:
             os.kill(os.getpid(), signal.SIGINT)
         return result
 
     with monkeypatch.context() as patched:
-        patched.setattr(Session, "step", interrupted)
+        patched.setattr(GaussianSession, "step", interrupted)
         with pytest.raises(KeyboardInterrupt, match=rf"job 1 of 1 \(3dgs, seed 0\), at iteration {stop}; run the same"):
             run_jobs([cut])
     assert not (cut.folder / "job.json").exists()
@@ -113,15 +113,15 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
     monkeypatch.setattr(train_module, "CHECKPOINT_INTERVAL", 5)
     whole, cut = make_job(folder=tmp_path / "whole"), make_job(folder=tmp_path / "cut")
     expected = run_job(whole)
-    step = Session.step
+    step = GaussianSession.step
 
-    def killed(session: Session):
+    def killed(session: GaussianSession):
         if session.iteration == 8:
             raise MemoryError("killed")
         return step(session)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Session, "step", killed)
+        patched.setattr(GaussianSession, "step", killed)
         assert "MemoryError" in run_jobs([cut])[0]["error"]
     assert without_times(run_job(cut)) == without_times(expected)
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
@@ -167,14 +167,14 @@ def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.
 
 
 def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = Session.step
+    step = GaussianSession.step
 
-    def diverging(session: Session):
+    def diverging(session: GaussianSession):
         if session.config.seed == 1:
             raise NeecoError("training: the loss became nan at iteration 1, frame 000; train anew")
         return step(session)
 
-    monkeypatch.setattr(Session, "step", diverging)
+    monkeypatch.setattr(GaussianSession, "step", diverging)
     told: list[str] = []
     results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda news: told.append(news.stage))
     assert [("error" in result) for result in results] == [False, True, False]
@@ -187,7 +187,7 @@ def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.M
 def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
     job = make_job()
     with monkeypatch.context() as patched:
-        patched.setattr(Session, "step", lambda session: 1 // 0)
+        patched.setattr(GaussianSession, "step", lambda session: 1 // 0)
         error = run_jobs([job])[0]["error"]
     record = job.folder.with_name("3dgs-seed0.error.txt")
     assert error.startswith("ZeroDivisionError")

@@ -119,7 +119,7 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(reported, 
     scene = world.TinyScene(method=HOSTILE, diagnostics={HOSTILE: {"hinge": HOSTILE, "verdict": HOSTILE}})
     capture = world.make_capture(tmp_path / HOSTILE, scene, ("train", "test"))
     (tmp_path / "config.yaml").write_text(HOSTILE)
-    evaluation = evaluate_run(world.TinyRun(tmp_path, scene, capture)) | {"notes": [HOSTILE]}
+    evaluation = evaluate_run(world.TinyRun(tmp_path, scene, capture), capture) | {"notes": [HOSTILE]}
     scene.instruments = (replace(scene.instruments[0], name=HOSTILE),)
     scene.label_names = ((HOSTILE, HOSTILE), ("bar", HOSTILE))
     check_hostile_names(lambda: write_report(tmp_path, evaluation, capture, scene).read_text(), VOID)

@@ -82,7 +82,7 @@ def test_recorded_states_span_minus_one_to_one(neeco: Scene) -> None:
 def test_the_quaternion_does_not_jump_where_its_sign_is_a_convention() -> None:
     """w passes through 0 at half a turn; the state must pass on smoothly."""
     states = [grasper_state(pose_of(angle, 0, 0, 0, 0, 0)) for angle in torch.linspace(2.6, 3.6, 41).tolist()]
-    network = NPS((GRASPER,), depth=2, width=8)
+    network = NPS((GRASPER,), NPSSettings(depth=2, width=8))
     network.fit_ranges(states, torch.randn(50, 3, generator=torch.Generator().manual_seed(0)))
     quats = torch.stack([network._raw_state(state)[3:7] for state in states])
     assert (quats[1:] - quats[:-1]).norm(dim=1).max() < 0.02

@@ -44,7 +44,7 @@ def begun(method: str, folder: Path) -> Session:
 
 @pytest.mark.parametrize("method", list(METHODS))
 def test_two_hundred_steps_agree(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Losses within float32's rounding. A field's first gradients are noise, whose sign Adam follows: there, the end."""
+    """Losses within float32's rounding. A field's first gradients are noise, whose sign Adam follows: there the end."""
     monkeypatch.setattr(discovery, "SEEDS", 300)  # the reference sees every Gaussian at every pixel
     losses: dict[Family, torch.Tensor] = {}
     sizes: dict[Family, int | None] = {}

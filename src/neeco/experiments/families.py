@@ -33,8 +33,8 @@ class Family:
 
 
 def _paper_settings(iterations: int) -> tuple[str, ...]:
-    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network rests for its usual share
-    of the run or REST_STEPS, whichever is longer."""
+    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network rests for its usual
+    share of the run or REST_STEPS, whichever is longer."""
     rest = max(WARM_UP, min(LONGEST_REST, REST_STEPS / iterations))
     return (
         f"schedule.published_steps={PUBLISHED_STEPS}",

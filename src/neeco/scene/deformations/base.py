@@ -76,7 +76,7 @@ class Deformation(nn.Module, Method):
     warm_up: float = 0.0
     resting: bool = False
 
-    def __init__(self, instruments: tuple[Instrument, ...], settings: Any = None) -> None:
+    def __init__(self, instruments: tuple[Instrument, ...] = (), settings: Any = None) -> None:
         super().__init__()
         self.instruments = instruments
         self.settings = self.Settings() if settings is None else settings
