@@ -24,6 +24,8 @@ from neeco.experiments import jobs as jobs_module
 from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
 from neeco.experiments.jobs import Budget
 from neeco.experiments.summary import distances_to_training
+from neeco.scene.methods import method_settings
+from neeco.settings import plain
 from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "machine", "milliseconds")
@@ -254,7 +256,7 @@ def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None
         for name in ("3dgs", "neeco")
     }
     assert [configs[name]["tissue_budget"] for name in configs] == [70, 70]
-    assert configs["neeco"]["deformation"] == {"width": 16}
+    assert configs["neeco"]["deformation"] == plain(method_settings("neeco", {"width": 16}))
     assert configs["3dgs"]["deformation"] == {}
     assert result["settings"] == list(given)
 
