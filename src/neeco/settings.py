@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +56,8 @@ def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
         hint = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
         text = f"{default:.4g}" if isinstance(default, float) else str(default)
-        yield field.name, hint.replace("Literal", ""), text
+        words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace(", ", "|").replace('"', ""), hint)
+        yield field.name, words, text
 
 
 def _plain(value: Any) -> Any:

@@ -66,7 +66,7 @@ def test_such_a_folder_is_learned_on_its_white_scored_and_drawn(folder: Path, tm
     config = training_config("3dgs", {"iterations": 60}, ["tissue_budget=2000"])
     run_path = train(folder, tmp_path / "run", config)
     scene = load_scene(run_path / "scene.safetensors")
-    assert scene.backdrop == 1.0
+    assert scene.background == 1.0
     frame = read_capture(folder).split("test")[0]
     with torch.no_grad():
         away = rasterize(scene.at(frame.state), _turned_round(frame.camera)).color

@@ -185,11 +185,11 @@ def test_a_quaternion_of_length_zero_draws_nothing(simd: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_the_backdrop_stands_in_where_no_background_is_asked_for(backend: str) -> None:
+def test_the_background_stands_in_where_no_background_is_asked_for(backend: str) -> None:
     scene = make_scene(6)
     _, gaussians, camera = leaves(scene, torch.float32)
     white, grey = torch.ones(3), torch.full((3,), 0.5)
-    before = replace(gaussians, backdrop=white)
+    before = replace(gaussians, background=white)
     out = rasterize(before, camera, backend=backend)
     assert torch.equal(out.color, rasterize(gaussians, camera, background=white, backend=backend).color)
     assert not torch.equal(out.color, rasterize(gaussians, camera, backend=backend).color)
@@ -325,7 +325,7 @@ def test_the_reference_keeps_its_type(dtype: torch.dtype) -> None:
 
 def test_gaussians_and_camera_move_whole() -> None:
     _, gaussians, camera = leaves(make_scene(5), torch.float32)
-    gaussians = replace(gaussians, backdrop=torch.ones(3)).to("meta")
+    gaussians = replace(gaussians, background=torch.ones(3)).to("meta")
     assert gaussians.headlight is not None
     held = [*vars(gaussians).values(), *vars(gaussians.headlight).values(), camera.to("meta").world_from_camera]
     assert {item.device.type for item in held if isinstance(item, torch.Tensor)} == {"meta"}

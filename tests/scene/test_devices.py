@@ -31,7 +31,7 @@ def all_meta(*tensors: Tensor | None) -> bool:
 @pytest.fixture(params=OF_GAUSSIANS)
 def scene(request: pytest.FixtureRequest) -> Scene:
     scene = make_scene(request.param).to(META)
-    scene.backdrop = 0.5
+    scene.background = 0.5
     return scene
 
 
@@ -56,7 +56,7 @@ def test_posing_labels_and_deltas_stay_on_the_device(scene: Scene) -> None:
         light = posed.headlight
         assert light is not None
         assert all_meta(posed.means, posed.quats, posed.scales, posed.opacities, posed.sh, posed.sh_frames)
-        assert all_meta(light.falloff, light.vignette, posed.backdrop)
+        assert all_meta(light.falloff, light.vignette, posed.background)
     assert all_meta(scene.label_channels(), *vars(scene.deltas(state)).values())
     assert all_meta(*(point for points in scene.keypoints(state).values() for point in points.values()))
 

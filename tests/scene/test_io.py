@@ -18,7 +18,7 @@ from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors
 
 
 def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
-    any_scene.backdrop = 0.75
+    any_scene.background = 0.75
     any_scene.diagnostics = {"joints": {"grasper.jaw_angle": {"found": True}}}
     with torch.no_grad():
         any_scene.falloff.copy_(torch.tensor([1.9, 2.1]))
@@ -38,7 +38,7 @@ def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
             assert torch.equal(a.means, b.means)
             assert torch.equal(a.quats, b.quats)
             assert torch.equal(a.sh, b.sh)
-            assert b.backdrop.tolist() == [0.75] * 3
+            assert b.background.tolist() == [0.75] * 3
             assert torch.equal(a.headlight.falloff, b.headlight.falloff)
 
 

@@ -78,7 +78,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     import tyro
 
-    run, arguments = _verb(words[0]) if words and words[0] in VERBS else (None, None)
+    run, arguments = _verb(words) if words and words[0] in VERBS else (None, None)
     choices: dict[str, Callable[..., Any]] = {
         name: arguments if arguments is not None and name == words[0] else _named_only(name, line)
         for name, line in VERBS.items()
@@ -93,10 +93,15 @@ def _dispatch(words: list[str]) -> int:
     return run(parsed)
 
 
-def _verb(name: str) -> tuple[Callable[[Any], int], Callable[..., Any]]:
-    """A verb's `run` and the dataclass of its arguments, which is what `run` takes."""
-    run = importlib.import_module(f"{__name__}.{name.replace('-', '_')}").run
-    return run, next(iter(get_type_hints(run).values()))
+def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:
+    """The first word's `run` and the dataclass of its arguments, which is what `run` takes. Where the verb's help takes
+    longer to find out (`explain`), it is only when help is asked for."""
+    module = importlib.import_module(f"{__name__}.{words[0].replace('-', '_')}")
+    arguments = next(iter(get_type_hints(module.run).values()))
+    if hasattr(module, "explain") and not {"-h", "--help"}.isdisjoint(words):
+        explained = f"{arguments.__doc__.strip()}\n\n{module.explain()}"
+        arguments = type(arguments.__name__, (arguments,), {"__doc__": explained})
+    return module.run, arguments
 
 
 def _named_only(name: str, line: str) -> Callable[..., Any]:

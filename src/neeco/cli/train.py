@@ -64,3 +64,17 @@ def run(args: Arguments) -> int:
     path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {path})")
     return 0
+
+
+def explain() -> str:
+    """What `--help` adds: each method's own settings."""
+    from neeco.scene.methods import METHODS
+    from neeco.settings import described
+
+    told = ["Settings of each method, as --set deformation.NAME=VALUE:"]
+    for name, method in METHODS.items():
+        fields = [f"{field}: {kind} = {default}" for field, kind, default in described(method.Settings)]
+        if fields:
+            words = " ".join((method.Settings.__doc__ or "").split())
+            told.append(f"{name}: {', '.join(fields)}. {words}")
+    return "\n\n".join(told)

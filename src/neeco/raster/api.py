@@ -26,7 +26,7 @@ def rasterize(
     """Draw Gaussians (3D Gaussian splatting, Kerbl et al. 2023, with gsplat's conventions).
 
     channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
-    the Gaussians' backdrop, or black.
+    the Gaussians' background, or black.
     backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat), or
     "auto": cuda for tensors on a CUDA device, cpu for those on the CPU, reference on other devices and where
     `kernels("torch")` asks for it. The camera's pose may stay on the CPU.
@@ -46,7 +46,7 @@ def rasterize(
     Raises NeecoError where shapes do not fit, or the backend cannot be had.
     """
     if background is None:
-        background = gaussians.backdrop
+        background = gaussians.background
     _check(gaussians, camera, channels, background)
     if backend == "auto":
         on_cpu = "cpu" if goes_native(gaussians.means) else "reference"

@@ -12,6 +12,8 @@ from neeco.raster.types import Camera
 
 Array = TypeVar("Array", Tensor, np.ndarray)
 
+FIELD_MARGIN = 0.3  # share of half the field of view by which the linearisation point may lie outside
+
 
 def project(points: Array, fx: Any, fy: Any, cx: Any, cy: Any, nearest: float | None = None) -> tuple[Array, Array]:
     """Columns and rows [...] px of points [..., 3] mm in a camera's frame (OpenCV axes, pixel centres at +0.5).
@@ -42,3 +44,16 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
 
 def _intrinsic(points: Array, camera: Camera, nearest: float | None) -> tuple[Array, Array]:
     return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
+
+
+def field_slopes(camera: Camera, camera_means: Tensor) -> Tensor:
+    """x/z and y/z [N, 2] of means [N, 3] (mm, camera frame), brought into the field of view and its margin.
+
+    A Gaussian beside the camera, whose slopes are enormous, may still reach into the image.
+    """
+    margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
+    margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
+    x, y, z = camera_means.unbind(-1)
+    across = (x / z).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    down = (y / z).clamp(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)
+    return torch.stack([across, down], dim=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neeco.raster.field import field_slopes
+from neeco.raster.pinhole import field_slopes
 from neeco.raster.types import Camera, Headlight
 
 

@@ -33,7 +33,7 @@ class Gaussians:
 
     Colour is `max(0, sh . basis(direction) + 0.5)`, direction = from the camera centre to the mean, unit, turned into
     the Gaussian's SH frame when `sh_frames` is given; then the headlight. No gradient flows into `sh_frames`.
-    `backdrop` lies behind all of them where nothing else is asked for, e.g. the white of images cut out of their
+    `background` lies behind all of them where nothing else is asked for, e.g. the white of images cut out of their
     surroundings.
     """
 
@@ -44,7 +44,7 @@ class Gaussians:
     sh: Tensor  # [N, K, 3], K = 1, 4, 9 or 16
     sh_frames: Tensor | None = None  # [N, 4] wxyz unit, world_from_sh
     headlight: Headlight | None = None
-    backdrop: Tensor | None = None  # [3] colour; None: black
+    background: Tensor | None = None  # [3] colour; None: black
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -36,7 +36,8 @@ class Scene(nn.Module):
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
-    instruments) and `vignette` are the headlight (see `Headlight`). `backdrop` in [0, 1] is the grey behind everything.
+    instruments) and `vignette` are the headlight (see `Headlight`). `background` in [0, 1] is the grey behind
+    everything.
     """
 
     has_gaussians = True
@@ -60,7 +61,7 @@ class Scene(nn.Module):
         self.instruments = instruments
         self.recorded = recorded
         self.sh_degree = 0
-        self.backdrop = 0.0
+        self.background = 0.0
         self.diagnostics: dict[str, Any] = {}
         self.register_buffer("center", center.float())  # [3] mm, middle of the tissue
         self.registration = nn.Parameter(torch.zeros(7))
@@ -84,7 +85,7 @@ class Scene(nn.Module):
         return {f"canonical.{name}": tensor for name, tensor in canonical.tensors().items()}, {
             "counts": list(canonical.counts),
             "sh_degree": self.sh_degree,
-            "backdrop": self.backdrop,
+            "background": self.background,
         }
 
     @classmethod
@@ -100,7 +101,8 @@ class Scene(nn.Module):
             header["method"], canonical, deformation, stored.instruments, stored.recorded, canonical.means.new_zeros(3)
         )
         scene.sh_degree = int(header["sh_degree"])
-        scene.backdrop = float(header.get("backdrop", 0.0))  # older scenes have none
+        # older scenes call it backdrop, or have none
+        scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
@@ -119,7 +121,7 @@ class Scene(nn.Module):
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
             headlight=Headlight(falloff, self.vignette),
-            backdrop=canonical.means.new_full((3,), self.backdrop) if self.backdrop else None,
+            background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
     def registered(self, state: State) -> State:

@@ -40,7 +40,7 @@ def gaussian_session(
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
     """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
     alone. Raises NeecoError when a joint asked for is unknown."""
-    backdrop = _backdrop(frames)  # first: files may go once training has begun
+    background = _background(frames)  # first: files may go once training has begun
     instruments = tuple(
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
         for i in capture.instruments
@@ -53,11 +53,11 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     center = torch.from_numpy(np.median(positions, 0))
     tissue = tissue.with_extras(**deformation.initial_extras(tissue))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
-    scene.backdrop = backdrop
+    scene.background = background
     return scene
 
 
-def _backdrop(frames: tuple[Frame, ...]) -> float:
+def _background(frames: tuple[Frame, ...]) -> float:
     """The grey [0, 1] that transparent images were laid on, so that it need not be learned; black where images fill
     their frame. Raises NeecoError when an image cannot be read."""
     return next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 from neeco.raster import rasterize
+from neeco.raster.pinhole import project
 from neeco.scene.scene import Scene
 from neeco.training.views import TrainingViews
 
@@ -52,9 +53,8 @@ class Evidence:
     def look_up_camera(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue: both
         [F, Q]."""
-        x, y, z = points.unbind(-1)
-        fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
-        u, v = x / z * fx + cx, y / z * fy + cy
+        z = points[..., 2]
+        u, v = project(points, *(column[:, None] for column in self.intrinsics.unbind(1)))
         height, width = self.hits.shape[1:]
         own_width, own_height = self.sizes[:, :1], self.sizes[:, 1:]
         inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)

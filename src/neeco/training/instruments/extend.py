@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from neeco.raster.pinhole import project_world
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinges
 from neeco.scene.recording import Recording
@@ -34,7 +35,8 @@ def extend_shaft(
     rear, front = float(along[solid].quantile(0.01)), float(hinges.wrist_start)
     if not rear < front:
         return canonical
-    positions = torch.linspace(rear, front, 40)
+    device = canonical.means.device
+    positions = torch.linspace(rear, front, 40, device=device)
     seen = shaft_coverage(positions, name, hinges, recorded)
     if float(seen[0]) > ENDS_IN_VIEW or not bool((seen >= WELL_SEEN).any()):
         return canonical
@@ -46,9 +48,10 @@ def extend_shaft(
     kept = torch.nonzero(along >= start)[:, 0]
     repeats = math.ceil(length / slab)
     index = torch.cat([kept, copied.repeat(repeats)]) + rows.start
-    shift = torch.zeros(len(index))
-    shift[len(kept) :] = -slab * torch.arange(1, repeats + 1).repeat_interleave(len(copied)).float()
-    whole = torch.cat([torch.arange(rows.start), index, torch.arange(rows.stop, len(canonical))])
+    shift = torch.zeros(len(index), device=device)
+    shift[len(kept) :] = -slab * torch.arange(1, repeats + 1, device=device).repeat_interleave(len(copied)).float()
+    whole = torch.arange(len(canonical), device=device)
+    whole = torch.cat([whole[: rows.start], index, whole[rows.stop :]])
     counts = list(canonical.counts)
     counts[body] = len(index)
     extended = canonical.map(lambda tensor: tensor[whole].contiguous(), tuple(counts))
@@ -61,14 +64,12 @@ def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recor
     """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
     origin, direction = hinges.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]
-    counts = torch.zeros(len(positions))
+    counts = torch.zeros_like(positions)
     for state, camera in zip(recorded.states, recorded.cameras, strict=True):
-        pose = state.instruments[name].pose.float()
-        world = points @ pose[:3, :3].T + pose[:3, 3]
-        view = camera.world_from_camera.float()
-        x, y, z = ((world - view[:3, 3]) @ view[:3, :3]).unbind(1)
-        u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
-        counts += (z > camera.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        pose = state.instruments[name].pose.to(points)
+        pixels, depths = project_world(points @ pose[:3, :3].T + pose[:3, 3], camera)
+        u, v = pixels.unbind(1)
+        counts += (depths > camera.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
     return counts / max(1, len(recorded.states))
 
 
