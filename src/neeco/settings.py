@@ -56,7 +56,7 @@ def described(kind: type[Any]) -> Iterator[tuple[str, str, str]]:
         hint = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
         default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
         text = f"{default:.4g}" if isinstance(default, float) else str(default)
-        words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace(", ", "|").replace('"', ""), hint)
+        words = re.sub(r"Literal\[(.*?)\]", lambda match: match[1].replace(", ", "|").replace("'", ""), hint)
         yield field.name, words, text
 
 
