@@ -8,13 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from capture_files import write_capture
 from torch import Tensor
 
+from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
+from neeco.training.initial import initial_scene
+from neeco.training.instruments import discovery
 from neeco.training.instruments.carving import CarvedShape, carve
+from neeco.training.instruments.discovery import tissue_evidence
 from neeco.training.instruments.evidence import Evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
+from neeco.training.options import training_config
+from neeco.training.views import TrainingViews
 
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame
@@ -151,3 +158,17 @@ def test_a_joint_that_stands_still_gives_no_hinge() -> None:
     )
     frozen = Evidence(evidence.hits, evidence.depths, evidence.camera_from_world, evidence.intrinsics, still)
     assert search_hinge(frozen, "tool", "jaw", shape) == []
+
+
+def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five steps: longer, and the tissue's Gaussians would grow over what is behind them."""
+    monkeypatch.setattr(discovery, "TISSUE_STEPS", 5)
+    monkeypatch.setattr(discovery, "LONGER_STEPS", 5)
+    capture = read_capture(write_capture(tmp_path / "capture"))
+    frames = capture.split("train")
+    white = tuple(torch.full((24, 32, 3), 255, dtype=torch.uint8) for _ in frames)
+    config = training_config("kinematic", {})
+    scene = initial_scene(capture, frames, config, print)
+    scene.background = 1.0  # as of images cut out of their surroundings
+    evidence = tissue_evidence(scene, TrainingViews(frames, white, (None,) * len(frames)), config)
+    assert float(evidence.hits[:, :6].mean()) < 0.05  # above the points

@@ -107,7 +107,8 @@ def _evidence_after(
 ) -> Evidence:
     """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
-    alone = Scene("3dgs", tissue, Static(()), (), Recording(), scene.center)
+    alone = Scene("3dgs", tissue, Static(), (), Recording(), scene.center)
+    alone.background = scene.background  # or what lies behind transparent images would be evidence
     short = replace(
         config,
         iterations=steps,
