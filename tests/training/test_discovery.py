@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.training.initial import initial_scene
+from neeco.training.initial import gaussian_session, initial_scene
 from neeco.training.instruments import discovery
 from neeco.training.instruments.carving import CarvedShape, carve
 from neeco.training.instruments.discovery import tissue_evidence
@@ -172,3 +172,12 @@ def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path, monk
     scene.background = 1.0  # as of images cut out of their surroundings
     evidence = tissue_evidence(scene, TrainingViews(frames, white, (None,) * len(frames)), config)
     assert float(evidence.hits[:, :6].mean()) < 0.05  # above the points
+
+
+def test_without_instruments_there_is_nothing_to_look_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discovery, "tissue_evidence", lambda *_: pytest.fail("fitted the tissue for nothing"))
+    capture = read_capture(write_capture(tmp_path / "capture", instruments=False))
+    views = TrainingViews.read(capture.split("train"))
+    session = gaussian_session(capture, views, training_config("kinematic", {}), print)
+    assert session.scene.canonical.counts == (150,)
+    session.step()

@@ -37,6 +37,8 @@ def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
     in its own frame: its poses do not match the images.
     """
     scene, config, report = session.scene, session.config, session.report
+    if not scene.instruments:
+        return
     report("looking for the instruments: fitting the tissue alone")
     evidence = tissue_evidence(scene, session.views, config)
     generator = torch.Generator().manual_seed(config.seed)
