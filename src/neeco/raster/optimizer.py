@@ -36,41 +36,15 @@ def adam_step(
     for name, tensor in (("grad", gradient), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
         if _kind(tensor) != _kind(param):
             raise NeecoError(f"adam_step: {name}: {_kind(tensor)}; expected {_kind(param)}, as the parameter")
-    if goes_native(param) and param.dtype == torch.float32:
-        _native_step(param, gradient, exp_avg, exp_avg_sq, lr, step, betas, eps)
-    else:
-        _torch_step(param, gradient, exp_avg, exp_avg_sq, lr, step, betas, eps)
-
-
-def _native_step(
-    param: Tensor,
-    grad: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    lr: float,
-    step: int,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    for name, tensor in (("param", param), ("exp_avg", mean), ("exp_avg_sq", square)):
+    if not (goes_native(param) and param.dtype == torch.float32):
+        param.sub_(lr * adam_update(gradient, exp_avg, exp_avg_sq, step, betas, eps))
+        return
+    for name, tensor in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
         if not tensor.is_contiguous():
             raise NeecoError(f"adam_step: {name}: must be contiguous")
-    native().adam(param.detach(), grad.contiguous(), mean, square, lr, step, *betas, eps)
+    native().adam(param.detach(), gradient.contiguous(), exp_avg, exp_avg_sq, lr, step, *betas, eps)
     # Autograd notices in-place changes by this counter, which native code does not touch.
     torch.autograd.graph.increment_version(param)
-
-
-def _torch_step(
-    param: Tensor,
-    grad: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    lr: float,
-    step: int,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    param.sub_(lr * adam_update(grad, mean, square, step, betas, eps))
 
 
 @torch.no_grad()

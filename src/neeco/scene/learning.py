@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame, Instrument
+from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
@@ -30,6 +32,21 @@ class StepResult:
 
     loss: float
     psnr: float
+
+    @classmethod
+    def of(cls, loss: Tensor, squared_error: Tensor) -> StepResult:
+        """From the image's loss and its mean squared error, both scalars."""
+        return cls(float(loss.detach()), -10 * math.log10(max(float(squared_error.detach()), 1e-10)))
+
+
+def check_finite(total: Tensor, iteration: int, where: str = "") -> None:
+    """Raises NeecoError when what is to be minimised, a scalar, has become no number."""
+    value = float(total.detach())
+    if not math.isfinite(value):
+        raise NeecoError(
+            f"training: the loss became {value} at iteration {iteration}{where}; run `neeco check` on the capture, or "
+            "train anew with another --seed (the last checkpoint is kept)"
+        )
 
 
 class Views(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -76,8 +75,3 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     settings = method_settings(method, own)
     config = structure(TrainConfig, {**values, "deformation": None}, owner="the training config")
     return with_fields(config, {"deformation": settings})
-
-
-def decayed(rate: float, progress: float, final: float = 0.03) -> float:
-    """Log-linear decay of a learning rate from `rate` to `rate * final` (3DGS's position schedule)."""
-    return rate * math.exp(math.log(final) * min(1.0, progress))

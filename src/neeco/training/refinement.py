@@ -12,8 +12,9 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.optimizer import adam_update
+from neeco.scene.deformations.base import log_linear
 from neeco.scene.rotations import rigid_from_vector, vector_from_rotation
-from neeco.training.config import RefineConfig, decayed
+from neeco.training.config import RefineConfig
 
 RATES = torch.tensor([6e-4] * 3 + [4e-2] * 3)  # rad, mm
 PRIOR_SIGMA = torch.tensor([4.4e-3] * 3 + [0.3] * 3)  # a tracker's 0.25 deg and 0.3 mm
@@ -83,7 +84,7 @@ class Refinement:
             return
         self.frame_steps[index] += 1
         count = float(self.frame_steps[index])
-        decay = decayed(1.0, progress, 0.1)
+        decay = log_linear(1.0, 0.1, progress)
         for name, leaf in self._leaves.items():
             if leaf.grad is None:
                 continue

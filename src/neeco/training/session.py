@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Frame
-from neeco.errors import NeecoError
 from neeco.raster import Rendering, rasterize
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation, floored_decay
-from neeco.scene.learning import InstrumentSearch, Report, StepResult
+from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
+from neeco.scene.learning import InstrumentSearch, Report, StepResult, check_finite
 from neeco.scene.scene import Scene
-from neeco.training.config import TrainConfig, decayed
+from neeco.training.config import TrainConfig
 from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule, order_by_pose
@@ -112,23 +111,13 @@ class GaussianSession:
         target = self.views.target(index)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
-        if not math.isfinite(float(total.detach())):
-            raise NeecoError(
-                f"training: the loss became {float(total.detach())} at iteration {self.iteration}, frame {frame.name}; "
-                "run `neeco check` on the capture, or train anew with another --seed (the last checkpoint is kept)"
-            )
+        check_finite(total, self.iteration, f", frame {frame.name}")
         total.backward()
         self._learn(rendering, index, progress)
-        mse = self._error(rendering.color.detach(), target, mask)
-        result = StepResult(float(loss.detach()), -10 * math.log10(max(mse, 1e-10)))
+        result = StepResult.of(loss, _squared_error(rendering.color.detach(), target, mask))
         self.schedule.observe(self.iteration, result.loss, result.psnr, progress)
         self._control_density(progress)
         return result
-
-    @staticmethod
-    def _error(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-        squared = (image - target).square()
-        return float(squared.mean() if mask is None else squared[mask].mean())
 
     def _next_frame(self) -> int:
         phase = self.schedule.phase
@@ -157,7 +146,7 @@ class GaussianSession:
         camera = self.views.frames[index].camera
         self.statistics.record(gradient, camera.width, camera.height)
         scene, gaussian_rates = self.scene, self.gaussian_rates
-        position_rate = POSITION_RATE * self.extent * decayed(1.0, progress)
+        position_rate = POSITION_RATE * self.extent * log_linear(1.0, FINAL_RATE, progress)
         for name, tensor in scene.canonical.tensors().items():
             rate = position_rate if name == "means" else gaussian_rates.get(name)
             if rate is not None:
@@ -289,3 +278,8 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
 def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
     """The tensors called GROUP/NAME, by NAME."""
     return {key.removeprefix(f"{group}/"): t for key, t in tensors.items() if key.startswith(f"{group}/")}
+
+
+def _squared_error(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    squared = (image - target).square()
+    return squared.mean() if mask is None else squared[mask].mean()

@@ -55,6 +55,7 @@ def train(
     output: Path,
     config: TrainConfig,
     *,
+    capture: Capture | None = None,
     device: torch.device = CPU,
     resume: bool = False,
     progress: Progress | None = None,
@@ -63,7 +64,7 @@ def train(
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
-    `device` is where it computes; a run goes on on the kind of device it was begun on. Writes config.yaml,
+    `capture`: what `read_checked` made of the path, where that is known. `device` is where it computes; a run goes on on the kind of device it was begun on. Writes config.yaml,
     metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an interrupted run
     under the settings it was started with. The same seed gives the same scene on a CPU, interrupted or not, unless
     `minutes` is set: minutes of `clock` (s; time.process_time counts the processor's), without what `watch` takes.
@@ -80,7 +81,8 @@ def train(
             return output
     elif output.is_dir() and any(output.iterdir()):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
-    capture, frames = _open_capture(capture_path, config)
+    capture = read_checked(capture_path, config.transforms) if capture is None else capture
+    frames = _training_frames(capture, capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
     with new_folder(output), method_class(config.method).torch_threads():
@@ -138,9 +140,8 @@ def _begin(
     return session
 
 
-def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame, ...]]:
-    capture = read_checked(path, config.transforms)
-    frames = capture.split("train")
+def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple[Frame, ...]:
+    """The frames to learn from. Raises NeecoError where the capture lacks what the method needs."""
     if method_class(config.method).needs_instruments and not capture.instruments:
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
@@ -150,7 +151,7 @@ def _open_capture(path: Path, config: TrainConfig) -> tuple[Capture, tuple[Frame
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
             "each frame its `time` in seconds), 3dgs does not"
         )
-    return capture, frames
+    return capture.split("train")
 
 
 def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:

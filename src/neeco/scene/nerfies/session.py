@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +13,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import log_linear
-from neeco.scene.learning import Config, Start, StepResult
+from neeco.scene.learning import Config, Start, StepResult, check_finite
 from neeco.scene.nerfies.rays import RayTable
 from neeco.scene.nerfies.scene import Drawn, NerfScene
 from neeco.scene.nerfies.settings import NerfiesSettings
@@ -120,17 +119,13 @@ class NerfiesSession:
         error = coarse if drawn.fine is None else _error(drawn.fine.color, colors, counted)
         loss = coarse if drawn.fine is None else coarse + error
         total = loss + self._elastic(drawn) + self._background()
-        if not math.isfinite(float(total.detach())):
-            raise NeecoError(
-                f"training: the loss became {float(total.detach())} at iteration {self.iteration}; run `neeco check` "
-                "on the capture, or train anew with another --seed (the last checkpoint is kept)"
-            )
+        check_finite(total, self.iteration)
         total.backward()
         rate = log_linear(settings.rate, FINAL_RATE * settings.rate, progress)
         for name, parameter in scene.named_parameters():
             if parameter.numel():
                 self.adam.step(name, parameter, rate)
-        return StepResult(float(loss.detach()), -10 * math.log10(max(float(error.detach()), 1e-10)))
+        return StepResult.of(loss, error)
 
     def _elastic(self, drawn: Drawn) -> Tensor:
         """Weighted elastic loss at the sample of median depth of the first rays, which are at random."""

@@ -54,7 +54,8 @@ class Evidence:
         """Evidence at camera-frame points [F, Q, 3], and whether each is in the image and before the tissue: both
         [F, Q]."""
         z = points[..., 2]
-        u, v = project(points, *(column[:, None] for column in self.intrinsics.unbind(1)))
+        fx, fy, cx, cy = (column[:, None] for column in self.intrinsics.unbind(1))
+        u, v = project(points, fx, fy, cx, cy)
         height, width = self.hits.shape[1:]
         own_width, own_height = self.sizes[:, :1], self.sizes[:, 1:]
         inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)
