@@ -64,12 +64,12 @@ def train(
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
-    `capture`: what `read_checked` made of the path, where that is known. `device` is where it computes; a run goes on on the kind of device it was begun on. Writes config.yaml,
-    metrics.jsonl, checkpoint/ while running and scene.safetensors at the end. `resume` continues an interrupted run
-    under the settings it was started with. The same seed gives the same scene on a CPU, interrupted or not, unless
-    `minutes` is set: minutes of `clock` (s; time.process_time counts the processor's), without what `watch` takes.
-    Raises NeecoError for a capture that `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is
-    no number.
+    `capture`: what `read_checked` made of the path, where that is known. `device` is where it computes; a run goes on
+    on the kind of device it was begun on. Writes config.yaml, metrics.jsonl, checkpoint/ while running and
+    scene.safetensors at the end. `resume` continues an interrupted run under the settings it was started with. The same
+    seed gives the same scene on a CPU, interrupted or not, unless `minutes` is set: minutes of `clock` (s;
+    time.process_time counts the processor's), without what `watch` takes. Raises NeecoError for a capture that
+    `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is no number.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way
     KeyboardInterrupt says how to go on. What fails before the first step leaves no run folder behind.
