@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.types import Camera
-from neeco.scene import CanonicalGaussians, Recording, Scene
+from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
 
 WALL_MM = 100.0
@@ -99,7 +99,7 @@ def make_scene() -> Scene:
         for jaw in np.linspace(0, 0.8, 12)
     )
     names = tuple(f"{k:06d}" for k in range(len(states)))
-    recorded = Recording(names, ("train",) * len(states), states, (CAMERA,) * len(states))
+    recorded = Recorded(names, ("train",) * len(states), states, (CAMERA,) * len(states))
     instruments = (Instrument("rod", {"jaw_angle": (0.0, 0.9)}),)
     return Scene("rod", canonical, Rod(len(jaw)), instruments, recorded, torch.tensor([0.0, 0, WALL_MM]))
 

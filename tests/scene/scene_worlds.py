@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.types import Camera
-from neeco.scene import CanonicalGaussians, Recording, Scene
+from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.scene.nerfies.scene import NerfScene
@@ -61,7 +61,7 @@ def make_scene(method: str) -> Scene:
         for k in range(8)
     )
     names = tuple(f"{k:06d}" for k in range(8))
-    recorded = Recording(names, ("train",) * 8, states, (CAMERA,) * 8)
+    recorded = Recorded(names, ("train",) * 8, states, (CAMERA,) * 8)
     torch.manual_seed(0)
     deformation = make_deformation(method, instruments, method_settings(method, SMALL.get(method, {})))
     canonical = canonical.with_extras(**deformation.initial_extras(canonical) | dict(canonical.extras))
@@ -92,7 +92,7 @@ def make_nerf(**changes) -> NerfScene:
     pose = torch.eye(4, dtype=torch.float64)
     states = tuple(State({"rod": InstrumentState(pose, {})}, time) for time in NERF_TIMES)
     camera = Camera(torch.eye(4, dtype=torch.float64), 9.0, 9.0, 4.0, 3.0, 8, 6)
-    recorded = Recording(("a", "b", "c"), ("train",) * 3, states, (camera,) * 3)
+    recorded = Recorded(("a", "b", "c"), ("train",) * 3, states, (camera,) * 3)
     instruments = (Instrument("rod"),)
     scene = NerfScene("nerfies", NerfiesSettings(**SMALL_NERF | changes), instruments, recorded)
     scene.center.copy_(torch.tensor([0.0, 0.0, 50.0]))

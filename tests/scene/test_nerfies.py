@@ -18,7 +18,7 @@ from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.nerfies.session import elastic_loss, robust
 from neeco.scene.nerfies.settings import PUBLISHED, NerfiesSettings
 from neeco.scene.nerfies.warp import WarpField, move_by_screw
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.rotations import skew
 from neeco.scene.scene import gaussian_scene
 
@@ -173,7 +173,7 @@ def test_a_setting_that_cannot_be_is_refused_by_name(field: str, value: float) -
 
 
 def test_the_published_sizes_are_settings() -> None:
-    scene = NerfScene("nerfies", NerfiesSettings(**PUBLISHED), (), Recording(states=(State({}, 0.0),)))
+    scene = NerfScene("nerfies", NerfiesSettings(**PUBLISHED), (), Recorded(states=(State({}, 0.0),)))
     assert len(scene.coarse.trunk.layers) == len(scene.fine.trunk.layers) == 8
     assert len(scene.warp.trunk.layers) == 6
     assert (scene.coarse.trunk.skip, scene.warp.trunk.skip) == (4, 4)

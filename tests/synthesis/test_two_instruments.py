@@ -9,7 +9,7 @@ from neeco.labels.annotation import annotate
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers
 from neeco.labels.threshold import ThresholdLabels
-from neeco.scene import CanonicalGaussians, Recording, Scene
+from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
 from neeco.synthesis.states import Inside
 
@@ -58,7 +58,7 @@ def bars(request) -> Scene:
         counts=(WALL, BAR, BAR),
     )
     states = (at(60, 70), at(70, 60))
-    recorded = Recording(("0", "1"), ("train",) * 2, states, ())
+    recorded = Recorded(("0", "1"), ("train",) * 2, states, ())
     instruments = (Instrument("upright"), Instrument("level"))
     return Scene("bars", canonical, TwoBars(), instruments, recorded, torch.zeros(3))
 

@@ -15,7 +15,7 @@ from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
 from neeco.training.instruments.extend import extend_shaft, shaft_coverage
@@ -42,7 +42,7 @@ def session(tmp_path: Path) -> GaussianSession:
         [wall.with_extras(**{PART_LOGITS: torch.zeros(900, 3)}), grasper.with_extras(**{PART_LOGITS: logits})]
     )
     states, cameras = tuple(f.state for f in frames), tuple(f.camera for f in frames)
-    recorded = Recording(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
+    recorded = Recorded(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
     deformation = make_deformation("kinematic", capture.instruments)
     scene = Scene("kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
     hinges = deformation.hinges_of(0)
@@ -158,7 +158,7 @@ def shaft_of(length: float) -> tuple[CanonicalGaussians, Hinges]:
     return canonical, hinges
 
 
-def recorded_at(session: GaussianSession, shift_mm: float) -> Recording:
+def recorded_at(session: GaussianSession, shift_mm: float) -> Recorded:
     """The session's recording with each camera looking across the shaft, whose rear leaves the image at `shift_mm`."""
     from neeco.capture.model import Camera, InstrumentState, State
 
@@ -168,7 +168,7 @@ def recorded_at(session: GaussianSession, shift_mm: float) -> Recording:
     pose[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     pose[:3, 3] = torch.tensor([-50.0 - shift_mm, 0.0, 100.0])
     state = State({"tool": InstrumentState(pose, {"jaw": 0.1})})
-    return Recording(("a",) * 4, ("train",) * 4, (state,) * 4, (camera,) * 4)
+    return Recorded(("a",) * 4, ("train",) * 4, (state,) * 4, (camera,) * 4)
 
 
 def test_coverage_counts_the_frames_that_hold_a_place(session: GaussianSession) -> None:

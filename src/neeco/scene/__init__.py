@@ -2,7 +2,7 @@
 
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Drawable
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene, gaussian_scene
 
-__all__ = ["CanonicalGaussians", "Drawable", "Recording", "Scene", "gaussian_scene"]
+__all__ = ["CanonicalGaussians", "Drawable", "Recorded", "Scene", "gaussian_scene"]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Instrument, State
 from neeco.raster.types import Rendering
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 
 
 class Drawable(Protocol):
@@ -19,7 +19,7 @@ class Drawable(Protocol):
 
     method: str
     instruments: tuple[Instrument, ...]
-    recorded: Recording
+    recorded: Recorded
     diagnostics: dict[str, Any]
     has_gaussians: bool  # False: nothing to rasterise, pose or label; a drawing takes seconds
 

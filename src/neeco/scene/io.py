@@ -18,7 +18,7 @@ from neeco.files import write_atomically
 from neeco.scene.drawable import Learned
 from neeco.scene.method import Stored
 from neeco.scene.methods import method_class, method_settings
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.settings import plain
 
@@ -115,7 +115,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     return scene
 
 
-def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recording]:
+def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:
     """The instruments, and what the scene was learned from."""
     instruments = tuple(
         Instrument(
@@ -133,7 +133,7 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         states.append(State(moved, entry["time"]))
         fx, fy, cx, cy, width, height, near = entry["intrinsics"]
         cameras.append(Camera(tensors["recorded.cameras"][index], fx, fy, cx, cy, int(width), int(height), near))
-    recorded = Recording(
+    recorded = Recorded(
         tuple(entry["name"] for entry in header["recorded"]),
         tuple(entry["split"] for entry in header["recorded"]),
         tuple(states),

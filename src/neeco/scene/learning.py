@@ -20,7 +20,7 @@ from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
 from neeco.scene.hinges import Hinged
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.swept import SweptVolume
 
 Report = Callable[[str], None]  # news in words
@@ -49,7 +49,7 @@ def check_finite(total: Tensor, iteration: int, where: str = "") -> None:
         )
 
 
-class Views(Protocol):
+class LearnedViews(Protocol):
     """The frames learned from, with their pixels (`neeco.training.views.TrainingViews`)."""
 
     @property
@@ -86,7 +86,7 @@ class GaussianScene(Protocol):
 
     canonical: CanonicalGaussians
     instruments: tuple[Instrument, ...]
-    recorded: Recording
+    recorded: Recorded
     diagnostics: dict[str, Any]
 
 
@@ -112,7 +112,7 @@ class Training(Protocol):
     @property
     def scene(self) -> GaussianScene: ...
     @property
-    def views(self) -> Views: ...
+    def views(self) -> LearnedViews: ...
     @property
     def instruments(self) -> InstrumentSearch: ...
     @property
@@ -171,7 +171,7 @@ class Start:
     deforms Gaussians: around a scene that is there already, or, with None, around a new one."""
 
     capture: Capture
-    views: Views
+    views: LearnedViews
     config: Config
     report: Report
     gaussians: Callable[[Any | None], Session]

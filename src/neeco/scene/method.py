@@ -13,7 +13,7 @@ from neeco.capture.model import Instrument
 from neeco.raster.threads import torch_threads
 from neeco.scene.drawable import Learned
 from neeco.scene.learning import Session, Start
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
 PLAIN_TRAINING: Mapping[str, Any] = {
@@ -37,7 +37,7 @@ class Stored:
 
     settings: Any  # the method's own, an instance of its `Settings`
     instruments: tuple[Instrument, ...]
-    recorded: Recording
+    recorded: Recorded
     tensors: Mapping[str, Tensor]  # by name
     header: Mapping[str, Any]
     gaussians: Callable[[Any, Stored], Learned]  # of a deformation

@@ -18,7 +18,7 @@ from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.drawable import Drawable
 from neeco.scene.method import Stored
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.rotations import rigid_from_vector
 
 CANONICAL_SHAPES = {  # of one Gaussian
@@ -51,7 +51,7 @@ class Scene(nn.Module):
         canonical: CanonicalGaussians,
         deformation: Deformation,
         instruments: tuple[Instrument, ...],
-        recorded: Recording,
+        recorded: Recorded,
         center: Tensor,
     ) -> None:
         super().__init__()

@@ -11,7 +11,7 @@ from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
 from neeco.scene.learning import Report
 from neeco.scene.methods import make_deformation
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
 from neeco.training.instruments.search import SessionSearch
@@ -45,7 +45,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
         for i in capture.instruments
     )
-    recorded = Recording.of(frames, instruments)
+    recorded = Recorded.of(frames, instruments)
     positions, colors = _thinned_points(capture, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)

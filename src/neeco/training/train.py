@@ -46,7 +46,7 @@ class ProgressRow:
     note: str = ""
 
 
-Progress = Callable[[ProgressRow], None]
+ShowRow = Callable[[ProgressRow], None]
 Watch = Callable[[Session], None]  # after every step; may draw the scene, must not change it
 
 
@@ -58,7 +58,7 @@ def train(
     capture: Capture | None = None,
     device: torch.device = CPU,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: ShowRow | None = None,
     watch: Watch | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Path:
@@ -198,7 +198,7 @@ def _check_finite(session: Session) -> None:
 class _Log:
     """metrics.jsonl, the callbacks, and the clock that all rows are timed by."""
 
-    def __init__(self, path: Path, progress: Progress | None, watch: Watch | None, clock: Callable[[], float]) -> None:
+    def __init__(self, path: Path, progress: ShowRow | None, watch: Watch | None, clock: Callable[[], float]) -> None:
         self.path = path
         self.progress = progress
         self.watch = watch

@@ -15,7 +15,7 @@ from neeco.scene.encoding import encode_by_octave
 from neeco.scene.nerfies.render import Composite, Rays, camera_rays, composite, even_depths, finer_depths
 from neeco.scene.nerfies.settings import NerfiesSettings
 from neeco.scene.nerfies.warp import Mlp, WarpField
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 
 CODE_RANGE = 0.05  # codes start in U(-0.05, 0.05), as in the source
 COLOR_WIDTH = 0.5  # of the trunk's: the layer that sees the direction
@@ -79,7 +79,7 @@ class NerfScene(nn.Module):
     has_gaussians = False
 
     def __init__(
-        self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recording
+        self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recorded
     ) -> None:
         super().__init__()
         self.method = method

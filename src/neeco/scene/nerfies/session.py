@@ -17,7 +17,7 @@ from neeco.scene.learning import Config, Start, StepResult, check_finite
 from neeco.scene.nerfies.rays import RayTable
 from neeco.scene.nerfies.scene import Drawn, NerfScene
 from neeco.scene.nerfies.settings import NerfiesSettings
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 
 FINAL_RATE = 0.1  # of the first: 1e-3 to 1e-4, log-linear
 ROBUST_SCALE = 0.03  # c of both losses: log singular values, and template units
@@ -30,7 +30,7 @@ QUANTILES = (0.01, 0.99)  # of the points, against stray ones
 def initial_field(capture: Capture, frames: tuple[Frame, ...], config: Config) -> NerfScene:
     """The untrained field, its box and depths taken from the sparse points and the training cameras. Raises NeecoError
     where a setting does not fit."""
-    recorded = Recording.of(frames, capture.instruments)
+    recorded = Recorded.of(frames, capture.instruments)
     scene = NerfScene(config.method, config.deformation, capture.instruments, recorded)
     points = torch.from_numpy(capture.points.positions).float()
     near, far = depth_bounds(points, frames)

@@ -58,16 +58,16 @@ def score_points(evidence: Evidence, transforms: Tensor, points: Tensor, chunk: 
 
 
 @dataclass(frozen=True)
-class Views:
+class PosedViews:
     """How every frame's camera sees some frame fixed to an instrument, under its own poses and under exchanged ones."""
 
     evidence: Evidence
     own: Tensor  # [F, 4, 4]
     exchanged: Tensor  # [EXCHANGES, F, 4, 4]
 
-    def seen_from(self, base: Tensor) -> Views:
+    def seen_from(self, base: Tensor) -> PosedViews:
         """The same for another frame, `base` [4, 4] in the present one."""
-        return Views(self.evidence, self.own @ base, self.exchanged @ base)
+        return PosedViews(self.evidence, self.own @ base, self.exchanged @ base)
 
     def scores(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """`score_points`, but 0 for what is nearly as evident under exchanged poses."""
@@ -82,20 +82,20 @@ class Views:
         return torch.stack([score_points(self.evidence, other, points)[0] for other in self.exchanged]).mean(0)
 
 
-def views_of(evidence: Evidence, name: str) -> Views:
+def posed_views(evidence: Evidence, name: str) -> PosedViews:
     """The views of instrument `name`. An exchange keeps the cameras and shifts the poses among the frames."""
     own = camera_from_instrument(evidence, name)
     cameras = evidence.camera_from_world.double()
     poses = torch.linalg.inv(cameras) @ own.double()
     # uneven shifts, so that a motion that repeats itself does not come out the same
     shifts = [round(len(poses) * (k + 0.1 * (k % 2)) / (EXCHANGES + 1)) for k in range(1, EXCHANGES + 1)]
-    return Views(evidence, own, torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts]))
+    return PosedViews(evidence, own, torch.stack([(cameras @ poses.roll(shift, 0)).float() for shift in shifts]))
 
 
 def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int = 3000) -> CarvedShape | None:
     """The shape of instrument `name`, or None when nothing in its frame is evident (wrong poses, or never in view)."""
     reach = 0.6 * evidence.distance
-    views = views_of(evidence, name)
+    views = posed_views(evidence, name)
     for side in (COARSE, FINER):
         solid, level = _solid_points(views, reach, side)
         if len(solid) >= FEW:
@@ -110,7 +110,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int 
     return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
 
 
-def _solid_points(views: Views, reach: float, side: int) -> tuple[Tensor, float]:
+def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
     """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
     the strictest of SOLID that ENOUGH of them have."""
     ticks = torch.linspace(-reach, reach, side)
@@ -121,7 +121,7 @@ def _solid_points(views: Views, reach: float, side: int) -> tuple[Tensor, float]
     return grid[score > level], level
 
 
-def _shaft_frame(views: Views, solid: Tensor) -> Tensor:
+def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
     """instrument_from_shaft [4, 4] by the principal axis of solid points [S, 3], towards the end that more frames
     see."""
     center = solid.mean(0)
@@ -148,7 +148,7 @@ def _frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     return frame
 
 
-def _refine_axis(views: Views, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
+def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
     """Fit the axis to the solid's centre in slices, thrice; returns (base, centre line [Z, 3], radius mm)."""
     half = 0.09 * views.evidence.distance
     line, radius = torch.zeros(0, 3), spacing
@@ -173,11 +173,11 @@ def _refine_axis(views: Views, base: Tensor, spacing: float, level: float) -> tu
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape) -> Tensor:
     """[Z, 3] like `CarvedShape.center_line`, from other frames."""
-    views = views_of(evidence, name).seen_from(shape.instrument_from_shaft)
+    views = posed_views(evidence, name).seen_from(shape.instrument_from_shaft)
     return _slice_centers(views, (shape.tip - shape.near) / 30, 4 * shape.radius, shape.level)[:, :3]
 
 
-def _slice_centers(views: Views, spacing: float, half: float, level: float) -> Tensor:
+def _slice_centers(views: PosedViews, spacing: float, half: float, level: float) -> Tensor:
     """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
     see it."""
     ticks = torch.linspace(-half, half, 21)
@@ -219,7 +219,7 @@ def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
 
 
 def _sample_seeds(
-    views: Views,
+    views: PosedViews,
     near: float,
     tip: float,
     width: float,

@@ -12,10 +12,10 @@ from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
 from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
 from neeco.scene.learning import Report
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
-from neeco.training.instruments.carving import MOVES, CarvedShape, carve, score_points, views_of
+from neeco.training.instruments.carving import MOVES, CarvedShape, carve, posed_views, score_points
 from neeco.training.instruments.evidence import Evidence, gather_evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.session import GaussianSession, new_session
@@ -66,7 +66,7 @@ def judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedSha
 
     Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
     """
-    views = views_of(evidence, name)
+    views = posed_views(evidence, name)
     own, _ = score_points(evidence, views.own, shape.seeds)
     other = views.exchanged_scores(shape.seeds)
     moves = float(own.mean()) > MOVES * float(other.mean())
@@ -109,7 +109,7 @@ def _evidence_after(
 ) -> Evidence:
     """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
-    alone = Scene("3dgs", tissue, Static(), (), Recording(), scene.center)
+    alone = Scene("3dgs", tissue, Static(), (), Recorded(), scene.center)
     alone.background = scene.background  # or what lies behind transparent images would be evidence
     short = replace(
         config,

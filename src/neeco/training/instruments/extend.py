@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.raster.pinhole import project_world
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinges
-from neeco.scene.recording import Recording
+from neeco.scene.recorded import Recorded
 
 WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
 ENDS_IN_VIEW = 0.3  # share above which the instrument's rear end is taken for real
@@ -23,7 +23,7 @@ SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
 
 @torch.no_grad()
 def extend_shaft(
-    canonical: CanonicalGaussians, body: int, name: str, hinges: Hinges, recorded: Recording, length: float
+    canonical: CanonicalGaussians, body: int, name: str, hinges: Hinges, recorded: Recorded, length: float
 ) -> CanonicalGaussians:
     """Canonical Gaussians with instrument `body` (row group index) prolonged by about `length` mm; unchanged when its
     end is real."""
@@ -60,7 +60,7 @@ def extend_shaft(
     return extended
 
 
-def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recording) -> Tensor:
+def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recorded) -> Tensor:
     """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
     origin, direction = hinges.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]

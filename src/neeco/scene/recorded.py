@@ -9,7 +9,7 @@ from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, Stat
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recorded:
     """Every training frame's name, split, state and camera."""
 
     names: tuple[str, ...] = ()
@@ -18,7 +18,7 @@ class Recording:
     cameras: tuple[Camera, ...] = ()
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], instruments: tuple[Instrument, ...]) -> Recording:
+    def of(cls, frames: Sequence[Frame], instruments: tuple[Instrument, ...]) -> Recorded:
         """What `frames` say of `instruments`: only these, and of each only the joints named."""
         return cls(
             tuple(frame.name for frame in frames),
