@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
-from neeco.capture.images import write_image, write_labels
+from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.files import new_folder
 from neeco.ingest.border import SAMPLES, visible_mask
 from neeco.ingest.clocks import offset_from_instrument
 from neeco.ingest.lens import Lens, read_lens
@@ -28,6 +23,7 @@ from neeco.ingest.result import IngestResult
 from neeco.ingest.select import choose_frames, look_over
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.splits import LEFT_OUT, Assigned, assign_splits
+from neeco.ingest.staging import staged
 from neeco.ingest.work import (
     States,
     Work,
@@ -51,10 +47,7 @@ def ingest(recording: Recording, output: Path, progress: StageProgress) -> Inges
     Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and
     what to do.
     """
-    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
-        raise NeecoError(f"{output}: already exists; choose another --output")
-    place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
-    with _staging(place) as folder:
+    with staged(output) as folder:
         work = begin(recording, folder, progress)
         lens = _read_lens(recording, work.video.size)
         kept = _choose(work)
@@ -80,17 +73,6 @@ def ingest(recording: Recording, output: Path, progress: StageProgress) -> Inges
         sfm = motion.adjust(sfm, doubtful, progress)
         registration = _register(work, kept, sfm)
         return _finish(work, output, kept, sfm, pinhole, registration, shapes, visible)
-
-
-@contextmanager
-def _staging(output: Path) -> Iterator[Path]:
-    """A temporary folder beside the output, on the same disk, gone afterwards whatever happens."""
-    with new_folder(output.parent):
-        folder = Path(tempfile.mkdtemp(prefix=f".{output.name[:80]}-", dir=output.parent))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _read_lens(recording: Recording, size: tuple[int, int]) -> Lens | None:
@@ -196,8 +178,7 @@ def _loader(work: Work, motion: StructureFromMotion, sfm: SfmResult) -> Callable
     """Image [H, W, 3] uint8 of a row of `sfm`."""
 
     def load(row: int) -> np.ndarray:
-        with Image.open(work.folder / "raw" / motion.names[int(sfm.indices[row])]) as image:
-            return np.asarray(image.convert("RGB"))
+        return np.asarray(open_image(work.folder / "raw" / motion.names[int(sfm.indices[row])]).convert("RGB"))
 
     return load
 
@@ -315,11 +296,7 @@ def _finish(
     cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
     registered = registration is not None or not work.logs.poses
     capture = Capture(work.folder, capture_frames, instruments_of(work), cloud, registered)
-    whole = work.folder / "capture"
-    write_capture(capture, whole)
-    if output.exists():
-        output.rmdir()
-    whole.rename(os.path.abspath(output))
+    write_capture(capture, work.folder / "capture")
     order = np.flatnonzero(chosen)
     position = {row: index for index, row in enumerate(order.tolist())}
     registered_frames = (

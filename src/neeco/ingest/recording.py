@@ -14,7 +14,7 @@ from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, pose_columns
+from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, parse_yaml, pose_columns
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 TRACKER_CLOCK = "em"
@@ -172,13 +172,7 @@ class _Loader(yaml.SafeLoader):
 def _load(path: Path) -> Any:
     missing = "no such file; `neeco ingest --init` writes one by looking at the files"
     text = read_text(path, "a recording as YAML", missing)
-    try:
-        document = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}: " if mark else ""
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
-        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); repair it") from None
+    document = parse_yaml(path, text, _Loader, "repair it")
     if document is None:
         raise NeecoError(f"{path}: the file is empty; `neeco ingest --init` writes one by looking at the files")
     return document

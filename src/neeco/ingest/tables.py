@@ -190,5 +190,4 @@ def _unique(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_number(text: str) -> bool:
-    value = parse_number(text)
-    return value is not None
+    return parse_number(text) is not None

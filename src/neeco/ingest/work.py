@@ -82,7 +82,7 @@ def begin(recording: Recording, folder: Path, progress: StageProgress) -> Work:
 
 def _video_times(recording: Recording, video: VideoSource) -> np.ndarray:
     """The frames' times s. Raises NeecoError for those that no recording has, and for frames too small."""
-    times, source = video.frame_times(), recording.times or video.path
+    times, source = video.times, recording.times or video.path
     rate = 1 / float(np.median(np.diff(times)))
     if not (SLOWEST < rate < FASTEST and times[-1] - times[0] < LONGEST):
         raise NeecoError(
