@@ -11,8 +11,10 @@ from PIL import Image, ImageDraw, ImageFilter
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import outline
 from neeco.ingest.moving import RoughShape
+from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
-from neeco.report.figures import MAX_WIDTH, jpeg
+from neeco.report.figures import MAX_WIDTH, jpeg, to_bytes
+from neeco.report.tracks import round_length
 
 FIGURES = 8
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
@@ -82,12 +84,10 @@ def axis_length(capture: Capture) -> float:
     sizes = []
     for frame in capture.frames:
         for state in frame.state.instruments.values():
-            depth = float(_in_camera(state.pose.numpy()[None, :3, 3], frame.camera)[0, 2])
+            _, (depth,) = _project(state.pose.numpy()[None, :3, 3], frame.camera)
             if depth > NEAR:
                 sizes.append(AXIS_SHARE * frame.camera.width / frame.camera.fx * depth)
-    wanted = float(np.median(sizes)) if sizes else 10.0
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max((step * power for step in (1, 2, 5) if step * power <= wanted), default=power))
+    return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
 def in_view(capture: Capture, name: str) -> tuple[int, int]:
@@ -119,7 +119,7 @@ def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
 def _draw(
     frame: Frame, capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> str:
-    pixels = np.clip(np.rint(frame.load_image().numpy() * 255), 0, 255).astype(np.uint8)
+    pixels = to_bytes(frame.load_image().numpy())
     # drawn at twice the size shown, then shrunk: smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
@@ -179,16 +179,6 @@ def _draw_frame(painter: ImageDraw.ImageDraw, pose: np.ndarray, camera: Camera, 
     painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
 
 
-def _in_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """[N, 3] points of the world in a camera's frame, OpenCV axes."""
-    pose = camera.world_from_camera.double().numpy()
-    return (points - pose[:3, 3]) @ pose[:3, :3]
-
-
 def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """[N, 2] px and [N] depth of points of the world; pixels behind the camera mean nothing."""
-    local = _in_camera(points, camera)
-    z = np.where(local[:, 2] > NEAR, local[:, 2], np.inf)
-    x = camera.fx * local[:, 0] / z + camera.cx
-    y = camera.fy * local[:, 1] / z + camera.cy
-    return np.stack([x, y], axis=1), local[:, 2]
+    return project_world(points, camera, nearest=NEAR)

@@ -31,7 +31,7 @@ from neeco.report.ingest_figures import (
     main_axes,
     sample_figures,
 )
-from neeco.report.render import write_page
+from neeco.report.render import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
@@ -56,7 +56,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         result=result,
         capture=capture,
         verdict=give_verdict(result, capture),
-        splits=", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits),
+        splits=split_counts(capture),
         tiles=_tiles(result, capture),
         residuals=_residuals(result),
         clocks=_clocks(result, capture),
