@@ -1,4 +1,7 @@
-"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format")."""
+"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
+
+Ours beside pycolmap on purpose: captures are read without it, damage becomes one line, and poses stay the same bits.
+"""
 
 from __future__ import annotations
 

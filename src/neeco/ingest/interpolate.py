@@ -2,7 +2,8 @@
 
 At each time asked for, a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how
 well they fit (bisquare). Rotations are fitted as rotation vectors about their local mean. How wide the window is
-follows from the log: the width that best predicts each sample from its neighbours.
+follows from the log: the width that best predicts each sample from its neighbours. Ours beside scipy's Slerp and
+RotationSpline on purpose: these go through every sample, noise and all.
 """
 
 from __future__ import annotations

@@ -175,11 +175,7 @@ def _opencv(path: Path, document: Any) -> Lens:
     if model in FISHEYE:
         raise _fisheye(path, "distortion_model", model)
     found = _first(document, DISTORTION_NAMES)
-    size = _size(
-        path,
-        document.get("image_width", document.get("image_Width")),
-        document.get("image_height", document.get("image_Height")),
-    )
+    size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
     return _checked(path, values, _numbers(path, [] if found is None else found, "distortion_coefficients"), size)
 
@@ -230,6 +226,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _read_opencv_yaml(path: Path) -> Any:
+    """By PyYAML, not cv2.FileStorage, on purpose: it reads ROS's files and plain lists too, and names a bad line."""
     text = read_text(path, "OpenCV's calibration as YAML")
     if text.lstrip().startswith("<"):
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")

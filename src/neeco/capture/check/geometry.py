@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.check.states import states_of
+from neeco.capture.check.frames import states_of
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import ProblemReport, errors_only, shown
