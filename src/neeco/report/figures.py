@@ -23,7 +23,6 @@ from neeco.raster.types import Camera
 from neeco.scene import Drawable
 
 MAX_WIDTH = 480  # px; the page has to stay a file one can mail
-FRAMES_PER_SPLIT = 3
 
 
 @dataclass(frozen=True)
