@@ -119,10 +119,10 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -
     numbers = dict(zip(np.round(result.kept_times, 6).tolist(), result.kept.tolist(), strict=True))
     start = min(frame.state.time for frame in capture.frames)
     samples = []
-    for figure in sample_figures(capture, result.shapes, axes, length):
-        number = numbers.get(round(figure.frame.state.time, 6))
-        place = figure.frame.name if number is None else f"video frame {number}"
-        samples.append((figure.picture, place, f"{figure.frame.state.time - start:.2f}", figure.frame.split))
+    for picture, frame in sample_figures(capture, result.shapes, axes, length):
+        number = numbers.get(round(frame.state.time, 6))
+        place = frame.name if number is None else f"video frame {number}"
+        samples.append((picture, place, f"{frame.state.time - start:.2f}", frame.split))
     return {
         "samples": samples,
         "axis_mm": f"{length:g}",
