@@ -13,7 +13,7 @@ from typing import Any
 from neeco.errors import NeecoError
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file beside `path`, sync it to disk and rename it to `path`.
 
     On any failure the temporary file is removed and `path` is left as it was.

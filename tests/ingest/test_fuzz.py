@@ -201,7 +201,7 @@ def test_no_film_makes_reading_raise(world):
 
         def read():
             video = open_video(path)
-            count = len(video.frame_times())
+            count = len(video.times)
             assert len(list(video.read(range(count)))) == count
 
         refused(read, "damaged.mp4")

@@ -94,7 +94,7 @@ def test_init_of_images_alone(world):
     recording = read_recording(world.folder / "recording.yaml")
     assert (recording.images, recording.fps) == (world.folder / "frames", 25)
     assert recording.instruments == ()
-    assert len(recording.open().frame_times()) == 12
+    assert len(recording.open().times) == 12
 
 
 def test_init_of_a_folder_without_frames(world):

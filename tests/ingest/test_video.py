@@ -20,7 +20,7 @@ def test_frames_are_read_by_index_in_order(world):
     video = open_video(world.video())
     assert video.size == (64, 48)
     assert video.notes == ()
-    np.testing.assert_allclose(video.frame_times(), np.arange(30) / 25, atol=1e-9)
+    np.testing.assert_allclose(video.times, np.arange(30) / 25, atol=1e-9)
     frames = list(video.read([20, 3, 3, 11]))
     assert [index for index, _ in frames] == [3, 11, 20]
     assert all(image.shape == (48, 64, 3) and image.dtype == np.uint8 for _, image in frames)
@@ -30,8 +30,8 @@ def test_frames_are_read_by_index_in_order(world):
 def test_a_variable_rate_is_kept(world):
     stamps = np.cumsum([0, 40, 40, 120, 20, 40, 200, *[33] * 23])
     video = open_video(world.video(stamps=lambda i: int(stamps[i])))
-    np.testing.assert_allclose(video.frame_times(), stamps / 1000, atol=1e-6)
-    np.testing.assert_allclose(open_video(video.path, fps=10).frame_times(), np.arange(30) / 10)
+    np.testing.assert_allclose(video.times, stamps / 1000, atol=1e-6)
+    np.testing.assert_allclose(open_video(video.path, fps=10).times, np.arange(30) / 10)
 
 
 def test_a_truncated_film_gives_its_beginning_and_a_note(world):
@@ -39,7 +39,7 @@ def test_a_truncated_film_gives_its_beginning_and_a_note(world):
     path = world.folder / "cut.mp4"
     path.write_bytes(whole[: len(whole) * 9 // 10])
     video = open_video(path)
-    count = len(video.frame_times())
+    count = len(video.times)
     assert 5 < count < 40
     assert any(f"{count} of 40 frames are there" in note or "damaged" in note for note in video.notes)
     assert [index for index, _ in video.read(range(count))] == list(range(count))
@@ -52,8 +52,8 @@ def test_damage_inside_reads_the_same_twice(world):
     path = world.folder / "damaged.mp4"
     path.write_bytes(content)
     first, second = open_video(path), open_video(path)
-    np.testing.assert_array_equal(first.frame_times(), second.frame_times())
-    count = len(first.frame_times())
+    np.testing.assert_array_equal(first.times, second.times)
+    count = len(first.times)
     assert [index for index, _ in first.read(range(count))] == list(range(count))
 
 
@@ -84,17 +84,17 @@ def images(world):
 
 def test_images_are_ordered_by_number(images):
     video = open_images(images, fps=10)
-    np.testing.assert_allclose(video.frame_times(), np.arange(12) / 10)
+    np.testing.assert_allclose(video.times, np.arange(12) / 10)
     assert [(index, int(image[0, 0, 0])) for index, image in video.read([10, 2])] == [(2, 40), (10, 200)]
 
 
 def test_images_at_the_times_of_a_table(world, images):
     times = world.write("file,t_ms", [[f"frame{i}.png", 100 * i + (i > 5)] for i in range(2, 10)], "times.csv")
     video = open_images(images, times=times)
-    np.testing.assert_allclose(video.frame_times()[:5], [0.2, 0.3, 0.4, 0.5, 0.601])
+    np.testing.assert_allclose(video.times[:5], [0.2, 0.3, 0.4, 0.5, 0.601])
     assert [int(image[0, 0, 0]) for _, image in video.read([0])] == [40]
     bare = world.write("t_s", [[i / 7] for i in range(12)], "bare.csv")
-    np.testing.assert_allclose(open_images(images, times=bare).frame_times(), np.arange(12) / 7, atol=1e-8)
+    np.testing.assert_allclose(open_images(images, times=bare).times, np.arange(12) / 7, atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_tables_of_times_that_do_not_fit(world, images, header, rows, message):
 def test_damaged_images_are_left_out_and_noted(images):
     (images / "frame4.png").write_bytes(b"\x89PNG broken")
     video = open_images(images, fps=10)
-    np.testing.assert_allclose(video.frame_times(), np.delete(np.arange(12), 4) / 10)
+    np.testing.assert_allclose(video.times, np.delete(np.arange(12), 4) / 10)
     assert "1 images cannot be read" in video.notes[0]
     assert "frame4.png" in video.notes[0]
 

@@ -24,7 +24,7 @@ from neeco.ingest.result import IngestResult
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes
 from neeco.report.ingest_page import write_ingest_page
-from neeco.report.tracks import read_tracks
+from neeco.report.tracks import read_tracks, round_length
 from neeco.report.verdict import give_verdict
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
@@ -278,3 +278,10 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(tmp_path, 
         return path.read_text()
 
     check_hostile_names(write, VOID, scripts=1)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "length"), [(0.03, 0.02), (1.0, 1.0), (4.9, 2.0), (7.0, 5.0), (10.0, 10.0), (99.0, 50.0)]
+)
+def test_lengths_drawn_are_round_and_no_longer_than_wanted(wanted, length):
+    assert round_length(wanted) == pytest.approx(length)

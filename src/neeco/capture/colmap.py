@@ -1,4 +1,7 @@
-"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format")."""
+"""Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
+
+Ours beside pycolmap on purpose: captures are read without it, damage becomes one line, and poses stay the same bits.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from neeco.capture.parsed import Parsed, Place, inside, relative_name
 from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
+from neeco.files import read_bytes
 from neeco.raster.types import Camera
 
 _MODELS = {
@@ -111,7 +115,7 @@ def _frame(
         focal = _pinhole(intrinsics)
         path = inside(root, root / "images", image.name)
     except NeecoError as error:
-        report.error(place.file, place.field, *str(error).split("; ", 1))
+        report.refused(place.file, place.field, error)
         return None
     if not path.is_file():
         report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
@@ -162,12 +166,7 @@ def _world_from_camera(image: _Image) -> np.ndarray | None:
 
 def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
     """`parse` applied to a file's content; damage becomes NeecoError."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file; export the whole COLMAP model") from None
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
         return parse(content)
     except (struct.error, ValueError, IndexError, KeyError, OverflowError):

@@ -87,8 +87,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
         try:
             paths.append(inside(root, root / folder, path.name))
         except NeecoError as error:
-            message, _, remedy = str(error).partition("; ")
-            report.error(f"{folder}/{path.name}", "", message, remedy)
+            report.refused(f"{folder}/{path.name}", "", error)
     return paths
 
 
@@ -99,8 +98,7 @@ def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
         # mapped, so that a lying header cannot make us allocate more than the file holds
         table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
     except NeecoError as error:
-        message, _, way = str(error).partition("; ")
-        report.error(POSES_FILE, "", message, way)
+        report.refused(POSES_FILE, "", error)
         return None
     except Exception:  # damaged headers make numpy raise nearly anything
         report.error(POSES_FILE, "", "is damaged or not an array of plain numbers", remedy)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -41,12 +43,8 @@ def read_labels(path: Path, size: tuple[int, int] | None = None) -> Tensor:
 def open_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """An image file, decoded, in its own mode. `size`: (width, height) it must have. Raises NeecoError."""
     path = Path(path)
-    try:
-        with Image.open(path) as image:
-            image.load()
-    # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
-    except Exception as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        image.load()
     if size is not None and image.size != tuple(size):
         found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
         raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
@@ -55,20 +53,14 @@ def open_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from an image file's header. Raises NeecoError."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        return image.size
 
 
 def has_alpha(path: Path) -> bool:
     """Whether an image file has transparency. Raises NeecoError."""
-    try:
-        with Image.open(path) as image:
-            return _is_transparent(image)
-    except Exception as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        return _is_transparent(image)
 
 
 def write_image(path: Path, image: Tensor) -> None:
@@ -85,13 +77,22 @@ def write_labels(path: Path, labels: Tensor) -> None:
     write_atomically(Path(path), lambda temporary: Image.fromarray(pixels, "L").save(temporary, format="PNG"))
 
 
-def _unreadable(path: Path, error: Exception) -> NeecoError:
-    if isinstance(error, FileNotFoundError):
-        return NeecoError(f"{path}: no such file")
-    if isinstance(error, Image.UnidentifiedImageError):
-        return NeecoError(f"{path}: not an image file; expected PNG or JPEG")
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return NeecoError(f"{path}: image cannot be decoded ({reason}); the file is damaged, replace it or drop its frame")
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image file for the block, not yet decoded. Raises NeecoError when it cannot be read there."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except FileNotFoundError as error:
+        raise NeecoError(f"{path}: no such file") from error
+    except Image.UnidentifiedImageError as error:
+        raise NeecoError(f"{path}: not an image file; expected PNG or JPEG") from error
+    # damaged files make pillow's decoders raise nearly anything: SyntaxError, struct.error, ValueError, EOFError ...
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise NeecoError(
+            f"{path}: image cannot be decoded ({reason}); the file is damaged, replace it or drop its frame"
+        ) from error
 
 
 def _is_transparent(image: Image.Image) -> bool:

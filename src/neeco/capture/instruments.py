@@ -72,27 +72,24 @@ def seen_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) 
     return tuple(Instrument(name, limits) for name, limits in joints.items())
 
 
-def _joints(item: Node) -> dict[str, float] | None:
+def _joint_nodes(item: Node) -> dict[str, Node] | None:
+    """What stands under each name in `joints` ({} where there is none), or None when that is no object."""
     if not item.has("joints"):
         return {}
     node = item.child("joints")
-    if not node.is_object():
-        return None
-    values = {name: node.child(name).number() for name in node.value}
-    if any(value is None for value in values.values()):
-        return None
-    return {name: value for name, value in values.items() if value is not None}
+    return {name: node.child(name) for name in node.value} if node.is_object() else None
+
+
+def _joints(item: Node) -> dict[str, float] | None:
+    nodes = _joint_nodes(item)
+    values = {name: node.number() for name, node in (nodes or {}).items()}
+    known = {name: value for name, value in values.items() if value is not None}
+    return None if nodes is None or len(known) < len(values) else known
 
 
 def _declared_joints(item: Node) -> dict[str, Limits]:
-    if not item.has("joints"):
-        return {}
-    node = item.child("joints")
-    if not node.is_object():
-        return {}
     joints: dict[str, Limits] = {}
-    for name in node.value:
-        joint = node.child(name)
+    for name, joint in (_joint_nodes(item) or {}).items():
         has_limits = joint.value is not None and joint.is_object() and joint.has("limits")
         joints[name] = joint.child("limits").range("rad") if has_limits else None
     return joints

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from neeco.capture.images import read_image, read_mask
 from neeco.raster.types import Camera
 
 
@@ -54,14 +55,10 @@ class Frame:
 
     def load_image(self) -> Tensor:
         """float32 [H, W, 3] in [0, 1], sRGB as stored. Raises NeecoError when unreadable or of another size."""
-        from neeco.capture.images import read_image
-
         return read_image(self.image_path, (self.camera.width, self.camera.height), self.background)
 
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""
-        from neeco.capture.images import read_mask
-
         if self.mask_path is None:
             return None
         return read_mask(self.mask_path, (self.camera.width, self.camera.height))

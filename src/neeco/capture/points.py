@@ -8,7 +8,7 @@ import numpy as np
 
 from neeco.capture.model import PointCloud
 from neeco.errors import NeecoError
-from neeco.files import write_atomically
+from neeco.files import read_bytes, write_atomically
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -24,12 +24,7 @@ def read_ply(path: Path) -> PointCloud:
 
     Positions may hold NaN. Raises NeecoError when the file is missing, damaged or has no usable vertices.
     """
-    try:
-        content = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file") from None
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    content = read_bytes(Path(path), "a point cloud as PLY")
     encoding, count, properties, body = _parse_header(Path(path), content)
     vertices = _vertices(Path(path), encoding, count, properties, body)
     if not {"x", "y", "z"} <= vertices.keys():
@@ -52,11 +47,7 @@ def write_ply(path: Path, points: PointCloud) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name, _ in fields] + ["end_header", ""]
     content = "\n".join(header).encode("ascii") + vertices.tobytes()
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomically(Path(path), write)
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(content))
 
 
 def random_points(center: np.ndarray, half_size: float, count: int = 20_000, seed: int = 0) -> PointCloud:

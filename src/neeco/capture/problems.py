@@ -37,6 +37,11 @@ class ProblemReport:
     def error(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("error", file, field, message, remedy))
 
+    def refused(self, file: str, field: str, error: NeecoError) -> None:
+        """Report a refusal of the form "what is wrong; what to do" that does not say where."""
+        message, _, remedy = str(error).partition("; ")
+        self.error(file, field, message, remedy)
+
     def warning(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("warning", file, field, message, remedy))
 

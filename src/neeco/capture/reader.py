@@ -55,7 +55,7 @@ def parse_capture(
     try:
         file = inside(path, path, transforms)
     except NeecoError as error:
-        report.error(transforms, "", *str(error).split("; ", 1))
+        report.refused(transforms, "", error)
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)

@@ -201,8 +201,7 @@ def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()
         path = inside(root, folder, text)
         candidates = [path, *(inside(root, folder, text + extension) for extension in extensions)]
     except NeecoError as error:
-        message, _, remedy = str(error).partition("; ")
-        node.error(message, remedy)
+        node.report.refused(node.file, node.field, error)
         return None
     for candidate in candidates:
         if candidate.is_file():

@@ -105,8 +105,4 @@ def _copy(source: Path, target: Path) -> None:
         return
     if not source.is_file():
         raise NeecoError(f"{source}: no such file")
-
-    def copy(temporary: Path) -> None:
-        shutil.copyfile(source, temporary)
-
-    write_atomically(target, copy)
+    write_atomically(target, lambda temporary: shutil.copyfile(source, temporary))

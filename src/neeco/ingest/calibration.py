@@ -44,7 +44,7 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> Calibration:
             f"{path}: column {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg"
         )
     values, missing, bad = numbers(table, (count_name, angle_name))
-    wrong = [(row, what) for row, what in bad] + [(int(row), "has an empty cell") for row in np.flatnonzero(missing)]
+    wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
     if wrong:
         row, what = min(wrong)
         raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import fftconvolve
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.errors import NeecoError
 from neeco.ingest.interpolate import poses_at
@@ -113,17 +113,9 @@ def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
 
 def turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
     """[G] rad/s at the grid's times s, over STRIDE, by chords between nearest-in-time interpolated rotations [T]."""
-    before, after = rotations_at(grid - STRIDE / 2, times, turns), rotations_at(grid + STRIDE / 2, times, turns)
+    along = Slerp(times, turns)
+    before, after = (along(np.clip(grid + side * STRIDE / 2, times[0], times[-1])) for side in (-1, 1))
     return (before.inv() * after).magnitude() / STRIDE
-
-
-def rotations_at(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> Rotation:
-    """Rotations at the grid's times s, along the geodesic between the two samples around each."""
-    right = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
-    left = right - 1
-    share = np.clip((grid - times[left]) / (times[right] - times[left]), 0, 1)
-    step = (turns[left].inv() * turns[right]).as_rotvec() * share[:, None]
-    return turns[left] * Rotation.from_rotvec(step)
 
 
 def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

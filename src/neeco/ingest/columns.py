@@ -84,18 +84,8 @@ class Recognised:
 
 # names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
 _TIMES = (
-    "header_stamp",
-    "timestamp",
-    "time_stamp",
-    "stamp",
-    "time",
-    "t",
-    "elapsed",
-    "secs",
-    "sec",
-    "seconds",
-    "__time",
-)
+    "header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed", "secs", "sec", "seconds", "__time",
+)  # fmt: skip
 _LONG = ("position_", "translation_", "pos_", "trans_")  # may follow any prefix: "field.pose.position.x"
 _SHORT = ("t", "p", "")
 _QUATERNION_LONG = ("orientation_", "rotation_", "quaternion_", "quat_", "q_", "q")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +15,7 @@ from neeco.capture.parsed import Parsed
 from neeco.capture.problems import Problem, ProblemReport
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
-from neeco.errors import NeecoError
+from neeco.ingest.staging import staged
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
@@ -29,33 +26,16 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     exists already, and when the disk refuses.
     """
     folder, output = Path(folder), Path(output)
-    if os.path.lexists(output) and not _is_empty_folder(output):
-        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
-    report = ProblemReport()
-    parsed = parse_capture(folder, report)
-    if not parsed.frames and not report.problems:
-        report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
-    tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
-    report.raise_first(folder)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}."))
-    except OSError as error:
-        raise NeecoError(f"{output}: cannot write here: {error.strerror or error}") from error
-    try:
+    with staged(output) as work:
+        report = ProblemReport()
+        parsed = parse_capture(folder, report)
+        if not parsed.frames and not report.problems:
+            report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
+        tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
+        report.raise_first(folder)
         frames = _with_tool_masks(parsed.frames, tool_masks, work / "tool")
         write_capture(replace(capture_of(parsed), frames=tuple(frames)), work / "capture")
-        os.chmod(work / "capture", 0o755)
-        os.replace(work / "capture", output)
-    except OSError as error:
-        raise NeecoError(f"{output}: cannot write: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return (*_lacking(parsed, masked=bool(tool_masks)), *_warnings(report))
-
-
-def _is_empty_folder(path: Path) -> bool:
-    return path.is_dir() and not path.is_symlink() and not any(path.iterdir())
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:

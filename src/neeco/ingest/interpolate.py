@@ -2,12 +2,13 @@
 
 At each time asked for, a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how
 well they fit (bisquare). Rotations are fitted as rotation vectors about their local mean. How wide the window is
-follows from the log: the width that best predicts each sample from its neighbours.
+follows from the log: the width that best predicts each sample from its neighbours. Ours beside scipy's Slerp and
+RotationSpline on purpose: these go through every sample, noise and all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -158,14 +159,8 @@ def _fit(
     if width <= 0 or not len(times):
         return result
     noise = _noise(values)
-    for part in _chunks(samples, len(times), width):
-        index, used = samples.window(times[part], width)
-        if leave_out is not None:
-            used &= index != leave_out[part, None]
-        enough = used.sum(axis=1) >= TOO_FEW
-        offsets = (samples.times[index] - times[part, None]) / width
-        fitted = _local_polynomial(offsets[enough], used[enough], values[index[enough]], noise)
-        result[np.arange(len(times))[part][enough]] = fitted
+    for rows, index, used, offsets in _windows(samples, times, width, leave_out):
+        result[rows] = _local_polynomial(offsets, used, values[index], noise)
     return result
 
 
@@ -181,21 +176,13 @@ def _fit_rotations(
     if width <= 0:
         return result
     noise = _noise(_turns(quats))
-    for part in _chunks(samples, len(times), width):
-        index, used = samples.window(times[part], width)
-        if leave_out is not None:
-            used &= index != leave_out[part, None]
-        enough = used.sum(axis=1) >= TOO_FEW
-        if not enough.any():
-            continue
-        index, used = index[enough], used[enough]
-        offsets = (samples.times[index] - times[part][enough, None]) / width
+    for rows, index, used, offsets in _windows(samples, times, width, leave_out):
         around = quats[index]  # sign-continuous, so their mean is a mean of rotations
         mean = _rotation((around * (used * _tricube(offsets))[..., None]).sum(axis=1))
         flat = np.repeat(np.arange(len(index)), index.shape[1])
         vectors = (mean[flat].inv() * _rotation(around.reshape(-1, 4))).as_rotvec().reshape(*index.shape, 3)
         vector = _local_polynomial(offsets, used, vectors, noise)
-        result[np.arange(len(times))[part][enough]] = _wxyz(mean * Rotation.from_rotvec(vector))
+        result[rows] = _wxyz(mean * Rotation.from_rotvec(vector))
     return result
 
 
@@ -245,9 +232,21 @@ def _best_width(samples: _Samples, errors: Callable[[float], np.ndarray]) -> tup
     return widths[best], float(np.sqrt(scores[best]))
 
 
-def _chunks(samples: _Samples, count: int, width: float) -> list[slice]:
+def _windows(
+    samples: _Samples, times: np.ndarray, width: float, leave_out: np.ndarray | None
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Times with samples enough around them, some at once: which [N], their samples [N, K] with bool [N, K] of those
+    in use, and the samples' offsets [N, K] in half widths."""
     size = max(int(CHUNK / max(2 * width / samples.step, 8)), 1)
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+    for start in range(0, len(times), size):
+        rows = np.arange(start, min(start + size, len(times)))
+        index, used = samples.window(times[rows], width)
+        if leave_out is not None:
+            used &= index != leave_out[rows, None]
+        enough = used.sum(axis=1) >= TOO_FEW
+        if enough.any():
+            rows, index, used = rows[enough], index[enough], used[enough]
+            yield rows, index, used, (samples.times[index] - times[rows, None]) / width
 
 
 def _noise(values: np.ndarray) -> float:

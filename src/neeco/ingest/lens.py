@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import yaml
@@ -17,7 +18,7 @@ from neeco.capture.nodes import as_float
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
-from neeco.ingest.requirements import optional_module
+from neeco.ingest.sections import parse_yaml
 from neeco.raster.types import Camera
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
@@ -80,7 +81,7 @@ class Lens:
         NeecoError when the distortion folds the image over."""
         if not self.distorted:
             return replace(self, distortion=(), size=size)
-        matrix, _ = optional_module("cv2").getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
+        matrix, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
         fl_x, fl_y, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         found = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
         if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(found, size):
@@ -90,18 +91,17 @@ class Lens:
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """An image uint8 [H, W, 3] (or [H, W]) as `pinhole` sees it, bilinear."""
-        return self._remap(image, "INTER_LINEAR")
+        return self._remap(image, cv2.INTER_LINEAR)
 
     def undistort_mask(self, mask: np.ndarray) -> np.ndarray:
         """A mask bool [H, W] as `pinhole` sees it."""
-        return self._remap(mask.astype(np.uint8), "INTER_NEAREST") > 0
+        return self._remap(mask.astype(np.uint8), cv2.INTER_NEAREST) > 0
 
-    def _remap(self, image: np.ndarray, interpolation: str) -> np.ndarray:
+    def _remap(self, image: np.ndarray, interpolation: int) -> np.ndarray:
         if not self.distorted:
             return image
-        cv2 = optional_module("cv2")
         maps = _maps(self, (image.shape[1], image.shape[0]))
-        return cv2.remap(image, *maps, getattr(cv2, interpolation), borderMode=cv2.BORDER_CONSTANT)
+        return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT)
 
     def _folds(self, pinhole: Lens, size: tuple[int, int]) -> bool:
         """Whether somewhere in the undistorted image a ray farther out is not seen farther out."""
@@ -140,7 +140,6 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
 @lru_cache(maxsize=4)
 def _maps(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     new = lens.pinhole(size)._matrix()
-    cv2 = optional_module("cv2")
     return cv2.initUndistortRectifyMap(lens._matrix(), lens._coefficients(), None, new, size, cv2.CV_32FC1)
 
 
@@ -176,11 +175,7 @@ def _opencv(path: Path, document: Any) -> Lens:
     if model in FISHEYE:
         raise _fisheye(path, "distortion_model", model)
     found = _first(document, DISTORTION_NAMES)
-    size = _size(
-        path,
-        document.get("image_width", document.get("image_Width")),
-        document.get("image_height", document.get("image_Height")),
-    )
+    size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
     return _checked(path, values, _numbers(path, [] if found is None else found, "distortion_coefficients"), size)
 
@@ -231,18 +226,13 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def _read_opencv_yaml(path: Path) -> Any:
+    """By PyYAML, not cv2.FileStorage, on purpose: it reads ROS's files and plain lists too, and names a bad line."""
     text = read_text(path, "OpenCV's calibration as YAML")
     if text.lstrip().startswith("<"):
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
-    try:
-        return yaml.load("\n".join(lines), Loader=_Loader)  # a SafeLoader
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}: " if mark else ""
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:80]
-        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); save the calibration again") from None
+    return parse_yaml(path, "\n".join(lines), _Loader, "save the calibration again")
 
 
 def _first(document: dict[Any, Any], names: Sequence[str]) -> Any:

@@ -18,17 +18,17 @@ from neeco.ingest.columns import (
     FORMS,
     JointColumns,
     PoseColumns,
-    Units,
+    Recognised,
     recognise_pose,
     recognise_time,
     recognise_value,
 )
 from neeco.ingest.rotations import continuous, to_quaternions
-from neeco.ingest.tables import Dropped, Table, column_index, count_rows, listed, numbers, read_table
+from neeco.ingest.tables import Rows, Table, column_index, count_rows, listed, numbers, read_table
 from neeco.ingest.units import scale_of
 
 FEWEST = 4  # samples of a usable log
-WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+STATES_TOLD = 8  # of those that drop rows
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
 
@@ -66,19 +66,17 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = read_table(source.path)
     found = recognise_pose(table.header)
-    dropped = Dropped(table.path)
-    keep = _measured(table, source, found.state, dropped)
-    times = _times(table, source.time or found.time, source.units, source.rate_hz, keep, dropped)
-    positions, quats = _poses(table, source, found, keep, dropped)
-    times, order = _in_order(table, times, keep, dropped)
+    rows = Rows(table)
+    _keep_measured(rows, source, found.state)
+    times = _times(rows, source, found)
+    positions, quats = _poses(rows, source, found)
+    times, order = _in_order(rows, times)
     quats, flips = continuous(quats[order])
-    notes = [*dropped.notes()]
     if flips:
-        notes.append(f"{table.path.name}: the quaternion's sign flipped {flips} times; undone")
+        rows.mended.append(f"the quaternion's sign flipped {flips} times; undone")
     gaps = _gaps(times)
-    return PoseLog(
-        table.path, source.clock, times, positions[order], quats, gaps, (*notes, *_gap_notes(table.path, gaps))
-    )
+    notes = (*rows.notes(), *_gap_notes(table.path, gaps))
+    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes)
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -91,34 +89,30 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         raise NeecoError(
             f"{table.path}: header: which column is the joint's reading? Name it in the recording: columns.value"
         )
-    dropped = Dropped(table.path)
-    keep = np.ones(len(table.rows), dtype=bool)
-    times = _times(table, source.time or found.time, source.units, source.rate_hz, keep, dropped)
-    values = _cells(table, (value,), keep, dropped)[:, 0]
+    rows = Rows(table)
+    times = _times(rows, source, found)
+    values = _cells(rows, (value,))[:, 0]
     notes: tuple[str, ...] = ()
     if source.calibration is not None:
         calibration = read_calibration(source.calibration, source.units.angle)
-        values, outside, notes = apply_calibration(calibration, table, value, values, keep)
+        values, outside, notes = apply_calibration(calibration, table, value, values, rows.keep)
         reason = f"{value} lies far outside the calibration table {source.calibration.name}"
-        _refuse_wrong(table, outside, keep, reason + "; extend the table, or name the right column", dropped)
-        keep &= ~outside
+        rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * scale_of(str(table.path), (value,), "angle", source.units.angle, None, hint)
-        wild = keep & (np.abs(np.where(keep, values, 0)) > 4 * np.pi)
+        wild = np.abs(np.where(rows.keep, values, 0)) > 4 * np.pi
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
-        _refuse_wrong(table, wild, keep, reason, dropped)
-        keep &= ~wild
-    times, order = _in_order(table, times, keep, dropped)
+        rows.drop_wrong(wild, reason)
+    times, order = _in_order(rows, times)
     gaps = _gaps(times)
-    notes = (*dropped.notes(), *notes, *_gap_notes(table.path, gaps))
+    notes = (*rows.notes(), *notes, *_gap_notes(table.path, gaps))
     return ReadingLog(table.path, source.clock, times, values[order], gaps, notes)
 
 
-def _poses(
-    table: Table, source: PoseColumns, found: named.Recognised, keep: np.ndarray, dropped: Dropped
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either leave `keep`."""
+def _poses(rows: Rows, source: PoseColumns, found: Recognised) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
+    table = rows.table
     form, rotation = _rotation_columns(table, source, found)
     position = source.position or found.position
     if form == named.MATRIX:
@@ -132,25 +126,22 @@ def _poses(
     angle = 1.0
     if form in (named.EULER, named.ROTATION_VECTOR):
         angle = scale_of(str(table.path), rotation, "angle", source.units.angle, None, "")
-    positions, turns = _parts(table, form, _cells(table, read, keep, dropped))
+    positions, turns = _parts(table, form, _cells(rows, read))
     positions = positions * scale
     if form not in (named.EULER, named.ROTATION_VECTOR):  # trackers write zeros where they have no rotation
-        nothing = keep & (turns == 0).all(axis=1)
-        dropped.add("the rotation is all zeros (no measurement)", table.lines[nothing])
-        keep &= ~nothing
+        rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
     quats, good = to_quaternions(form, turns, source.euler_convention, angle)
-    _refuse_wrong(table, keep & ~good, keep, _no_rotation(form, rotation), dropped)
-    keep &= good
-    _check_range(table, positions, keep, position)
+    what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
+    rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
+    _check_range(table, positions[rows.keep], position)
     return positions, quats
 
 
-def _measured(table: Table, source: PoseColumns, found: str | None, dropped: Dropped) -> np.ndarray:
-    """bool [R]: rows whose state says that they were measured."""
-    keep = np.ones(len(table.rows), dtype=bool)
-    name = source.state or found
+def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
+    """Drop the rows whose state does not say that they were measured."""
+    table, name = rows.table, source.state or found
     if name is None:
-        return keep
+        return
     index = column_index(table, name)
     good = {value.lower() for value in source.good}
     states = [cells[index] if index < len(cells) else "" for cells in table.rows]
@@ -158,76 +149,66 @@ def _measured(table: Table, source: PoseColumns, found: str | None, dropped: Dro
     for row, state in enumerate(states):
         if state.lower() not in good:
             by_state.setdefault(state[:20], []).append(row)
-    for state, rows in list(by_state.items())[:8]:
-        dropped.add(f"{name} is {state or 'empty'!r}", table.lines[rows])
-    for rows in by_state.values():
-        keep[rows] = False
-    if not keep.any():
+    for number, (state, members) in enumerate(by_state.items()):
+        if number < STATES_TOLD:
+            rows.drop(members, f"{name} is {state or 'empty'!r}")
+        rows.keep[members] = False
+    if not rows.keep.any():
         raise NeecoError(
             f"{table.path}: {name}: no row is {' or '.join(source.good)} (line {table.lines[0]} has {states[0][:20]!r})"
             "; list the values that mark measured rows in the recording: columns.good"
         )
-    return keep
 
 
-def _times(
-    table: Table,
-    names: tuple[str, ...] | None,
-    units: Units,
-    rate_hz: float | None,
-    keep: np.ndarray,
-    dropped: Dropped,
-) -> np.ndarray:
-    """Times [R] in s; rows without one leave `keep`."""
+def _times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised) -> np.ndarray:
+    """Times [R] in s; rows without one are dropped."""
+    table, names = rows.table, source.time or found.time
     if names is None:
         raise NeecoError(
             f"{table.path}: header: no column of times found; name it in the recording: columns.time (or add t_s)"
         )
-    cells = _cells(table, names, keep, dropped)
+    cells = _cells(rows, names)
     known = recognise_time(names)
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
-    if rate_hz is not None:
-        return cells[:, 0] / rate_hz
+    if source.rate_hz is not None:
+        return cells[:, 0] / source.rate_hz
     if known.counts_frames:
         raise NeecoError(
             f"{table.path}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
             "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
-    steps = np.diff(cells[keep, 0])
+    steps = np.diff(cells[rows.keep, 0])
     steps = steps[steps > 0]
     hint = ""
     if len(steps):
         rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
         likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
         hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * scale_of(str(table.path), names, "time", units.time, known.time_unit, hint)
+    return cells[:, 0] * scale_of(str(table.path), names, "time", source.units.time, known.time_unit, hint)
 
 
-def _cells(table: Table, names: tuple[str, ...], keep: np.ndarray, dropped: Dropped) -> np.ndarray:
-    """Numbers [R, C]; rows with missing or unreadable cells leave `keep`. Raises NeecoError when those are most."""
+def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
+    """Numbers [R, C]; rows with missing or unreadable cells are dropped. Raises NeecoError when those are most."""
+    table = rows.table
     values, missing, bad = numbers(table, names)
-    missing &= keep
-    dropped.add(f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing", table.lines[missing])
-    keep &= ~missing
-    bad = [(row, what) for row, what in bad if keep[row]]
-    rows = [row for row, _ in bad]
-    if len(bad) > max(3, 0.5 * keep.sum()):
+    rows.drop(missing, f"no value for {', '.join(names)}" if len(names) < 3 else "values are missing")
+    bad = [(row, what) for row, what in bad if rows.keep[row]]
+    if len(bad) > max(3, 0.5 * rows.keep.sum()):
         alike = f"{len(bad)} of {count_rows(len(table.rows))} like it"
         raise NeecoError(
-            f"{table.path}: line {table.lines[rows[0]]}: {bad[0][1]} ({alike}); name other columns or repair the file"
+            f"{table.path}: line {table.lines[bad[0][0]]}: {bad[0][1]} ({alike}); name other columns or repair the file"
         )
     if bad:
-        dropped.add(f"not readable, first: {bad[0][1]}", table.lines[rows])
-    keep[rows] = False
-    if not keep.any():
+        rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
+    if not rows.keep.any():
         raise NeecoError(
             f"{table.path}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
         )
     return values
 
 
-def _rotation_columns(table: Table, source: PoseColumns, found: named.Recognised) -> tuple[str, tuple[str, ...]]:
+def _rotation_columns(table: Table, source: PoseColumns, found: Recognised) -> tuple[str, tuple[str, ...]]:
     """Form and columns of the rotation."""
     rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
     if rotation is None or form is None:
@@ -266,23 +247,9 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
-def _no_rotation(form: str, names: tuple[str, ...]) -> str:
-    what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
-    return f"{names[0]} ... {names[-1]} are not {what}; name the right columns"
-
-
-def _refuse_wrong(table: Table, wrong: np.ndarray, keep: np.ndarray, reason: str, dropped: Dropped) -> None:
-    """Note a few rows that are wrong; refuse the file when they are more than a few."""
-    wrong = wrong & keep
-    lines = table.lines[wrong]
-    if len(lines) > max(1, WRONG_ROWS * keep.sum()):
-        raise NeecoError(f"{table.path}: {listed(lines)} ({len(lines)} of {count_rows(int(keep.sum()))}): {reason}")
-    dropped.add(reason.split(";")[0], lines)
-
-
-def _check_range(table: Table, positions: np.ndarray, keep: np.ndarray, names: tuple[str, ...]) -> None:
+def _check_range(table: Table, positions: np.ndarray, names: tuple[str, ...]) -> None:
     """Refuse positions that no tracker of instruments gives, which is how a wrong unit shows."""
-    distance = np.median(np.linalg.norm(positions[keep], axis=1)) if keep.any() else 0.0
+    distance = np.median(np.linalg.norm(positions, axis=1)) if len(positions) else 0.0
     if distance > FARTHEST_MM:
         raise NeecoError(
             f"{table.path}: {', '.join(names)}: half the samples are over {distance / 1000:.3g} m from the tracker; "
@@ -290,22 +257,22 @@ def _check_range(table: Table, positions: np.ndarray, keep: np.ndarray, names: t
         )
 
 
-def _in_order(table: Table, times: np.ndarray, keep: np.ndarray, dropped: Dropped) -> tuple[np.ndarray, np.ndarray]:
+def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
-    rows = np.flatnonzero(keep)
-    order = rows[np.argsort(times[rows], kind="stable")]
-    late = rows[1:][times[rows][1:] < np.maximum.accumulate(times[rows])[:-1]]
+    table, kept = rows.table, np.flatnonzero(rows.keep)
+    order = kept[np.argsort(times[kept], kind="stable")]
+    late = kept[1:][times[kept][1:] < np.maximum.accumulate(times[kept])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
-    dropped.add("a second row at one time", table.lines[np.sort(order[doubled])])
+    rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
     if len(order) < FEWEST:
-        why = "; ".join(note.partition(": ")[2] for note in dropped.notes()[:2])
+        why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
             f"{table.path}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
             "record again or name the right columns"
         )
     if len(late):
-        dropped.mended.append(f"{count_rows(len(late))} out of order in time; sorted ({listed(table.lines[late])})")
+        rows.mended.append(f"{count_rows(len(late))} out of order in time; sorted ({listed(table.lines[late])})")
     return times[order], order
 
 

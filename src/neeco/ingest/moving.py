@@ -6,17 +6,18 @@ tracked frame that such pixels cover in most frames (its rough shape); and that 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
+import cv2
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import binary_dilation
 from scipy.spatial import QhullError
 
 from neeco.ingest.lens import Lens
-from neeco.ingest.requirements import optional_module
 from neeco.ingest.sfm import SfmResult
 from neeco.raster.pinhole import project, project_world
 
@@ -47,40 +48,44 @@ def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Le
 
     load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted.
     """
-    cv2 = optional_module("cv2")
-    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    grey = lru_cache(maxsize=16)(lambda row: cv2.cvtColor(load(row), cv2.COLOR_RGB2GRAY))
-    height, width = grey(int(rows[0])).shape
-    v, u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
-    evidence = np.zeros((len(rows), *u.shape))
-    for index, row in enumerate(rows.tolist()):
-        depth = _still_depth(sfm, row, pinhole, u, v)
+    flow = _Flow(load, sfm, pinhole)
+    evidence = []
+    for row in rows.tolist():
         others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(sfm.indices)]
-        for other in others:
-            flow = estimator.calc(grey(row), grey(other), None)[v, u]  # [h, w, 2]
-            expected = _still_flow(sfm.world_from_camera[row], sfm.world_from_camera[other], depth, pinhole, u, v)
-            evidence[index] += np.linalg.norm(flow - expected, axis=-1) > MOVED
-        evidence[index] /= max(len(others), 1)
-    return evidence
+        moved = sum((motion > MOVED for motion in flow.beyond_still(row, others)), np.zeros(flow.u.shape))
+        evidence.append(moved / max(len(others), 1))
+    return np.stack(evidence)
 
 
 def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> np.ndarray:
     """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
-    cv2 = optional_module("cv2")
-    estimator = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    grey = [cv2.cvtColor(load(0), cv2.COLOR_RGB2GRAY)]
-    height, width = grey[0].shape
-    v, u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
-    patch = max(1, round(PATCH * u.size))
+    flow = _Flow(load, sfm, pinhole)
+    patch = max(1, round(PATCH * flow.u.size))
     motion = np.zeros(len(sfm.indices) - 1)
     for row in range(len(motion)):
-        grey = [grey[-1], cv2.cvtColor(load(row + 1), cv2.COLOR_RGB2GRAY)]
-        flow = estimator.calc(*grey, None)[v, u]  # [h, w, 2]
-        depth = _still_depth(sfm, row, pinhole, u, v)
-        still = _still_flow(sfm.world_from_camera[row], sfm.world_from_camera[row + 1], depth, pinhole, u, v)
-        left = np.linalg.norm(flow - still, axis=-1)
+        (left,) = flow.beyond_still(row, [row + 1])
         motion[row] = np.sort(left, axis=None)[-patch:].mean()
     return motion
+
+
+class _Flow:
+    """Optical flow at every STEP-th pixel, and what of it a still scene does not explain."""
+
+    def __init__(self, load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> None:
+        self.sfm, self.pinhole = sfm, pinhole
+        self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
+        self.grey = lru_cache(maxsize=16)(lambda row: cv2.cvtColor(load(row), cv2.COLOR_RGB2GRAY))
+        height, width = self.grey(0).shape
+        self.v, self.u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+
+    def beyond_still(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
+        """[h, w] px by which pixels of a row of `sfm` move otherwise to each of the others than still ones would."""
+        cameras = self.sfm.world_from_camera
+        depth = _still_depth(self.sfm, row, self.pinhole, self.u, self.v)
+        for other in others:
+            flow = self.estimator.calc(self.grey(row), self.grey(other), None)[self.v, self.u]  # [h, w, 2]
+            still = _still_flow(cameras[row], cameras[other], depth, self.pinhole, self.u, self.v)
+            yield np.linalg.norm(flow - still, axis=-1)
 
 
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:

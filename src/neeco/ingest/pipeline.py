@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
-from neeco.capture.images import write_image, write_labels
+from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.model import Capture, Frame, PointCloud
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.files import new_folder
 from neeco.ingest.border import SAMPLES, visible_mask
 from neeco.ingest.clocks import offset_from_instrument
 from neeco.ingest.lens import Lens, read_lens
@@ -28,6 +23,7 @@ from neeco.ingest.result import IngestResult
 from neeco.ingest.select import choose_frames, look_over
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.splits import LEFT_OUT, Assigned, assign_splits
+from neeco.ingest.staging import staged
 from neeco.ingest.work import (
     States,
     Work,
@@ -51,17 +47,14 @@ def ingest(recording: Recording, output: Path, progress: StageProgress) -> Inges
     Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and
     what to do.
     """
-    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
-        raise NeecoError(f"{output}: already exists; choose another --output")
-    place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
-    with _staging(place) as folder:
+    with staged(output) as folder:
         work = begin(recording, folder, progress)
         lens = _read_lens(recording, work.video.size)
-        kept = _choose(work)
-        names = _write_images(work, kept, lens)
+        work.kept = _choose(work)
+        names = _write_images(work, lens)
         sfm_folder = folder / "sfm"
         sfm_folder.mkdir()
-        visible = _visible(work, kept, lens, names)
+        visible = _visible(work, lens, names)
         pinhole = lens.pinhole(work.video.size) if lens else None
         motion = StructureFromMotion(sfm_folder, work.video.path, folder / "raw", names, pinhole, visible)
         sfm = motion.reconstruct(progress)
@@ -73,24 +66,13 @@ def ingest(recording: Recording, output: Path, progress: StageProgress) -> Inges
                 f"intrinsics were estimated by structure from motion (focal lengths {lens.fl_x:.1f} x {lens.fl_y:.1f} "
                 "px); a calibration is better"
             )
-            _write_images(work, kept, lens)
-        registration = _register(work, kept, sfm)
-        _clocks_from_instruments(work, kept, motion, sfm, pinhole)
-        doubtful, shapes = _on_instruments(work, kept, motion, sfm, pinhole, registration)
+            _write_images(work, lens)
+        registration = _register(work, sfm)
+        _clocks_from_instruments(work, motion, sfm, pinhole)
+        doubtful, shapes = _on_instruments(work, motion, sfm, pinhole, registration)
         sfm = motion.adjust(sfm, doubtful, progress)
-        registration = _register(work, kept, sfm)
-        return _finish(work, output, kept, sfm, pinhole, registration, shapes, visible)
-
-
-@contextmanager
-def _staging(output: Path) -> Iterator[Path]:
-    """A temporary folder beside the output, on the same disk, gone afterwards whatever happens."""
-    with new_folder(output.parent):
-        folder = Path(tempfile.mkdtemp(prefix=f".{output.name[:80]}-", dir=output.parent))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        registration = _register(work, sfm)
+        return _finish(work, output, sfm, pinhole, registration, shapes, visible)
 
 
 def _read_lens(recording: Recording, size: tuple[int, int]) -> Lens | None:
@@ -139,21 +121,21 @@ def _commonest(dropped: dict[int, str]) -> str:
     return max(set(reasons), key=reasons.count) if reasons else "the video is short"
 
 
-def _write_images(work: Work, kept: np.ndarray, lens: Lens | None) -> list[str]:
+def _write_images(work: Work, lens: Lens | None) -> list[str]:
     """Frames as PNG: as recorded while the lens is unknown, else undistorted."""
     folder = work.folder / "raw"
     folder.mkdir(exist_ok=True)
-    names = [f"{frame:06d}.png" for frame in kept]
-    for done, (name, (_, image)) in enumerate(zip(names, work.video.read(kept.tolist()), strict=True)):
-        work.progress("writing frames", done, len(kept))
+    names = [f"{frame:06d}.png" for frame in work.kept]
+    for done, (name, (_, image)) in enumerate(zip(names, work.video.read(work.kept.tolist()), strict=True)):
+        work.progress("writing frames", done, len(names))
         straight = lens.undistort(image) if lens else image
         write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
     return names
 
 
-def _visible(work: Work, kept: np.ndarray, lens: Lens | None, names: list[str]) -> Path | None:
+def _visible(work: Work, lens: Lens | None, names: list[str]) -> Path | None:
     """Masks of the endoscope's dark border, one file per frame as SfM wants them; None without a border."""
-    sample = kept[np.linspace(0, len(kept) - 1, min(SAMPLES, len(kept))).astype(int)]
+    sample = work.kept[np.linspace(0, len(names) - 1, min(SAMPLES, len(names))).astype(int)]
     seen = visible_mask(image for _, image in work.video.read(np.unique(sample).tolist()))
     if seen is None:
         return None
@@ -169,7 +151,7 @@ def _visible(work: Work, kept: np.ndarray, lens: Lens | None, names: list[str]) 
     return folder
 
 
-def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | None:
+def _register(work: Work, sfm: SfmResult) -> Registration | None:
     """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
     scope = work.logs.scope
     if scope is None:
@@ -182,7 +164,7 @@ def _register(work: Work, kept: np.ndarray, sfm: SfmResult) -> Registration | No
         return None
     given = work.clocks.get(scope.clock)
     known = given.seconds if given is not None and given.source == "given" else None
-    times = work.times[kept[sfm.indices]]
+    times = work.times_of(sfm)
     try:
         registration = register_with_laparoscope(sfm.world_from_camera, times, scope, known)
     except NeecoError as error:
@@ -196,15 +178,12 @@ def _loader(work: Work, motion: StructureFromMotion, sfm: SfmResult) -> Callable
     """Image [H, W, 3] uint8 of a row of `sfm`."""
 
     def load(row: int) -> np.ndarray:
-        with Image.open(work.folder / "raw" / motion.names[int(sfm.indices[row])]) as image:
-            return np.asarray(image.convert("RGB"))
+        return np.asarray(open_image(work.folder / "raw" / motion.names[int(sfm.indices[row])]).convert("RGB"))
 
     return load
 
 
-def _clocks_from_instruments(
-    work: Work, kept: np.ndarray, motion: StructureFromMotion, sfm: SfmResult, pinhole: Lens
-) -> None:
+def _clocks_from_instruments(work: Work, motion: StructureFromMotion, sfm: SfmResult, pinhole: Lens) -> None:
     """Clocks that neither `sync` nor the scope told: from how the instruments move in the images."""
     unknown = {log.clock: log for log in work.logs.poses.values() if log.clock not in work.clocks}
     if not unknown:
@@ -213,18 +192,13 @@ def _clocks_from_instruments(
     moved = motion_between(_loader(work, motion, sfm), sfm, pinhole)
     for clock, log in unknown.items():
         try:
-            work.clocks[clock] = offset_from_instrument(moved, work.times[kept[sfm.indices]], log)
+            work.clocks[clock] = offset_from_instrument(moved, work.times_of(sfm), log)
         except NeecoError as error:
             note_once(work, str(error))
 
 
 def _on_instruments(
-    work: Work,
-    kept: np.ndarray,
-    motion: StructureFromMotion,
-    sfm: SfmResult,
-    pinhole: Lens,
-    registration: Registration | None,
+    work: Work, motion: StructureFromMotion, sfm: SfmResult, pinhole: Lens, registration: Registration | None
 ) -> tuple[np.ndarray, dict[str, RoughShape]]:
     """bool [Q]: observations on an instrument, whose rough shape is carved from what moves with its pose."""
     doubtful = np.zeros(len(sfm.observations), dtype=bool)
@@ -236,7 +210,7 @@ def _on_instruments(
     cameras = registration.cameras(sfm.world_from_camera)
     shapes = {}
     for name, log in work.logs.poses.items():
-        poses, valid = instrument_poses(work, log, work.times[kept[sfm.indices]])
+        poses, valid = instrument_poses(work, log, work.times_of(sfm))
         camera_from_instrument = np.linalg.inv(cameras) @ np.where(valid[:, None, None], poses, np.eye(4))
         usable = valid[rows]
         shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], pinhole)
@@ -278,7 +252,6 @@ def _observations_on(
 def _finish(
     work: Work,
     output: Path,
-    kept: np.ndarray,
     sfm: SfmResult,
     pinhole: Lens,
     registration: Registration | None,
@@ -286,10 +259,9 @@ def _finish(
     visible: Path | None,
 ) -> IngestResult:
     """States at every frame's time, splits, and the capture on disk."""
-    for index in set(range(len(kept))) - set(sfm.indices.tolist()):
-        work.dropped[int(kept[index])] = "no camera: too few of its features match other frames"
-    frames = kept[sfm.indices]
-    times = work.times[frames]
+    for index in set(range(len(work.kept))) - set(sfm.indices.tolist()):
+        work.dropped[int(work.kept[index])] = "no camera: too few of its features match other frames"
+    frames, times = work.kept[sfm.indices], work.times_of(sfm)
     cameras, points = _placed(sfm, registration)
     states, usable = states_at(work, times)
     for frame in frames[~usable]:
@@ -315,11 +287,7 @@ def _finish(
     cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
     registered = registration is not None or not work.logs.poses
     capture = Capture(work.folder, capture_frames, instruments_of(work), cloud, registered)
-    whole = work.folder / "capture"
-    write_capture(capture, whole)
-    if output.exists():
-        output.rmdir()
-    whole.rename(os.path.abspath(output))
+    write_capture(capture, work.folder / "capture")
     order = np.flatnonzero(chosen)
     position = {row: index for index, row in enumerate(order.tolist())}
     registered_frames = (

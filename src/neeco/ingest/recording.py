@@ -14,7 +14,7 @@ from neeco.capture.problems import shown
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, pose_columns
+from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, parse_yaml, pose_columns
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 TRACKER_CLOCK = "em"
@@ -54,7 +54,7 @@ class Recording:
     images: Path | None = None
     fps: float | None = None
     times: Path | None = None
-    intrinsics: Path | tuple[float, float, float, float] | None = None
+    intrinsics: Path | tuple[float, ...] | None = None
     instruments: tuple[InstrumentLogs, ...] = ()
     laparoscope: PoseColumns | None = None
     sync: Mapping[str, float] = field(default_factory=dict)
@@ -118,11 +118,11 @@ def recording_from_flags(
     logs = {joint: JointColumns(Path(log), joint, calibration=_path(table)) for joint, log, table in joints}
     instruments = (InstrumentLogs(name, PoseColumns(Path(instrument), TRACKER_CLOCK), logs),) if instrument else ()
     scope = PoseColumns(Path(laparoscope), TRACKER_CLOCK) if laparoscope else None
-    values: Path | tuple[float, float, float, float] | None
+    values: Path | tuple[float, ...] | None
     if intrinsics is None or isinstance(intrinsics, str | Path):
         values = _path(intrinsics)
     elif len(intrinsics) == 4:
-        values = (float(intrinsics[0]), float(intrinsics[1]), float(intrinsics[2]), float(intrinsics[3]))
+        values = tuple(float(value) for value in intrinsics)
     else:
         raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
     folder = Path(video).is_dir()
@@ -172,13 +172,7 @@ class _Loader(yaml.SafeLoader):
 def _load(path: Path) -> Any:
     missing = "no such file; `neeco ingest --init` writes one by looking at the files"
     text = read_text(path, "a recording as YAML", missing)
-    try:
-        document = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}: " if mark else ""
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
-        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); repair it") from None
+    document = parse_yaml(path, text, _Loader, "repair it")
     if document is None:
         raise NeecoError(f"{path}: the file is empty; `neeco ingest --init` writes one by looking at the files")
     return document
@@ -204,13 +198,13 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     return None, source, fps, times
 
 
-def _intrinsics(top: Section) -> Path | tuple[float, float, float, float] | None:
+def _intrinsics(top: Section) -> Path | tuple[float, ...] | None:
     value = top.value.get("intrinsics")
     if value is None or isinstance(value, str):
         return top.path("intrinsics")
     numbers = top.node.child("intrinsics").numbers(4, "fl_x, fl_y, cx, cy in pixels, or a calibration file")
     assert numbers is not None
-    return numbers[0], numbers[1], numbers[2], numbers[3]
+    return tuple(numbers)
 
 
 def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:

@@ -1,4 +1,7 @@
-"""Rotations of logs, from whatever columns hold them to unit quaternions."""
+"""Rotations of logs, from whatever columns hold them to unit quaternions.
+
+scipy converts; what counts as a rotation is ours on purpose: scipy takes any four numbers or any matrix for one.
+"""
 
 from __future__ import annotations
 

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from neeco.capture.nodes import Node
 from neeco.capture.problems import Refusal, shown
 from neeco.errors import NeecoError
@@ -22,6 +24,17 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
     """The name that a misspelt one probably means."""
     matches = difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)
     return matches[0] if matches else None
+
+
+def parse_yaml(path: Path, text: str, loader: type[yaml.SafeLoader], remedy: str) -> Any:
+    """The document in a file's text. Raises NeecoError with the line where it is no YAML."""
+    try:
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}: " if mark else ""
+        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
+        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
 
 
 class Section:
@@ -41,8 +54,16 @@ class Section:
                 raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
 
     def error(self, key: str, message: str) -> NeecoError:
-        place = f"{self.place}.{key}" if self.place and key else self.place or key
-        return NeecoError(" ".join(f"{self.file}: {place}: {message}".split()))
+        return NeecoError(" ".join(f"{self.file}: {self.at(key)}: {message}".split()))
+
+    def at(self, key: str) -> str:
+        """Where a key of this section stands in its file."""
+        return ".".join(part for part in (self.place, key) if part)
+
+    def section(self, key: str, keys: tuple[str, ...]) -> Section:
+        """The mapping under a key; empty when absent."""
+        value = self.value.get(key)
+        return Section(self.file, self.at(key), {} if value is None else value, keys)
 
     def text(self, key: str, required: bool = False) -> str | None:
         """A name; YAML makes whole numbers of some."""
@@ -111,13 +132,9 @@ class Section:
 
 def pose_columns(parent: Section, key: str, value: Any, clock: str) -> PoseColumns:
     """A log of poses: a file's name, or a mapping. Raises NeecoError."""
-    place = f"{parent.place}.{key}" if parent.place else key
-    value = value if isinstance(value, dict) else {"file": value}
-    section = Section(parent.file, place, value, ("file", "clock", "columns", "units", "rate_hz"))
-    file = section.path("file", required=True)
-    assert file is not None
+    section, file = _log(parent, key, value)
     keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
-    columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), keys)
+    columns = section.section("columns", keys)
     forms = [form for form in ("quaternion", *FORMS) if columns.value.get(form) is not None]
     if len(forms) > 1:
         raise columns.error(forms[1], f"the rotation is already given by {forms[0]}; keep one of them")
@@ -150,15 +167,10 @@ def pose_columns(parent: Section, key: str, value: Any, clock: str) -> PoseColum
 def joint_columns(parent: Section, key: str, value: Any, clock: str, poses: PoseColumns | None) -> JointColumns:
     """A log of a joint: a file's name, or a mapping. In the file of the poses it shares their clock. Raises
     NeecoError."""
-    place = f"{parent.place}.{key}"
-    value = value if isinstance(value, dict) else {"file": value}
-    keys = ("file", "clock", "columns", "units", "rate_hz", "calibration", "limits")
-    section = Section(parent.file, place, value, keys)
-    file = section.path("file", required=True)
-    assert file is not None
+    section, file = _log(parent, key, value, ("calibration", "limits"))
     if poses is not None and file == poses.path:
         clock = poses.clock
-    columns = Section(section.file, f"{place}.columns", _mapping(section.value.get("columns")), ("time", "value"))
+    columns = section.section("columns", ("time", "value"))
     names = columns.names("value", (1,))
     return JointColumns(
         file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
@@ -167,12 +179,17 @@ def joint_columns(parent: Section, key: str, value: Any, clock: str, poses: Pose
     )  # fmt: skip
 
 
-def _mapping(value: Any) -> Any:
-    return {} if value is None else value
+def _log(parent: Section, key: str, value: Any, more: tuple[str, ...] = ()) -> tuple[Section, Path]:
+    """What the recording says of one log, and the log's file. more: keys that only this kind of log has."""
+    value = value if isinstance(value, dict) else {"file": value}
+    section = Section(parent.file, parent.at(key), value, ("file", "clock", "columns", "units", "rate_hz", *more))
+    file = section.path("file", required=True)
+    assert file is not None
+    return section, file
 
 
 def _units(section: Section) -> Units:
-    given = Section(section.file, f"{section.place}.units", _mapping(section.value.get("units")), tuple(KINDS))
+    given = section.section("units", tuple(KINDS))
     found: dict[str, str | None] = {}
     for kind, units in KINDS.items():
         text = given.text(kind)

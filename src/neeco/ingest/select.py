@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-
-from neeco.ingest.requirements import optional_module
 
 BLUR = 0.5  # of the neighbours' sharpness: less is a blurred frame
 NEIGHBOURS = 7  # frames on each side
@@ -34,7 +33,6 @@ class Selection:
 
 def look_over(images: Iterable[np.ndarray]) -> Look:
     """Sharpness and a thumbnail of every image [H, W, 3] uint8."""
-    cv2 = optional_module("cv2")
     sharpness, thumbnails = [], []
     for image in images:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # rows named in a note
+WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,36 @@ class Table:
         return matches[0] if len(matches) == 1 else None
 
 
-@dataclass
-class Dropped:
-    """Rows left out, by reason, and rows mended, for the notes."""
+class Rows:
+    """Which rows of a table are in use; those left out, by reason, and those mended, for the notes."""
 
-    path: Path
-    reasons: dict[str, list[int]] = field(default_factory=dict)
-    mended: list[str] = field(default_factory=list)  # other things done to the rows, in words
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.keep = np.ones(len(table.rows), dtype=bool)
+        self.reasons: dict[str, list[int]] = {}  # the file's lines
+        self.mended: list[str] = []  # other things done to the rows, in words
 
-    def add(self, reason: str, lines: Sequence[int] | np.ndarray) -> None:
+    def drop(self, which: np.ndarray | list[int], reason: str) -> None:
+        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
+        lines = self.table.lines[which][self.keep[which]]
         if len(lines):
-            self.reasons.setdefault(reason, []).extend(int(line) for line in lines)
+            self.reasons.setdefault(reason, []).extend(lines.tolist())
+        self.keep[which] = False
+
+    def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
+        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
+        lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
+        if len(lines) > max(1, WRONG_ROWS * count):
+            raise NeecoError(f"{self.table.path}: {listed(lines)} ({len(lines)} of {count_rows(count)}): {reason}")
+        self.drop(wrong, reason.split(";")[0])
 
     def notes(self) -> tuple[str, ...]:
+        name = self.table.path.name
         dropped = (
-            f"{self.path.name}: {count_rows(len(lines))} dropped: {reason} ({listed(lines)})"
+            f"{name}: {count_rows(len(lines))} dropped: {reason} ({listed(lines)})"
             for reason, lines in self.reasons.items()
         )
-        return (*dropped, *(f"{self.path.name}: {what}" for what in self.mended))
+        return (*dropped, *(f"{name}: {what}" for what in self.mended))
 
 
 def count_rows(count: int) -> str:
@@ -190,5 +203,4 @@ def _unique(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_number(text: str) -> bool:
-    value = parse_number(text)
-    return value is not None
+    return parse_number(text) is not None

@@ -6,14 +6,14 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.ingest.columns import recognise_time
-from neeco.ingest.requirements import optional_module
+from neeco.ingest.requirements import require_installed
 from neeco.ingest.tables import numbers, read_table
 from neeco.ingest.units import scale_of
 
@@ -21,25 +21,19 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 FEWEST = 2
 
 
-class VideoSource(Protocol):
-    """Frames with their times. size: (width, height) px; notes: what could not be read, in words."""
+@dataclass(frozen=True)
+class VideoSource:
+    """Frames with their times. size: (width, height) px; notes: what could not be read, in words; times [N] s,
+    increasing, of a video from its first frame."""
 
-    @property
-    def path(self) -> Path: ...
-
-    @property
-    def size(self) -> tuple[int, int]: ...
-
-    @property
-    def notes(self) -> tuple[str, ...]: ...
-
-    def frame_times(self) -> np.ndarray:
-        """Times [N] s, increasing; of a video, from its first frame."""
-        ...
+    path: Path
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    times: np.ndarray
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
-        ...
+        raise NotImplementedError
 
 
 def open_video(path: Path, fps: float | None = None) -> VideoSource:
@@ -83,10 +77,8 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     size, usable, bad = None, [], []
     for index, file in enumerate(files):
         try:
-            with Image.open(file) as image:
-                image.load()
-                found = image.size
-        except Exception:  # damaged files make pillow's decoders raise nearly anything
+            found = open_image(file).size
+        except NeecoError:
             bad.append(file.name)
             continue
         if size is not None and found != size:
@@ -99,42 +91,27 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
         raise NeecoError(f"{folder}: {len(usable)} of {len(files)} images can be read; replace the damaged files")
     if bad:
         notes.append(f"{folder.name}: {len(bad)} images cannot be read and are left out ({', '.join(bad[:3])})")
-    return _Images(folder, size, tuple(notes), tuple(files[i] for i in usable), stamps[usable])
+    return _Images(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
 
 
 @dataclass(frozen=True)
-class _Images:
-    path: Path
-    size: tuple[int, int]
-    notes: tuple[str, ...]
+class _Images(VideoSource):
     files: tuple[Path, ...]
-    times: np.ndarray
-
-    def frame_times(self) -> np.ndarray:
-        return self.times
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         for index in sorted({int(i) for i in indices}):
             try:
-                with Image.open(self.files[index]) as image:
-                    pixels = np.array(image.convert("RGB"))
-            except Exception as error:
+                pixels = np.array(open_image(self.files[index]).convert("RGB"))
+            except NeecoError as error:
                 raise NeecoError(f"{self.files[index]}: cannot be read any more; do not change the images") from error
             yield index, pixels
 
 
 @dataclass(frozen=True)
-class _Video:
-    path: Path
-    size: tuple[int, int]
-    notes: tuple[str, ...]
+class _Video(VideoSource):
     stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
-    times: np.ndarray
     numbered: bool
     threads: str
-
-    def frame_times(self) -> np.ndarray:
-        return self.times
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
@@ -168,7 +145,9 @@ class _Scan:
 
     def decoded(self) -> Iterator[Any]:
         """Frames as far as they can be decoded; damaged ones are counted and left out."""
-        av = optional_module("av")
+        require_installed("av")
+        import av
+
         try:
             container = av.open(str(self.path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
@@ -230,16 +209,15 @@ class _Scan:
                 times = np.arange(len(order)) / fps
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return _Video(self.path, self.size, tuple(notes), tuple(order), times, False, self.threads)
+            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads)
         rate = fps or self.rate
         if not rate:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
         if fps is None:
             notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
         count = len(self.stamps)
-        return _Video(
-            self.path, self.size, tuple(notes), tuple(range(count)), np.arange(count) / rate, True, self.threads
-        )
+        times = np.arange(count) / rate
+        return _Video(self.path, self.size, tuple(notes), times, tuple(range(count)), True, self.threads)
 
     def _notes(self) -> list[str]:
         notes, read = [], len(self.stamps)
@@ -257,8 +235,9 @@ class _Scan:
 
 def _rgb(frame: Any) -> np.ndarray:
     """uint8 [H, W, 3]. The converter's quick default is over one level too dark, so it is asked for exact rounding."""
-    flags = optional_module("av.video.reformatter").Interpolation
-    exact = flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT | flags.BITEXACT
+    from av.video.reformatter import Interpolation
+
+    exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.BITEXACT
     return frame.to_ndarray(format="rgb24", interpolation=exact)
 
 

@@ -14,7 +14,7 @@ from neeco.ingest.clocks import LONGEST, ClockOffset
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
-from neeco.ingest.sfm import StageProgress
+from neeco.ingest.sfm import SfmResult, StageProgress
 from neeco.ingest.video import VideoSource
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
@@ -53,6 +53,11 @@ class Work:
     notes: list[str]
     clocks: dict[str, ClockOffset] = field(default_factory=dict)
     dropped: dict[int, str] = field(default_factory=dict)  # video frame -> why
+    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # [K] video frames chosen
+
+    def times_of(self, sfm: SfmResult) -> np.ndarray:
+        """[M] s of the frames that got a camera."""
+        return self.times[self.kept[sfm.indices]]
 
 
 def begin(recording: Recording, folder: Path, progress: StageProgress) -> Work:
@@ -82,7 +87,7 @@ def begin(recording: Recording, folder: Path, progress: StageProgress) -> Work:
 
 def _video_times(recording: Recording, video: VideoSource) -> np.ndarray:
     """The frames' times s. Raises NeecoError for those that no recording has, and for frames too small."""
-    times, source = video.frame_times(), recording.times or video.path
+    times, source = video.times, recording.times or video.path
     rate = 1 / float(np.median(np.diff(times)))
     if not (SLOWEST < rate < FASTEST and times[-1] - times[0] < LONGEST):
         raise NeecoError(

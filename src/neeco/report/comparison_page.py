@@ -28,7 +28,7 @@ from neeco.experiments.tables import UNKNOWN, Table, csv_text
 from neeco.files import write_text
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.comparison_shots import FrameRow, frame_rows
-from neeco.report.render import REPORT_FILE, write_page
+from neeco.report.render import REPORT_FILE, split_counts, write_page
 from neeco.report.standings import standings
 
 BINS = 6
@@ -203,7 +203,7 @@ def _facts(comparison: Mapping[str, Any], capture: Capture) -> list[tuple[str, s
     return [
         ("command", command_of(comparison)),
         ("capture", comparison["capture"]),
-        ("frames", ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)),
+        ("frames", split_counts(capture)),
         ("budget", budget_words(comparison)),
         ("machine", machine_words(comparison)),
         ("versions", f"neeco {comparison['version']}, Python {machine['python']}, torch {machine['torch']}"),

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import difference_map, overlay_outline
+from neeco.evaluation.difference import overlay_outline
 from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.evaluation.truth import load_reference
 from neeco.experiments.comparison import job_folder
 from neeco.labels.drawing import draw
-from neeco.report.figures import jpeg, png, to_bytes
+from neeco.report.figures import difference, jpeg, to_bytes
 from neeco.training.run import load_run
 
 
@@ -81,7 +81,6 @@ def _first_seeds(jobs: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 def _shot(name: str, seed: int, frame: Frame, image: np.ndarray) -> Shot:
     photograph, counted = frame.load_image(), frame.load_mask()
-    compared = image if counted is None else np.where(counted.numpy()[..., None], image, photograph.numpy())
     return Shot(
         name,
         seed,
@@ -89,7 +88,7 @@ def _shot(name: str, seed: int, frame: Frame, image: np.ndarray) -> Shot:
         frame.name,
         psnr(torch.from_numpy(image), photograph, counted),
         jpeg(to_bytes(image)),
-        png(difference_map(compared, photograph.numpy())),
+        difference(image, photograph.numpy(), counted),
     )
 
 

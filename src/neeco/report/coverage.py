@@ -90,9 +90,8 @@ def _turns(rotations: np.ndarray, splits: Sequence[str], main_axis: np.ndarray) 
 
 def extrapolations(degrees: Sequence[Degree]) -> list[str]:
     """One sentence for every degree of freedom of which a capture's own frames leave the trained range."""
-    several = len({degree.instrument for degree in degrees}) > 1
     sentences = []
-    for degree in degrees:
+    for name, degree in _named(degrees):
         trained = degree.trained
         if trained is None:
             continue
@@ -104,7 +103,6 @@ def extrapolations(degrees: Sequence[Degree]) -> list[str]:
                 reach = reach or _number(float(outside[0]))
                 parts.append(f"{len(outside)} of {count} {split} frames ({reach} {degree.unit})")
         if parts:
-            name = f"{degree.instrument} {degree.name}" if several else degree.name
             low, high = map(_number, trained)
             sentences.append(f"{name}: trained from {low} to {high} {degree.unit}; outside it {', '.join(parts)}.")
     return sentences
@@ -112,19 +110,23 @@ def extrapolations(degrees: Sequence[Degree]) -> list[str]:
 
 def unvisited(degrees: Sequence[Degree]) -> list[str]:
     """Stretches inside the trained range, a tenth of it or longer, that no training frame visits."""
-    several = len({degree.instrument for degree in degrees}) > 1
     sentences = []
-    for degree in degrees:
+    for name, degree in _named(degrees):
         values = np.sort(degree.of("train"))
         if len(values) < 2 or np.ptp(values) < CONSTANT:
             continue
         steps = np.diff(values)
-        name = f"{degree.instrument} {degree.name}" if several else degree.name
         sentences += [
             f"{name}: nothing between {_number(values[place])} and {_number(values[place + 1])} {degree.unit}."
             for place in np.flatnonzero(steps > 0.1 * np.ptp(values))
         ]
     return sentences
+
+
+def _named(degrees: Sequence[Degree]) -> list[tuple[str, Degree]]:
+    """Each with its name, after that of its instrument where there are several."""
+    several = len({degree.instrument for degree in degrees}) > 1
+    return [(f"{degree.instrument} {degree.name}" if several else degree.name, degree) for degree in degrees]
 
 
 @page_style()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
@@ -22,7 +23,6 @@ from neeco.raster.types import Camera
 from neeco.scene import Drawable
 
 MAX_WIDTH = 480  # px; the page has to stay a file one can mail
-FRAMES_PER_SPLIT = 3
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,10 @@ def _figure(capture: Capture, scene: Drawable, split: str, frame: Frame, why: st
     drawing = draw(scene, state, camera)
     photograph, image = frame.load_image().numpy(), drawing.image.numpy()
     reference = load_reference(capture, frame)
-    ignored = frame.load_mask()
-    compared = image if ignored is None else np.where(ignored.numpy()[..., None], image, photograph)
     pictures = [
         ("photograph", jpeg(to_bytes(photograph))),
         ("drawn", jpeg(to_bytes(image))),
-        ("difference", png(difference_map(compared, photograph))),
+        ("difference", difference(image, photograph, frame.load_mask())),
     ]
     if drawing.parts is not None:
         overlay = overlay_parts(photograph, drawing.parts.numpy())
@@ -102,6 +100,12 @@ def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
             },
         )
     return state, camera
+
+
+def difference(image: np.ndarray, photograph: np.ndarray, counted: Tensor | None) -> str:
+    """The difference map of two images [H, W, 3] as a data URI; black also where `counted` [H, W] is False."""
+    compared = image if counted is None else np.where(counted.numpy()[..., None], image, photograph)
+    return png(difference_map(compared, photograph))
 
 
 def jpeg(pixels: np.ndarray) -> str:

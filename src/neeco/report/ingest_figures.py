@@ -7,18 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
+from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import outline
 from neeco.ingest.moving import RoughShape
+from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
-from neeco.report.figures import MAX_WIDTH, jpeg
+from neeco.report.figures import MAX_WIDTH, jpeg, to_bytes
+from neeco.report.tracks import round_length
 
 FIGURES = 8
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 MAIN_AXIS_COLOR = "#ff6bff"
 OUTLINE_COLOR = "#ffe14a"
 NEAR = 1.0  # mm: nearer points are not drawn
+ORIGIN = np.zeros((1, 3))
 AXIS_SHARE = 0.16  # of the image's width: how long the drawn frame axes are
 
 
@@ -32,14 +36,6 @@ class MainAxis:
     @property
     def direction(self) -> np.ndarray:
         return (self.tip - self.tail) / np.linalg.norm(self.tip - self.tail)
-
-
-@dataclass(frozen=True)
-class SampleFigure:
-    """One sample frame as a data URI and its caption."""
-
-    picture: str
-    frame: Frame
 
 
 def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, MainAxis]:
@@ -67,14 +63,15 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
 
 def sample_figures(
     capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
-) -> list[SampleFigure]:
-    """Up to FIGURES frames, evenly spread over time. Frame axes are `length` mm long; unregistered poses are not drawn.
+) -> list[tuple[str, Frame]]:
+    """(data URI, frame) of up to FIGURES frames, evenly spread over time. Frame axes are `length` mm long; unregistered
+    poses are not drawn.
 
     Raises NeecoError when an image cannot be read.
     """
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(FIGURES, len(frames))).round().astype(int))
-    return [SampleFigure(_draw(frames[index], capture, shapes, axes, length), frames[index]) for index in chosen]
+    return [(_draw(frames[index], capture, shapes, axes, length), frames[index]) for index in chosen]
 
 
 def axis_length(capture: Capture) -> float:
@@ -82,113 +79,95 @@ def axis_length(capture: Capture) -> float:
     sizes = []
     for frame in capture.frames:
         for state in frame.state.instruments.values():
-            depth = float(_in_camera(state.pose.numpy()[None, :3, 3], frame.camera)[0, 2])
+            _, (depth,) = _project(ORIGIN, state.pose, frame.camera)
             if depth > NEAR:
                 sizes.append(AXIS_SHARE * frame.camera.width / frame.camera.fx * depth)
-    wanted = float(np.median(sizes)) if sizes else 10.0
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max((step * power for step in (1, 2, 5) if step * power <= wanted), default=power))
+    return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
 def in_view(capture: Capture, name: str) -> tuple[int, int]:
     """In how many frames an instrument's tracked origin lies inside the image, and how many have the instrument."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
-    inside = sum(_inside(frame, frame.state.instruments[name].pose.numpy()[:3, 3]) for frame in frames)
+    inside = 0
+    for frame in frames:
+        ((x, y),), (depth,) = _project(ORIGIN, frame.state.instruments[name].pose, frame.camera)
+        inside += bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
     return inside, len(frames)
-
-
-def _inside(frame: Frame, point: np.ndarray) -> bool:
-    camera = frame.camera
-    pixels, depth = _project(point[None], camera)
-    x, y = pixels[0]
-    return bool(depth[0] > NEAR and 0 <= x < camera.width and 0 <= y < camera.height)
 
 
 def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
     """How well a point of an instrument is in view over the frames: more is better."""
     score = 0.0
     for frame in frames:
-        pose, camera = frame.state.instruments[name].pose.numpy(), frame.camera
-        world = pose[:3, :3] @ point + pose[:3, 3]
-        pixels, depth = _project(world[None], camera)
-        off = np.abs(pixels[0] / [camera.width, camera.height] - 0.5).max()  # 0.5 at the border
-        score += 0.0 if depth[0] <= NEAR else float(off < 0.5) + 0.1 * max(0.0, 1 - off)
+        (place,), (depth,) = _project(point[None], frame.state.instruments[name].pose, frame.camera)
+        off = np.abs(place / [frame.camera.width, frame.camera.height] - 0.5).max()  # 0.5 at the border
+        score += 0.0 if depth <= NEAR else float(off < 0.5) + 0.1 * max(0.0, 1 - off)
     return score
 
 
 def _draw(
     frame: Frame, capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> str:
-    pixels = np.clip(np.rint(frame.load_image().numpy() * 255), 0, 255).astype(np.uint8)
+    pixels = to_bytes(frame.load_image().numpy())
     # drawn at twice the size shown, then shrunk: smooth lines
-    scale = 2 * MAX_WIDTH / frame.camera.width
-    size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
-    image = Image.fromarray(pixels).resize(size, Image.Resampling.BICUBIC)
+    camera = _resized(frame.camera, 2 * MAX_WIDTH)
+    image = Image.fromarray(pixels).resize((camera.width, camera.height), Image.Resampling.BICUBIC)
     if capture.registered:
         for name, state in frame.state.instruments.items():
-            pose = state.pose.numpy()
             if name in shapes:
-                _draw_outline(image, shapes[name], pose, frame.camera, scale)
+                _draw_outline(image, shapes[name], state.pose, camera)
             painter = ImageDraw.Draw(image)
             if name in axes:
-                _draw_main_axis(painter, axes[name], pose, frame.camera, scale)
-            _draw_frame(painter, pose, frame.camera, scale, length)
+                _draw_main_axis(painter, axes[name], state.pose, camera)
+            _draw_frame(painter, state.pose, camera, length)
     return jpeg(np.asarray(image))
 
 
-def _draw_outline(image: Image.Image, shape: RoughShape, pose: np.ndarray, camera: Camera, scale: float) -> None:
+def _resized(camera: Camera, width: int) -> Camera:
+    """The camera of an image scaled to so many px across."""
+    scale = width / camera.width
+    fx, fy, cx, cy = (scale * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return Camera(camera.world_from_camera, fx, fy, cx, cy, width, round(camera.height * scale))
+
+
+def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: Camera) -> None:
     """The outline of the shape's points, each as large as the grid cell it stands for."""
-    pixels, depth = _project(shape.points @ pose[:3, :3].T + pose[:3, 3], camera)
     mask = Image.new("L", image.size)
     painter = ImageDraw.Draw(mask)
-    for (x, y), z in zip(pixels * scale, depth, strict=True):
-        radius = 0.75 * shape.spacing * camera.fx / z * scale if z > NEAR else 0.0
+    for (x, y), z in zip(*_project(shape.points, pose, camera), strict=True):
+        radius = 0.75 * shape.spacing * camera.fx / z if z > NEAR else 0.0
         if radius and -radius < x < image.width + radius and -radius < y < image.height + radius:
             painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
     edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255).filter(ImageFilter.MaxFilter(3))
     image.paste(OUTLINE_COLOR, (0, 0), edge)
 
 
-def _draw_main_axis(
-    painter: ImageDraw.ImageDraw, axis: MainAxis, pose: np.ndarray, camera: Camera, scale: float
-) -> None:
-    local = axis.tail + np.linspace(0, 1, 33)[:, None] * (axis.tip - axis.tail)
-    pixels, depth = _project(local @ pose[:3, :3].T + pose[:3, 3], camera)
-    visible = [tuple(place) for place, z in zip(pixels * scale, depth, strict=True) if z > NEAR]
+def _draw_main_axis(painter: ImageDraw.ImageDraw, axis: MainAxis, pose: Tensor, camera: Camera) -> None:
+    pixels, depth = _project(np.linspace(axis.tail, axis.tip, 33), pose, camera)
+    visible = [tuple(place) for place, z in zip(pixels, depth, strict=True) if z > NEAR]
     if len(visible) > 1:
         painter.line(visible, fill="#000000", width=7)
         painter.line(visible, fill=MAIN_AXIS_COLOR, width=4)
     if depth[-1] > NEAR:
-        x, y = pixels[-1] * scale
+        x, y = pixels[-1]
         painter.ellipse((x - 10, y - 10, x + 10, y + 10), outline="#000000", width=7)
         painter.ellipse((x - 9, y - 9, x + 9, y + 9), outline=MAIN_AXIS_COLOR, width=4)
 
 
-def _draw_frame(painter: ImageDraw.ImageDraw, pose: np.ndarray, camera: Camera, scale: float, length: float) -> None:
-    ends = np.concatenate([pose[:3, 3][None], pose[:3, 3] + length * pose[:3, :3].T])
-    pixels, depth = _project(ends, camera)
-    pixels = pixels * scale
+def _draw_frame(painter: ImageDraw.ImageDraw, pose: Tensor, camera: Camera, length: float) -> None:
+    pixels, depth = _project(np.concatenate([ORIGIN, length * np.eye(3)]), pose, camera)
     if depth[0] <= NEAR:
         return
-    start = tuple(pixels[0])
+    x, y = start = tuple(pixels[0])
     for width, colors in ((10, ("#000000",) * 3), (6, AXIS_COLORS)):
         for end, z, color in zip(pixels[1:], depth[1:], colors, strict=True):
             if z > NEAR:
                 painter.line([start, tuple(end)], fill=color, width=width)
-    x, y = start
     painter.ellipse((x - 7, y - 7, x + 7, y + 7), fill="#ffffff", outline="#000000", width=2)
 
 
-def _in_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """[N, 3] points of the world in a camera's frame, OpenCV axes."""
-    pose = camera.world_from_camera.double().numpy()
-    return (points - pose[:3, 3]) @ pose[:3, :3]
-
-
-def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 2] px and [N] depth of points of the world; pixels behind the camera mean nothing."""
-    local = _in_camera(points, camera)
-    z = np.where(local[:, 2] > NEAR, local[:, 2], np.inf)
-    x = camera.fx * local[:, 0] / z + camera.cx
-    y = camera.fy * local[:, 1] / z + camera.cy
-    return np.stack([x, y], axis=1), local[:, 2]
+def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 2] px and [N] depth of points [N, 3] of an instrument at `pose`; pixels behind the camera mean nothing."""
+    world_from_instrument = pose.numpy()
+    world = points @ world_from_instrument[:3, :3].T + world_from_instrument[:3, 3]
+    return project_world(world, camera, nearest=NEAR)

@@ -31,7 +31,7 @@ from neeco.report.ingest_figures import (
     main_axes,
     sample_figures,
 )
-from neeco.report.render import write_page
+from neeco.report.render import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
@@ -56,7 +56,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         result=result,
         capture=capture,
         verdict=give_verdict(result, capture),
-        splits=", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits),
+        splits=split_counts(capture),
         tiles=_tiles(result, capture),
         residuals=_residuals(result),
         clocks=_clocks(result, capture),
@@ -119,10 +119,10 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, MainAxis]) -
     numbers = dict(zip(np.round(result.kept_times, 6).tolist(), result.kept.tolist(), strict=True))
     start = min(frame.state.time for frame in capture.frames)
     samples = []
-    for figure in sample_figures(capture, result.shapes, axes, length):
-        number = numbers.get(round(figure.frame.state.time, 6))
-        place = figure.frame.name if number is None else f"video frame {number}"
-        samples.append((figure.picture, place, f"{figure.frame.state.time - start:.2f}", figure.frame.split))
+    for picture, frame in sample_figures(capture, result.shapes, axes, length):
+        number = numbers.get(round(frame.state.time, 6))
+        place = frame.name if number is None else f"video frame {number}"
+        samples.append((picture, place, f"{frame.state.time - start:.2f}", frame.split))
     return {
         "samples": samples,
         "axis_mm": f"{length:g}",

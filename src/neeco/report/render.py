@@ -11,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import neeco
+from neeco.capture.model import Capture
 from neeco.files import write_text
 
 REPORT_FILE = "report.html"
@@ -31,6 +32,11 @@ def write_page(path: Path, template: str, **data: Any) -> Path:
     made_at = f"{now():%Y-%m-%d %H:%M %Z}"
     write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}) + "\n")
     return path
+
+
+def split_counts(capture: Capture) -> str:
+    """`40 train, 5 test`."""
+    return ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
 
 
 def now() -> datetime:

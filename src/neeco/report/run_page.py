@@ -13,7 +13,7 @@ from neeco.capture.model import Capture
 from neeco.evaluation.difference import FULL_SCALE, PART_COLORS
 from neeco.report.charts import SMALL, Series, line_chart, short
 from neeco.report.figures import file_uri, frame_figures
-from neeco.report.render import REPORT_FILE, write_page
+from neeco.report.render import REPORT_FILE, split_counts, write_page
 from neeco.scene import Drawable
 
 MAX_POINTS = 300  # of a training curve
@@ -187,8 +187,7 @@ def _plain(value: Any) -> str:
 
 
 def _facts(capture: Capture, scene: Drawable, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    splits = ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
-    facts = [("capture", str(capture.root)), ("frames", splits), ("method", scene.method)]
+    facts = [("capture", str(capture.root)), ("frames", split_counts(capture)), ("method", scene.method)]
     if rows:
         last = rows[-1]
         facts.append(("iterations", f"{last['iteration']:,}"))

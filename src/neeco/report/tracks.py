@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.report.charts import draw_dots
+from neeco.report.figures import to_bytes
 from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # view box units
@@ -98,7 +99,7 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
     _draw_line(axes, rays, np.arange(1, len(rays)) % 2 == 0, "accent", 1.0)
     for index, track in enumerate(tracks.instruments.values()):
         _draw_line(axes, place(track), tracks.breaks, LINE_COLORS[index % len(LINE_COLORS)], 1.8)
-    length = _round_length(0.25 * (WIDTH - 2 * MARGIN) / scale)
+    length = round_length(0.25 * (WIDTH - 2 * MARGIN) / scale)
     end = WIDTH - 12
     axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=STAND_INS["ink"], linewidth=2, clip_on=False)
     axes.text(end, HEIGHT - 16, f"{length:g} mm", ha="right")
@@ -120,7 +121,8 @@ def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, w
     axes.plot(line[:, 0], line[:, 1], color=STAND_INS[color], linewidth=width, clip_on=False)
 
 
-def _round_length(wanted: float) -> float:
+def round_length(wanted: float) -> float:
+    """The greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
     power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
     return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
 
@@ -137,7 +139,7 @@ def turning_data(tracks: Tracks) -> dict[str, object]:
         whole = np.where(np.isfinite(units), np.rint(np.nan_to_num(units)), -32768).astype("<i2")
         return base64.b64encode(whole.tobytes()).decode("ascii")
 
-    colors = np.clip(np.rint(tracks.colors[::step] * 255), 0, 255).astype(np.uint8)
+    colors = to_bytes(tracks.colors[::step])
     return {
         "points": packed(tracks.points[::step]),
         "colors": base64.b64encode(colors.tobytes()).decode("ascii"),

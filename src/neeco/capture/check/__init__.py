@@ -1,17 +1,20 @@
-"""Find everything that is wrong with a capture, at once."""
+"""Find everything that is wrong with a capture, at once, and what it holds in a few numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from neeco.capture.check.frames import check_frames
+import numpy as np
+
+from neeco.capture.check.frames import check_frames, check_states
 from neeco.capture.check.geometry import check_geometry
 from neeco.capture.check.images import check_images
-from neeco.capture.check.states import check_states
-from neeco.capture.check.summary import CaptureSummary, summarize
 from neeco.capture.model import Capture
-from neeco.capture.problems import Problem, ProblemReport, errors_only
+from neeco.capture.parsed import Parsed
+from neeco.capture.problems import Problem, ProblemReport, errors_only, key_name
 from neeco.capture.reader import capture_of, parse_capture
 
 __all__ = [
@@ -23,6 +26,20 @@ __all__ = [
     "inspect_capture",
     "read_checked",
 ]
+
+
+@dataclass(frozen=True)
+class CaptureSummary:
+    """Counts and ranges of what could be read."""
+
+    splits: dict[str, int]  # name -> frames
+    points: int  # measured points
+    registered: bool
+    joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
+    travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -63,3 +80,28 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> Ch
         check_states(parsed, report)
         check_geometry(parsed, report)
     return Checked(report.problems, summarize(parsed), capture)
+
+
+def summarize(parsed: Parsed) -> CaptureSummary:
+    """Count frames and points, and find the range of each joint and each instrument's travel."""
+    joints: dict[str, tuple[float, float]] = {}
+    travel: dict[str, float] = {}
+    for instrument in parsed.instruments:
+        states = [frame.state.instruments.get(instrument.name) for frame in parsed.frames]
+        present = [state for state in states if state is not None]
+        if not present:
+            continue
+        origins = np.stack([state.pose[:3, 3].numpy() for state in present])
+        travel[instrument.name] = round(float(np.linalg.norm(np.ptp(origins, axis=0))), 3)
+        for joint in instrument.joints:
+            values = [state.joints[joint] for state in present if joint in state.joints]
+            if values:
+                joints[f"{instrument.name}.{key_name(joint)}"] = (min(values), max(values))
+    points = parsed.points
+    return CaptureSummary(
+        splits=dict(Counter(frame.split for frame in parsed.frames)),
+        points=len(points.positions) if points is not None and points.measured else 0,
+        registered=parsed.registered,
+        joints=joints,
+        travel_mm=travel,
+    )

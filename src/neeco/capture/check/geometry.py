@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.check.states import states_of
+from neeco.capture.check.frames import states_of
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import ProblemReport, errors_only, shown
@@ -52,23 +52,6 @@ class _Cameras:
         with np.errstate(all="ignore"):
             u, v = project(local, fx, fy, cx, cy, nearest=BEHIND)
             return (local[..., 2] > BEHIND) & (u > 0) & (u < width) & (v > 0) & (v < height)
-
-    def scaled(self, factor: float) -> np.ndarray:
-        return _scaled(self.poses, factor)
-
-
-def _scaled(poses: np.ndarray, factor: float) -> np.ndarray:
-    poses = poses.copy()
-    poses[:, :3, 3] *= factor
-    return poses
-
-
-def _inverted(poses: np.ndarray) -> np.ndarray:
-    """Inverse of rigid transforms [F, 4, 4]."""
-    inverse = poses.copy()
-    inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    inverse[:, :3, 3] = -np.einsum("fji,fj->fi", poses[:, :3, :3], poses[:, :3, 3])
-    return inverse
 
 
 def check_geometry(parsed: Parsed, report: ProblemReport) -> None:
@@ -177,20 +160,26 @@ def _camera_mistake(scene: _Scene, given: float) -> tuple[str, str] | None:
     metres = "give all lengths in mm"
     if np.linalg.norm(opengl[:, :3, 3], axis=1).max() < METRES < 0.1 * scene.spread:
         return "camera positions are in metres", metres
+    inverted = np.linalg.inv(opengl)
+    farther = cameras.poses.copy()
+    farther[:, :3, 3] *= 1000.0
     guesses = {
         ("camera axes are OpenCV's", "flip y and z: transform_matrix has OpenGL axes"): (opengl, points),
         ("matrices are world-to-camera", "invert them: camera-to-world is expected"): (
-            swap_camera_axes(_inverted(opengl)),
+            swap_camera_axes(inverted),
             points,
         ),
-        ("matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"): (
-            _inverted(opengl),
-            points,
-        ),
-        ("camera positions are in metres", metres): (cameras.scaled(1000.0), points),
+        ("matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"): (inverted, points),
+        ("camera positions are in metres", metres): (farther, points),
         ("points are in metres", metres): (cameras.poses, points * 1000.0),
     }
-    shares = {name: float(cameras.sees(moved, poses).mean()) for name, (poses, moved) in guesses.items()}
+    return _likeliest(
+        {name: float(cameras.sees(moved, poses).mean()) for name, (poses, moved) in guesses.items()}, given
+    )
+
+
+def _likeliest(shares: dict[tuple[str, str], float], given: float) -> tuple[str, str] | None:
+    """The mistake that brings the greatest share back into view, if it explains much more than none does."""
     best = max(shares, key=lambda name: shares[name])
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
@@ -305,11 +294,10 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
     origins = poses[:, :3, 3]
     in_camera = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins) + cameras.poses[:, :3, 3]
     flipped = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins * [1, -1, -1]) + cameras.poses[:, :3, 3]
+    inverted = np.linalg.inv(poses)[:, :3, 3]
     in_world = "turn the poses into the cameras' world frame"
     guesses = {
-        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): _inverted(poses)[
-            :, :3, 3
-        ],
+        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): inverted,
         ("its world has y and z flipped (OpenGL axes)", in_world): origins * [1, -1, -1],
         ("its world has y and z swapped (y up)", in_world): origins[:, [0, 2, 1]] * [1, -1, 1],
         ("its world has z and y swapped (z up)", in_world): origins[:, [0, 2, 1]] * [1, 1, -1],
@@ -319,12 +307,10 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> t
     # shrinking puts everything at the world's origin, in view or not: a unit slip must also be far out to begin with
     if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.poses[:, :3, 3], axis=1).max():
         guesses["cameras and points are in metres, its positions in mm", "give all lengths in mm"] = origins / 1000.0
-    shares = {name: float(cameras.sees(moved[:, None])[:, 0].mean()) for name, moved in guesses.items()}
-    best = max(shares, key=lambda name: shares[name])
     # a sensor behind the visible part needs no mistake to be out of view: where that explains things, nothing is wrong
     if _visible_body_point(cameras, poses)[1] > SEEN_SURELY:
         return None
-    return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
+    return _likeliest({name: float(cameras.sees(moved[:, None]).mean()) for name, moved in guesses.items()}, given)
 
 
 def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: ProblemReport) -> None:
