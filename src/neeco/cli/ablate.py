@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
+from neeco.cli._options import Device
 from neeco.cli._tables import fitted
 
 
@@ -39,6 +40,7 @@ class Arguments:
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other field of the training config, as NAME=VALUE (e.g. tissue_budget=4000), in every run; repeatable."""
+    device: Device = "auto"
 
 
 def run(args: Arguments) -> int:
@@ -57,6 +59,7 @@ def run(args: Arguments) -> int:
         args.seed,
         args.transforms,
         args.set,
+        args.device,
     )
     with Bars() as bars:
         ablation = run_ablations(plan, args.workers, bars.job)

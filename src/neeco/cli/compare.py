@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from neeco.cli._options import Device
 from neeco.cli._tables import fitted
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class Compare:
     """A field of every method's training config, as NAME=VALUE (e.g. tissue_budget=5000); repeatable."""
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
+    device: Device = "auto"
 
 
 def run(args: Compare) -> int:
@@ -116,6 +118,7 @@ def _spec(args: Compare) -> ComparisonSpec:
         masks,
         args.transforms,
         args.set,
+        args.device,
     )
 
 

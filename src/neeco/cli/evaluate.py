@@ -11,6 +11,8 @@ import tyro
 from rich.console import Console
 from rich.table import Column, Table
 
+from neeco.cli._options import Device
+
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),
     ("SSIM", "ssim", "{:.3f}"),
@@ -39,6 +41,7 @@ class Evaluate:
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
     json: Path | None = None
     """Also write the numbers to this file."""
+    device: Device = "auto"
 
 
 def run(args: Evaluate) -> int:
@@ -46,14 +49,17 @@ def run(args: Evaluate) -> int:
     from neeco.cli._bars import Bars
     from neeco.errors import NeecoError
     from neeco.evaluation.evaluate import evaluate_run
+    from neeco.evaluation.lpips import find_lpips
     from neeco.files import new_folder, write_json
+    from neeco.raster.devices import device_of
     from neeco.report import write_report
-    from neeco.training.run import load_run
+    from neeco.training.run import open_run
 
     console = Console()
-    trained = load_run(args.run)
-    capture = trained.capture()
+    networks = find_lpips(args.lpips_weights)
     with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
+        trained = checked.enter_context(open_run(args.run, device_of(args.device)))
+        capture = trained.capture()
         checked.enter_context(new_folder(args.run))
         if args.json is not None:
             if args.json.is_dir():
@@ -61,7 +67,7 @@ def run(args: Evaluate) -> int:
             checked.enter_context(new_folder(args.json.parent))
         with Bars() as bars:
             evaluation = evaluate_run(
-                trained, capture, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=bars.stage
+                trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
         page = write_report(args.run, evaluation, capture, trained.scene)
         if args.json is not None:

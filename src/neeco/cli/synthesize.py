@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from neeco.cli._options import Device
 from neeco.synthesis.settings import Format, LabelWay, Settings, Views
 
 
@@ -48,18 +49,20 @@ class Arguments:
     """Refuse images with less than this share of instrument pixels."""
     tries: int = Settings.tries
     """How often to draw a state anew when it is refused."""
+    device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
     from neeco.cli._bars import counting
+    from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
-    from neeco.training.run import load_run
+    from neeco.training.run import open_run
 
     settings = Settings(**{name: getattr(arguments, name) for name in Settings.__dataclass_fields__})
     settings.check()
-    trained = load_run(arguments.run)
-    with trained.scene.torch_threads(), counting("synthesize", arguments.count) as advance:
+    opened = open_run(arguments.run, device_of(arguments.device))
+    with opened as trained, counting("synthesize", arguments.count) as advance:
         try:
             summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
         except KeyboardInterrupt:

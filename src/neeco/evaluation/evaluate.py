@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,7 +16,7 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
 from neeco.evaluation.align import align_frame, moved_by
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips, find_lpips
+from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
 from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, photograph, score
 from neeco.evaluation.truth import load_reference
@@ -52,7 +52,7 @@ class _Context:
 
     scene: Drawable
     capture: Capture
-    networks: dict[str, Lpips]
+    networks: Mapping[str, Lpips]
     coverage: Coverage
 
 
@@ -62,26 +62,26 @@ def evaluate_run(
     splits: Sequence[str] | None = None,
     *,
     align: bool = False,
-    lpips_weights: Path | None = None,
+    networks: Mapping[str, Lpips] = MappingProxyType({}),
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
     "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}. None is
-    "not known", never zero. psnr* in dB. Raises NeecoError for unknown splits, wrong LPIPS folders, unreadable frames.
+    "not known", never zero. psnr* in dB. networks: of `find_lpips`; they keep the threads that torch had when they were
+    found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
+    unreadable frames.
     """
     scene = run.scene
     splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")
-    networks = find_lpips(lpips_weights)  # these keep torch's threads, the rest of the scoring takes fewer
     report = progress or (lambda what, done, total: None)
-    with scene.torch_threads():
-        report("training views", 0, 1)
-        context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
-        report("training views", 1, 1)
-        evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
+    report("training views", 0, 1)
+    context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
+    report("training views", 1, 1)
+    evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -154,7 +154,7 @@ def _add(
     state: State,
     camera: Camera,
     photo: Photograph,
-    networks: dict[str, Lpips],
+    networks: Mapping[str, Lpips],
 ) -> None:
     drawing = draw(scene, state, camera)
     tally.rows.append(row | score(drawing, photo, networks))
@@ -203,7 +203,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 
 
-def _scene_notes(scene: Drawable, networks: dict[str, Lpips]) -> list[str]:
+def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips]) -> list[str]:
     notes = []
     missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
     if missing:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
@@ -20,8 +22,9 @@ from neeco.experiments.jobs import Budget, Job, JobNews, check_folder, check_set
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.running import require_ray, run_jobs
 from neeco.files import new_folder, read_json, write_json
+from neeco.raster.devices import device_of
 from neeco.training.options import training_config
-from neeco.training.run import load_run
+from neeco.training.run import open_run
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
@@ -39,6 +42,7 @@ class AblationPlan:
     seed: int = 0
     transforms: str = "transforms.json"
     settings: tuple[str, ...] = ()
+    device: str = "cpu"  # a word for `device_of`
 
     def steps(self, family: Family) -> int:
         """Iterations of a run of `family`."""
@@ -57,6 +61,7 @@ def run_ablations(
     """
     if workers > 1:
         require_ray()
+    device = device_of(plan.device)
     chosen = chosen_ablations(plan.tables)
     variants = distinct_variants(chosen)
     capture = _open_capture(plan, variants)
@@ -73,7 +78,7 @@ def run_ablations(
     failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
     folders = {job.name: job.folder for job in jobs if job.name in finished}
     families = [family for family in (NEECO_RUNS, KINEMATIC_RUNS) if any(v.family is family for v in variants)]
-    labels, untold = _label_scores(chosen, folders, capture, splits)
+    labels, untold = _label_scores(chosen, folders, capture, splits, device)
     ablation = {
         "schema": SCHEMA,
         "version": __version__,
@@ -134,11 +139,16 @@ def _job(plan: AblationPlan, variant: Variant) -> Job:
     if variant.derived is not None:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
-    return Job(variant.name, plan.seed, capture, plan.output / "runs" / variant.name, config, Budget(None, steps))
+    folder = plan.output / "runs" / variant.name
+    return Job(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
 
 
 def _label_scores(
-    chosen: Sequence[Ablation], folders: dict[str, Path], capture: Capture, splits: tuple[str, ...]
+    chosen: Sequence[Ablation],
+    folders: dict[str, Path],
+    capture: Capture,
+    splits: tuple[str, ...],
+    device: torch.device,
 ) -> tuple[dict[str, LabelScores], list[dict[str, str]]]:
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     entries = [entry for table in chosen for item in table.comparisons for entry in item.entries]
@@ -151,7 +161,8 @@ def _label_scores(
         stored = read_json(file) if file.exists() else None
         if stored is None or stored["splits"] != list(splits):
             try:
-                scored = score_label_ways(load_run(folders[name]), capture, splits)
+                with open_run(folders[name], device) as run:
+                    scored = score_label_ways(run, capture, splits)
             except NeecoError as error:
                 failures.append({"run": name, "error": f"label ways: {error}"})
                 continue

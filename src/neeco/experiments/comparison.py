@@ -32,6 +32,7 @@ from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
 from neeco.experiments.watching import CURVE_FILE, TOTALS
 from neeco.files import new_folder, read_json, write_json
+from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.training.config import TrainConfig
 from neeco.training.options import variant_config
@@ -57,6 +58,7 @@ class ComparisonSpec:
     masks: Mapping[str, Path] = field(default_factory=dict)
     transforms: str = "transforms.json"
     assignments: tuple[str, ...] = ()
+    device: str = "cpu"  # a word for `device_of`
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class ComparisonPlan:
 def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
     spec.budget.check()
+    device_of(spec.device)
     if spec.seeds < 1:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
@@ -169,6 +172,7 @@ def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job
             spec.budget,
             spec.splits,
             spec.lpips_weights,
+            spec.device,
         )
         for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
         for name, config in configs.items()
@@ -274,10 +278,12 @@ def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> 
     """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
     folder = plan.spec.output
     done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
-    runs = [(name, seed, load_run(job_folder(folder, name, seed))) for name, seed in done]
+    runs = [(name, seed, job_folder(folder, name, seed)) for name, seed in done]
     if runs:
         told = splits_with_truth(plan.capture, plan.splits)
-        scored = score_runs(runs, folder, plan.capture, told, partial(report, "scoring masks"))
+        device = device_of(plan.spec.device)
+        scored = score_runs(runs, folder, plan.capture, told, device, partial(report, "scoring masks"))
         result["masks"] = [*plan.given_masks, *scored]
-        result["speed"] = measure_speed(runs, plan.capture, partial(report, "measuring speed"))
+        opened = [(name, seed, load_run(path)) for name, seed, path in runs]
+        result["speed"] = measure_speed(opened, plan.capture, partial(report, "measuring speed"))
     result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])

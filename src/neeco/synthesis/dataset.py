@@ -75,8 +75,9 @@ def synthesize(
 
     Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C) or failing, it keeps and indexes what
     is done, for `resume`; where no image was drawn at all, `output` is left as it was found. `on_progress` is told how
-    many images are done. Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was
-    made with other settings, and when no acceptable state is found.
+    many images are done. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for bad
+    settings, an output that is not empty (without `resume`) or was made with other settings, and when no acceptable
+    state is found.
     """
     settings.check()
     output = Path(output)
