@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from neeco.experiments.ablation_run import AblationPlan, chosen_ablations, disti
 from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
 from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, Derived
 from neeco.experiments.derived import derive_capture
+from neeco.report.ablation_page import write_ablation_report
 from neeco.training import train as train_module
 from neeco.training.run import read_config
 
@@ -84,6 +86,20 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
     assert (off["values"], off["agrees"]) == ({}, {"psnr.test": None})
     assert on["values"]["psnr.test"] > 5
     assert "| off | worse | - | - |" in markdown(ablation["tables"][1])
+
+
+def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
+    plan: AblationPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_module, "ROW_INTERVAL", 50)
+    ablation = run_ablations(replace(plan, tables=("uniform-motion",)))
+    assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
+    assert ablation["failures"] == []
+    assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation["notes"])
+    for row in ablation["tables"][0]["rows"]:
+        assert row["values"]["phase_1_psnr"] is None
+        assert row["values"]["psnr.test"] > 5
+    assert write_ablation_report(plan.output, ablation).is_file()
 
 
 def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:

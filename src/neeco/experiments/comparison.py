@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -30,7 +29,7 @@ from neeco.experiments.masks import check_masks, score_folder, score_runs, split
 from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
-from neeco.experiments.watching import CURVE_FILE, TOTALS
+from neeco.experiments.watching import CURVE_FILE, TOTALS, read_rows
 from neeco.files import new_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
@@ -251,9 +250,7 @@ def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[
     """Held-out PSNR of every finished job at about ten moments; seconds on the budget's clock."""
     rows = []
     for job in (job for job in results if "error" not in job):
-        path = job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE
-        for line in path.read_text(encoding="utf-8").splitlines():
-            entry = json.loads(line)
+        for entry in read_rows(job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE):
             row = {"name": job["name"], "seed": job["seed"], "seconds": entry[TOTALS[spec.budget.clock]]}
             rows.append(row | {key: entry[key] for key in ("iteration", "split", "psnr")})
     return rows
