@@ -16,10 +16,11 @@ from neeco.errors import NeecoError
 from neeco.evaluation.truth import load_reference
 from neeco.experiments import ablation_run, jobs
 from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
-from neeco.experiments.ablation_run import AblationPlan, chosen_ablations, distinct_variants, run_ablations
+from neeco.experiments.ablation_run import chosen_ablations, distinct_variants, run_ablations
 from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
 from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, Derived
 from neeco.experiments.derived import derive_capture
+from neeco.experiments.plans import AblationPlan
 from neeco.report.ablation_page import write_ablation_report
 from neeco.training import train as train_module
 from neeco.training.run import read_config
@@ -35,7 +36,9 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
     monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
-    return AblationPlan(capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL)
+    return AblationPlan(
+        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL, device="cpu"
+    )
 
 
 def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
@@ -109,7 +112,7 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         asked.append(run.path.name)
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
-    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL)
+    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
     monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
     monkeypatch.setattr(ablation_run, "score_label_ways", score)

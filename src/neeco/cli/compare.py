@@ -8,16 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from neeco.cli._options import Device
 from neeco.cli._tables import fitted
+from neeco.settings import Device
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
     from neeco.experiments.jobs import Budget
-    from neeco.experiments.tables import Table as ResultTable
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def run(args: Compare) -> int:
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
     for table in tables_of(comparison):
-        for part in fitting(table, console.width):
+        for part in fitted(table, console.width):
             console.print(part)
     for note in absent_notes(comparison):
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
@@ -140,13 +137,3 @@ def _budget(args: Compare) -> Budget:
     if args.processor_minutes is not None:
         return Budget(args.processor_minutes, None, "processor")
     return Budget(args.minutes, args.iterations)
-
-
-def fitting(table: ResultTable, width: int) -> list[Table]:
-    """A table of the comparison for a terminal of `width` characters; the best of a column is bold."""
-    headings = [*table.keys, *(column.title for column in table.columns)]
-    rows = []
-    for row in table.rows:
-        cells = [Text(str(cell), "bold" if cell.best else "") for cell in row.cells]
-        rows.append([*map(Text, row.keys), *(cells if row.failed is None else [Text("failed", "red")])])
-    return fitted(table.title, headings, rows, len(table.keys), width)

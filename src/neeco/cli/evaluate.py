@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Column, Table
 
-from neeco.cli._options import Device
+from neeco.settings import Device
 
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from neeco.cli._options import Device
+from neeco.settings import Device
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from neeco.cli._options import Device
+from neeco.settings import Device
 
 
 @dataclass(frozen=True)

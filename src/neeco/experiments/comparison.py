@@ -57,7 +57,7 @@ class ComparisonSpec:
     masks: Mapping[str, Path] = field(default_factory=dict)
     transforms: str = "transforms.json"
     assignments: tuple[str, ...] = ()
-    device: str = "cpu"  # a word for `device_of`
+    device: str = "auto"  # a word for `device_of`
 
 
 @dataclass(frozen=True)

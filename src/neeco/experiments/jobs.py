@@ -83,7 +83,7 @@ class Job:
     budget: Budget
     splits: tuple[str, ...] | None = None
     lpips_weights: Path | None = None
-    device: str = "cpu"  # a word for `device_of`, opened where the job runs
+    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
     def title(self) -> str:
