@@ -15,7 +15,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.truth import REFERENCE_FOLDER, load_reference
+from neeco.evaluation.truth import load_reference, truth_file
 from neeco.files import write_json
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import Labeller, draw, draw_layers
@@ -31,12 +31,9 @@ LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and sp
 
 def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:
     """Those of `splits` in which at least one frame has a true or reference mask."""
-    places = (capture.root / "truth" / "masks", capture.root / REFERENCE_FOLDER)
-
-    def told(split: str) -> bool:
-        return any((place / f"{frame.name}.png").is_file() for frame in capture.split(split) for place in places)
-
-    return tuple(split for split in splits if told(split))
+    return tuple(
+        split for split in splits if any(truth_file(capture.root, frame.name) for frame in capture.split(split))
+    )
 
 
 def check_masks(masks: Mapping[str, Path], capture: Capture, splits: Sequence[str], taken: Sequence[str]) -> None:
