@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,7 +46,7 @@ class Evaluate:
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
     from neeco.cli._bars import Bars
-    from neeco.errors import NeecoError
+    from neeco.cli._json import ready_for_json
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.evaluation.lpips import find_lpips
     from neeco.files import new_folder, write_json
@@ -57,15 +56,9 @@ def run(args: Evaluate) -> int:
 
     console = Console()
     networks = find_lpips(args.lpips_weights)
-    with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
-        trained = checked.enter_context(open_run(args.run, device_of(args.device)))
+    with open_run(args.run, device_of(args.device)) as trained:
         capture = trained.capture()
-        checked.enter_context(new_folder(args.run))
-        if args.json is not None:
-            if args.json.is_dir():
-                raise NeecoError(f"--json: {args.json} is a folder; name a file")
-            checked.enter_context(new_folder(args.json.parent))
-        with Bars() as bars:
+        with new_folder(args.run), ready_for_json(args.json), Bars() as bars:
             evaluation = evaluate_run(
                 trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
