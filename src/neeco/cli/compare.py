@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -103,20 +103,10 @@ def _spec(args: Compare) -> ComparisonSpec:
         if name in masks:
             raise NeecoError(f"--masks: {name!r} is given twice; name each folder differently")
         masks[name] = Path(folder)
-    return ComparisonSpec(
-        args.capture,
-        args.output,
-        tuple(dict.fromkeys(args.methods)),
-        _budget(args),
-        args.seeds,
-        args.splits,
-        args.lpips_weights,
-        args.workers,
-        masks,
-        args.transforms,
-        args.set,
-        args.device,
-    )
+    told = {field.name for field in fields(args)} & {field.name for field in fields(ComparisonSpec)}
+    given = {name: getattr(args, name) for name in told}
+    given |= {"methods": tuple(dict.fromkeys(args.methods)), "masks": masks, "assignments": args.set}
+    return ComparisonSpec(**given, budget=_budget(args))
 
 
 def _budget(args: Compare) -> Budget:

@@ -18,7 +18,7 @@ from neeco.evaluation.align import align_frame, moved_by
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
-from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, photograph, score
+from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.composited import LABEL_THRESHOLD
@@ -43,7 +43,6 @@ class _Split:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     parts: PartTally = field(default_factory=PartTally)
-    frames_with_parts: int = 0
 
 
 @dataclass(frozen=True)
@@ -144,23 +143,10 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) ->
         if kind == "aligned":
             state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
             row |= _fit_of(frame, state, camera)
-        _add(tally, row, scene, state, camera, photo, context.networks)
-
-
-def _add(
-    tally: _Split,
-    row: dict[str, Any],
-    scene: Drawable,
-    state: State,
-    camera: Camera,
-    photo: Photograph,
-    networks: Mapping[str, Lpips],
-) -> None:
-    drawing = draw(scene, state, camera)
-    tally.rows.append(row | score(drawing, photo, networks))
-    if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
-        tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
-        tally.frames_with_parts += 1
+        drawing = draw(scene, state, camera)
+        tally.rows.append(row | score(drawing, photo, context.networks))
+        if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
+            tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
 
 
 def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
@@ -181,7 +167,7 @@ def _summary(scene: Drawable, tally: _Split) -> tuple[dict[str, Any], str | None
     known |= {"jaws"} & {"jaws" for part in known if part in ("jaw_left", "jaw_right")}
     parts: dict[str, float | None] = dict.fromkeys(PART_SCORES)
     assignment = None
-    if tally.frames_with_parts:
+    if tally.parts:
         means, assignment = tally.parts.result()
         parts |= {part: value for part, value in means.items() if part in known}
     numbers["part_iou"] = parts
