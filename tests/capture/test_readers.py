@@ -18,8 +18,8 @@ from neeco.capture.images import read_image, read_labels, read_mask, write_image
 from neeco.capture.model import Frame, State
 from neeco.capture.points import read_ply
 from neeco.capture.reader import stand_in_points
-from neeco.capture.truth import load_truth_mask
 from neeco.errors import NeecoError
+from neeco.evaluation.truth import load_reference
 from neeco.raster import Camera
 
 ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")
@@ -62,10 +62,12 @@ def test_the_sample_round_trips_and_has_truth(tmp_path):
     capture = read_capture(SAMPLE)
     write_capture(capture, tmp_path / "copy")
     assert_same(capture, read_capture(tmp_path / "copy"))
-    labels = load_truth_mask(capture, capture.frames[0])
+    reference = load_reference(capture, capture.frames[0])
+    assert reference is not None
+    labels = reference.parts
     assert labels.shape == (192, 240)
     assert set(labels.unique().tolist()) <= {0, 1, 2, 3, 4}
-    assert load_truth_mask(read_capture(tmp_path / "copy"), capture.frames[0]) is None
+    assert load_reference(read_capture(tmp_path / "copy"), capture.frames[0]) is None
 
 
 def test_exact_poses_of_the_truth_folder_are_read_as_another_transforms_file():

@@ -6,16 +6,18 @@ import io
 
 import pytest
 from rich.console import Console
-from rich.text import Text
 
 from neeco.cli._tables import fitted
+from neeco.experiments.tables import Cell, Column, Row, Table
 
 
 @pytest.mark.parametrize("width", [22, 60])
 def test_a_failed_row_is_whole_in_every_piece_however_narrow_its_columns(width: int) -> None:
-    rows = [[Text(text) for text in ("a", "12.00", "3", "4")], [Text("lost"), Text("failed")]]
+    numbers = tuple(map(Cell, ("12.00", "3", "4")))
+    rows = Row(("a",), numbers), Row(("lost",), (Cell("-"),) * 3, failed="its loss became nan")
+    table = Table("t", ("method",), tuple(Column(title, title) for title in ("PSNR", "n", "m")), rows)
     console = Console(width=width, record=True, file=io.StringIO())
-    pieces = fitted("t", ["method", "PSNR", "n", "m"], rows, 1, width)
+    pieces = fitted(table, width)
     for piece in pieces:
         console.print(piece)
     shown = console.export_text()

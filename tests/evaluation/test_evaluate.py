@@ -144,10 +144,12 @@ def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_p
     torch.set_num_threads(3)
     try:
         network = lpips.Lpips((lpips.Convolution(1, 1, 0, None, True),), one_by_one_filter())
-        monkeypatch.setattr(evaluate, "find_lpips", lambda folder: {"alexnet": network})
+        monkeypatch.setattr(lpips, "find_lpips", lambda folder: {"alexnet": network})
         monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
         monkeypatch.setattr(lpips, "conv2d", noting("lpips", lpips.conv2d))
-        evaluated(make_run(world, tmp_path), ["test"])
+        run = make_run(world, tmp_path)
+        monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
+        assert main(["evaluate", str(run.path), "--splits", "test"]) == 0
         assert (seen, torch.get_num_threads()) == ({"draw": 1, "lpips": 3}, 3)
     finally:
         torch.set_num_threads(before)
@@ -166,7 +168,7 @@ def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_pa
     run = make_run(world, tmp_path / "run")
     (tmp_path / "taken").write_text("a file, not a folder")
     (tmp_path / "folder").mkdir()
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
     monkeypatch.setattr("neeco.evaluation.evaluate.evaluate_run", lambda *_, **__: pytest.fail("scored"))
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / place)]) == 1
     told = capsys.readouterr()
@@ -176,7 +178,7 @@ def test_numbers_that_could_not_be_written_are_told_before_scoring(world, tmp_pa
 
 def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     run = make_run(world, tmp_path / "run")
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
     assert "photographs it never saw. " in (run.path / "report.html").read_text()

@@ -35,6 +35,6 @@ def make_job(capture: Path, tmp_path: Path):
         folder = changes.pop("folder", tmp_path / "runs" / f"{name}-seed{seed}")
         config = changes.pop("config", training_config("3dgs", {}))
         budget = changes.pop("budget", Budget(None, 12))
-        return Job(name, seed, capture, folder, config, budget, **changes)
+        return Job(name, seed, capture, folder, config, budget, device="cpu", **changes)
 
     return make

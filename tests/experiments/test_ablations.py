@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,12 @@ from neeco.errors import NeecoError
 from neeco.evaluation.truth import load_reference
 from neeco.experiments import ablation_run, jobs
 from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
-from neeco.experiments.ablation_run import AblationPlan, chosen_ablations, distinct_variants, run_ablations
+from neeco.experiments.ablation_run import chosen_ablations, distinct_variants, run_ablations
 from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
 from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, Derived
 from neeco.experiments.derived import derive_capture
+from neeco.experiments.plans import AblationPlan
+from neeco.report.ablation_page import write_ablation_report
 from neeco.training import train as train_module
 from neeco.training.run import read_config
 
@@ -33,7 +36,9 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
     monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
-    return AblationPlan(capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL)
+    return AblationPlan(
+        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL, device="cpu"
+    )
 
 
 def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
@@ -86,6 +91,20 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
     assert "| off | worse | - | - |" in markdown(ablation["tables"][1])
 
 
+def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
+    plan: AblationPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_module, "ROW_INTERVAL", 50)
+    ablation = run_ablations(replace(plan, tables=("uniform-motion",)))
+    assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
+    assert ablation["failures"] == []
+    assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation["notes"])
+    for row in ablation["tables"][0]["rows"]:
+        assert row["values"]["phase_1_psnr"] is None
+        assert row["values"]["psnr.test"] > 5
+    assert write_ablation_report(plan.output, ablation).is_file()
+
+
 def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
@@ -93,7 +112,7 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         asked.append(run.path.name)
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
-    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL)
+    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
     monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
     monkeypatch.setattr(ablation_run, "score_label_ways", score)

@@ -33,7 +33,7 @@ TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb", "speed", "mach
 
 @pytest.fixture
 def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
-    return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2)
+    return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2, device="cpu")
 
 
 def compared(spec: ComparisonSpec, **told):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from neeco.cli.compare import fitting
+from neeco.cli._tables import fitted
 from neeco.experiments.comparison_tables import latex_text, markdown_text, summary_csv, tables_of
 from neeco.experiments.summary import RUN_METRICS, SPLIT_METRICS, spread, summarise
 from neeco.experiments.tables import latex_escape
@@ -100,7 +100,7 @@ def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
 def test_the_terminal_shows_every_number_whole(comparison: dict[str, Any], width: int) -> None:
     console = Console(width=width, record=True, file=io.StringIO())
     tables = tables_of(comparison)
-    parts = [part for table in tables for part in fitting(table, width)]
+    parts = [part for table in tables for part in fitted(table, width)]
     for part in parts:
         console.print(part)
     shown = console.export_text()

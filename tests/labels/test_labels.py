@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from neeco.errors import NeecoError
-from neeco.labels.annotation import annotate, project, visibility
+from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
@@ -79,7 +79,9 @@ def test_projection_agrees_with_the_pinhole_formula_from_a_moved_camera():
     world_from_camera = torch.eye(4, dtype=torch.float64)
     world_from_camera[:3, 3] = torch.tensor([10.0, 0, -50])
     camera = Camera(world_from_camera, 60, 50, 32, 24, 64, 48)
-    assert project(np.array([20.0, 5.0, 50.0]), camera) == pytest.approx((32 + 60 * 0.1, 24 + 50 * 0.05, 100))
+    assert place_in_image(np.array([20.0, 5.0, 50.0]), camera) == pytest.approx((32 + 60 * 0.1, 24 + 50 * 0.05, 100))
+    assert place_in_image(np.array([20.0, 5.0, -50.5]), camera) is None  # behind it
+    assert place_in_image(np.array([80.0, 5.0, 50.0]), camera) is None  # beside what it shows
 
 
 def test_the_pose_is_given_in_the_camera_frame(scene, state, camera):

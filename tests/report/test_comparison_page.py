@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
+from contextlib import nullcontext
 from itertools import pairwise
 
 import pytest
@@ -25,10 +26,10 @@ FIGURES = ("summary.csv", "jobs.csv", "frames.csv", "curves.csv", "distance.csv"
 def capture(world, tmp_path, monkeypatch):
     scenes = {"kinematic": world.TinyScene(), "3dgs": world.TinyScene(labelled=False)}
 
-    def load_run(folder):
-        return world.TinyRun(folder, scenes[folder.name.split("-seed")[0]], None)
+    def open_run(folder):
+        return nullcontext(world.TinyRun(folder, scenes[folder.name.split("-seed")[0]], None))
 
-    monkeypatch.setattr(comparison_shots, "load_run", load_run)
+    monkeypatch.setattr(comparison_shots, "open_run", open_run)
     splits = ("train", "test", "test", "test", "unseen")
     return world.make_capture(tmp_path / "capture <b>", world.TinyScene(), splits)
 
@@ -243,7 +244,8 @@ def test_names_at_the_ends_of_lines_do_not_cover_one_another():
 
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, noon, monkeypatch):
     capture = world.make_capture(tmp_path / HOSTILE, world.TinyScene(), ("train", "test", "unseen"))
-    monkeypatch.setattr(comparison_shots, "load_run", lambda folder: world.TinyRun(folder, world.TinyScene(), None))
+    opened = nullcontext(world.TinyRun(tmp_path, world.TinyScene(), None))
+    monkeypatch.setattr(comparison_shots, "open_run", lambda folder: opened)
     jobs = [job(f"{HOSTILE}{k}", seed, 24.0 + k, 0.8) for k in (0, 1) for seed in (0, 1)]
     comparison = comparison_of(capture, [*jobs, {**FAILED, "name": HOSTILE, "error": HOSTILE}])
     comparison |= {"notes": [HOSTILE], "settings": [HOSTILE], "version": HOSTILE}

@@ -77,7 +77,7 @@ def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tm
 
 
 def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("neeco.training.run.load_run", lambda path: run)
+    monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
     real, left = dataset.make_sample, iter(range(2))
 
     def stopped(*arguments):

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -10,7 +11,17 @@ from neeco.capture.model import Instrument
 from neeco.capture.statefile import read_states, state_to_json
 from neeco.errors import NeecoError
 from neeco.synthesis.samplers import instrument_axes, make_sampler
-from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, JointRange, interpolate_pose
+from neeco.synthesis.states import (
+    AlongPath,
+    Beyond,
+    Grid,
+    Inside,
+    JointRange,
+    interpolate_pose,
+    rigid,
+    turn_about,
+    with_poses,
+)
 from neeco.synthesis.views import OrbitViews, PerturbedViews, RecordedViews
 
 
@@ -172,3 +183,20 @@ def test_perturbed_views_stay_near_recorded_ones(camera):
 def test_a_folder_is_no_file_of_states(scene, states):
     with pytest.raises(NeecoError, match=f"--states: '{states}' is neither inside, beyond"):
         make_sampler(scene, states, 0.2, "recorded", 1)
+
+
+def test_a_turn_about_a_point_leaves_it_where_it_is_and_turns_the_rest():
+    point, quarter = np.array([5.0, -2.0, 60.0]), np.array([0.0, 0.0, np.pi / 2])
+    turn = turn_about(point, quarter)
+    assert turn @ np.append(point, 1) == pytest.approx(np.append(point, 1))
+    beside, above = np.array([1.0, 0.0, 3.0]), np.array([0.0, 1.0, 3.0])
+    assert turn @ np.append(point + beside, 1) == pytest.approx(np.append(point + above, 1))
+
+
+def test_poses_are_moved_one_by_one_and_joints_and_time_are_kept(state):
+    posed = state()
+    shifted = with_poses(posed, lambda name, pose: rigid(np.eye(3), pose[:3, 3] + 1))
+    for name, item in posed.instruments.items():
+        assert torch.equal(shifted.instruments[name].pose[:3, 3], item.pose[:3, 3].double() + 1)
+        assert shifted.instruments[name].joints == item.joints
+    assert shifted.time == posed.time

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 if TYPE_CHECKING:
     from neeco.experiments.jobs import JobNews
+    from neeco.training.train import ProgressRow
 
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
@@ -41,6 +42,21 @@ class Bars:
     def stage(self, what: str, done: int, total: int | None) -> None:
         """How many of `what` are done."""
         self.bar.update(self._task(what), completed=done, total=total, text=f"{done}/{total}")
+
+    def training(self, row: ProgressRow) -> None:
+        """What `train` tells."""
+        task = self._task("training")
+        if row.note:
+            self.bar.console.print(row.note, style="dim", highlight=False)
+            return
+        size = f"  {row.num_gaussians} Gaussians  phase {row.phase}" if row.num_gaussians else ""
+        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{size}"
+        self.bar.update(task, completed=row.progress, text=text)
+
+    def end(self, title: str) -> None:
+        """What was counted under `title` is done, if anything was told of it."""
+        if title in self.tasks:
+            self.bar.update(self.tasks[title], completed=1.0)
 
     def job(self, news: JobNews) -> None:
         """What `run_jobs` tells."""

@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.table import Column, Table
 from rich.text import Text
 
+if TYPE_CHECKING:
+    from neeco.experiments.tables import Table as ResultTable
+
 BORDER = 3  # what a column takes beside its text
 
 
-def fitted(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
-    """A table in as many pieces as a terminal of `width` characters needs; the first `keys` columns stand in each.
+def fitted(table: ResultTable, width: int) -> list[Table]:
+    """A table in as many pieces as a terminal of `width` characters needs; the keys' columns stand in each.
 
-    A row of one cell behind its keys says the same in every piece.
+    Bold are the best of a column, and a row that others are measured against; a row that failed says so in every piece.
     """
+    headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
+    rows = []
+    for row in table.rows:
+        cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
+        told = cells if row.failed is None else [Text("failed", "red")]
+        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *told])
+    return _pieces(table.title, headings, rows, keys, width)
+
+
+def _pieces(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
+    """`fitted` of texts. A row of one cell behind its keys says the same in every piece."""
     full = [[*row[:keys], *[row[keys]] * (len(headings) - keys)] if len(row) == keys + 1 else row for row in rows]
     widths = [
         max([*map(len, heading.split()), *(len(row[index]) for row in full)], default=0)

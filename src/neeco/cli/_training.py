@@ -1,15 +1,14 @@
-"""The progress bar that `train` and `demo` share."""
+"""Training with the progress bar that `train` and `demo` share."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from neeco.cli._bars import Bars
 from neeco.training.config import TrainConfig
-from neeco.training.train import ProgressRow, train
+from neeco.training.train import train
 
 
 def train_with_progress(
@@ -19,30 +18,7 @@ def train_with_progress(
 
     Nothing is printed before training has news, so that bad input ends in its one line alone.
     """
-    columns = [
-        TextColumn("training"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    ]
-    bar = Progress(*columns, console=Console(stderr=True))
-    task = bar.add_task("starting", total=1.0)
-
-    def show(row: ProgressRow) -> None:
-        bar.start()
-        if row.note:
-            bar.console.print(row.note, style="dim", highlight=False)
-            return
-        size = f"  {row.num_gaussians} Gaussians  phase {row.phase}" if row.num_gaussians else ""
-        text = f"iteration {row.iteration}  PSNR {row.psnr:.1f} dB{size}"
-        bar.update(task, completed=row.progress, description=text)
-
-    try:
-        path = train(capture, output, config, device=device, resume=resume, progress=show)
-        bar.update(task, completed=1.0)
-        return path
-    finally:
-        if bar.live.is_started:
-            bar.stop()
+    with Bars() as bars:
+        path = train(capture, output, config, device=device, resume=resume, progress=bars.training)
+        bars.end("training")
+    return path

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from neeco.cli._tables import fitted
+from neeco.settings import Device
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
     from neeco.experiments.jobs import Budget
-    from neeco.experiments.tables import Table as ResultTable
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,7 @@ class Compare:
     """A field of every method's training config, as NAME=VALUE (e.g. tissue_budget=5000); repeatable."""
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
+    device: Device = "auto"
 
 
 def run(args: Compare) -> int:
@@ -71,7 +70,7 @@ def run(args: Compare) -> int:
     console = Console()
     console.print(f"{args.capture}: {budget_words(comparison)}", markup=False, highlight=False)
     for table in tables_of(comparison):
-        for part in fitting(table, console.width):
+        for part in fitted(table, console.width):
             console.print(part)
     for note in absent_notes(comparison):
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)
@@ -104,19 +103,10 @@ def _spec(args: Compare) -> ComparisonSpec:
         if name in masks:
             raise NeecoError(f"--masks: {name!r} is given twice; name each folder differently")
         masks[name] = Path(folder)
-    return ComparisonSpec(
-        args.capture,
-        args.output,
-        tuple(dict.fromkeys(args.methods)),
-        _budget(args),
-        args.seeds,
-        args.splits,
-        args.lpips_weights,
-        args.workers,
-        masks,
-        args.transforms,
-        args.set,
-    )
+    told = {field.name for field in fields(args)} & {field.name for field in fields(ComparisonSpec)}
+    given = {name: getattr(args, name) for name in told}
+    given |= {"methods": tuple(dict.fromkeys(args.methods)), "masks": masks, "assignments": args.set}
+    return ComparisonSpec(**given, budget=_budget(args))
 
 
 def _budget(args: Compare) -> Budget:
@@ -137,13 +127,3 @@ def _budget(args: Compare) -> Budget:
     if args.processor_minutes is not None:
         return Budget(args.processor_minutes, None, "processor")
     return Budget(args.minutes, args.iterations)
-
-
-def fitting(table: ResultTable, width: int) -> list[Table]:
-    """A table of the comparison for a terminal of `width` characters; the best of a column is bold."""
-    headings = [*table.keys, *(column.title for column in table.columns)]
-    rows = []
-    for row in table.rows:
-        cells = [Text(str(cell), "bold" if cell.best else "") for cell in row.cells]
-        rows.append([*map(Text, row.keys), *(cells if row.failed is None else [Text("failed", "red")])])
-    return fitted(table.title, headings, rows, len(table.keys), width)

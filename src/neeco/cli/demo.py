@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import torch
+
+    from neeco.evaluation.lpips import Lpips
     from neeco.training.run import Run
 
 SAMPLE = "liver-mini"
@@ -27,6 +30,9 @@ class Arguments:
 def run(args: Arguments) -> int:
     """Do it all and say where everything lies."""
     from neeco.errors import NeecoError
+    from neeco.evaluation.lpips import find_lpips
+    from neeco.raster.devices import device_of
+    from neeco.training.run import open_run
 
     if not args.minutes > 0:
         raise NeecoError(f"--minutes: {args.minutes} is no time to train; give more than 0")
@@ -36,16 +42,19 @@ def run(args: Arguments) -> int:
     capture, dataset = sample_capture(), args.output / "dataset"
     try:
         _check(capture)
-        trained = _train(capture, args.output / "run", args.minutes)
-        _synthesize(trained, dataset)
-        report = _evaluate(trained, dataset)
+        device = device_of("auto")
+        run_path = _train(capture, args.output / "run", args.minutes, device)
+        networks = find_lpips()
+        with open_run(run_path, device) as trained:
+            _synthesize(trained, dataset)
+            report = _evaluate(trained, dataset, networks)
     except KeyboardInterrupt:
         before = f"remove {args.output} and " if args.output.exists() else ""
         raise KeyboardInterrupt(f"{before}run the same command again") from None
     print(f"\nDone in {time.monotonic() - start:.0f} s.")
     for what, path in (
         ("capture", capture),
-        ("learned scene", trained.path),
+        ("learned scene", run_path),
         ("labelled data set", dataset),
         ("its preview", dataset / "preview.png"),
         ("report, open it in a browser", report),
@@ -81,17 +90,15 @@ def _check(path: Path) -> None:
         raise NeecoError(f"{path}: {len(errors)} problems in the sample capture; install neeco again")
 
 
-def _train(capture: Path, output: Path, minutes: float) -> Run:
+def _train(capture: Path, output: Path, minutes: float, device: torch.device) -> Path:
     from dataclasses import replace
 
     from neeco.cli._training import train_with_progress
-    from neeco.raster.devices import device_of
     from neeco.training.config import method_defaults
-    from neeco.training.run import load_run
 
     print(f"2/4 train for {minutes:g} minutes")
     config = replace(method_defaults("kinematic"), minutes=minutes)
-    return load_run(train_with_progress(capture, output, config, device_of("auto")))
+    return train_with_progress(capture, output, config, device)
 
 
 def _synthesize(trained: Run, output: Path) -> None:
@@ -100,17 +107,17 @@ def _synthesize(trained: Run, output: Path) -> None:
     from neeco.synthesis.settings import Settings
 
     print(f"3/4 synthesize {IMAGES} labelled images of states that were not recorded")
-    with trained.scene.torch_threads(), counting("synthesize", IMAGES) as advance:
+    with counting("synthesize", IMAGES) as advance:
         synthesize(trained, output, Settings(count=IMAGES), ("coco", "yolo"), False, advance)
 
 
-def _evaluate(trained: Run, dataset: Path) -> Path:
+def _evaluate(trained: Run, dataset: Path, networks: dict[str, Lpips]) -> Path:
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.report import write_report
 
     print("4/4 evaluate on frames kept from training")
     capture = trained.capture()
-    evaluation = evaluate_run(trained, capture)
+    evaluation = evaluate_run(trained, capture, networks=networks)
     for split, numbers in evaluation["given"].items():
         iou = "" if numbers["mask_iou"] is None else f", mask IoU {numbers['mask_iou']:.3f}"
         print(f"  {split}: PSNR {numbers['psnr']:.2f} dB{iou}")

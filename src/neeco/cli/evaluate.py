@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +9,8 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 from rich.table import Column, Table
+
+from neeco.settings import Device
 
 COLUMNS = (
     ("PSNR", "psnr", "{:.2f}"),
@@ -39,29 +40,27 @@ class Evaluate:
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
     json: Path | None = None
     """Also write the numbers to this file."""
+    device: Device = "auto"
 
 
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
     from neeco.cli._bars import Bars
-    from neeco.errors import NeecoError
+    from neeco.cli._json import ready_for_json
     from neeco.evaluation.evaluate import evaluate_run
+    from neeco.evaluation.lpips import find_lpips
     from neeco.files import new_folder, write_json
+    from neeco.raster.devices import device_of
     from neeco.report import write_report
-    from neeco.training.run import load_run
+    from neeco.training.run import open_run
 
     console = Console()
-    trained = load_run(args.run)
-    capture = trained.capture()
-    with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
-        checked.enter_context(new_folder(args.run))
-        if args.json is not None:
-            if args.json.is_dir():
-                raise NeecoError(f"--json: {args.json} is a folder; name a file")
-            checked.enter_context(new_folder(args.json.parent))
-        with Bars() as bars:
+    networks = find_lpips(args.lpips_weights)
+    with open_run(args.run, device_of(args.device)) as trained:
+        capture = trained.capture()
+        with new_folder(args.run), ready_for_json(args.json), Bars() as bars:
             evaluation = evaluate_run(
-                trained, capture, args.splits, align=args.align, lpips_weights=args.lpips_weights, progress=bars.stage
+                trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
         page = write_report(args.run, evaluation, capture, trained.scene)
         if args.json is not None:

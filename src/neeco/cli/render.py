@@ -7,6 +7,8 @@ from pathlib import Path
 
 import tyro
 
+from neeco.settings import Device
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -22,21 +24,23 @@ class Arguments:
     """Which frames."""
     states: Path | None = None
     """Draw these states (JSON lines) instead of a split."""
+    device: Device = "auto"
 
 
 def run(arguments: Arguments) -> int:
     """Draw, and say where it lies."""
     from neeco.cli._bars import counting
+    from neeco.raster.devices import device_of
     from neeco.synthesis.render import STATES_FOLDER, render, split_views, state_views
-    from neeco.training.run import load_run
+    from neeco.training.run import open_run
 
-    trained = load_run(arguments.run)
-    if arguments.states is not None:
-        views, folder = state_views(trained.scene, arguments.states), arguments.output / STATES_FOLDER
-    else:
-        views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
-    with counting("render", len(views)) as advance:
-        rendered = render(trained.scene, views, folder, advance)
+    with open_run(arguments.run, device_of(arguments.device)) as trained:
+        if arguments.states is not None:
+            views, folder = state_views(trained.scene, arguments.states), arguments.output / STATES_FOLDER
+        else:
+            views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
+        with counting("render", len(views)) as advance:
+            rendered = render(trained.scene, views, folder, advance)
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")

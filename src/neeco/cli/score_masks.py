@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,17 +42,12 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Score, print a table."""
     from neeco.cli._bars import counting
-    from neeco.errors import NeecoError
+    from neeco.cli._json import ready_for_json
     from neeco.evaluation.mask_folders import parse_classes
     from neeco.evaluation.mask_scores import score_masks
-    from neeco.files import new_folder, write_json
+    from neeco.files import write_json
 
-    with ExitStack() as checked:  # a place that cannot be written to is told before the work, not after
-        if arguments.json is not None:
-            if arguments.json.is_dir():
-                raise NeecoError(f"--json: {arguments.json} is a folder; name a file")
-            checked.enter_context(new_folder(arguments.json.parent))
-        advance = checked.enter_context(counting("score masks"))
+    with ready_for_json(arguments.json), counting("score masks") as advance:
         scores = score_masks(
             arguments.predicted,
             arguments.truth,

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from neeco.settings import Device
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -24,8 +26,7 @@ class Arguments:
     """Optimisation steps; by default as the method has it."""
     minutes: float | None = None
     """Stop in time with a finished run."""
-    device: str = "auto"
-    """cpu, cuda, cuda:N, or auto: a CUDA device where there is one."""
+    device: Device = "auto"
     seed: int = 0
     """The same seed gives the same scene on the same machine (without --minutes)."""
     resume: bool = False

@@ -14,6 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
 from neeco.labels.composited import composited_parts
+from neeco.raster.pinhole import project
 from neeco.raster.types import Camera, Rendering
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ FACTOR = 0.25  # of the image's resolution
 MIN_SIDE = 48  # px; small images are shrunk no further
 TOLERANCE = 0.02  # of the depth
 TOLERANCE_MM = 1.0
+NEAREST_MM = 1e-3  # what lies behind a camera is not seen, wherever it falls
 CHUNK = 16  # views tested at once; most points are found seen in the first chunk
 
 
@@ -57,9 +59,7 @@ class Coverage:
         local = torch.einsum("vij,mj->vmi", pose[:, :3, :3], points) + pose[:, None, :3, 3]  # [V', M, 3]
         depth = local[..., 2]
         fx, fy, cx, cy = self.intrinsics[views].T[..., None]  # each [V', 1]
-        safe = depth.clamp_min(1e-3)
-        column = (local[..., 0] / safe * fx + cx).floor().long()
-        row = (local[..., 1] / safe * fy + cy).floor().long()
+        column, row = (place.floor().long() for place in project(local, fx, fy, cx, cy, nearest=NEAREST_MM))
         width, height = self.sizes[views].T[..., None]
         inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         stride = self.depths.shape[2]

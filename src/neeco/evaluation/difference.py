@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_erosion
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]
 
@@ -16,19 +18,7 @@ PART_COLORS = np.array(
     [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66]],
     np.float64,
 )  # Okabe and Ito: told apart by colour-blind readers
-_GLYPHS = {
-    "0": ("111", "101", "101", "101", "111"),
-    "1": ("010", "110", "010", "010", "111"),
-    "2": ("111", "001", "111", "100", "111"),
-    "3": ("111", "001", "011", "001", "111"),
-    "4": ("101", "101", "111", "001", "001"),
-    "5": ("111", "100", "111", "001", "111"),
-    "6": ("111", "100", "111", "101", "111"),
-    "7": ("111", "001", "010", "010", "010"),
-    "8": ("111", "101", "111", "101", "111"),
-    "9": ("111", "101", "111", "001", "111"),
-    ".": ("0", "0", "0", "0", "1"),
-}
+LEGEND_HEIGHT, LEGEND_FONT = 14, 10  # px
 
 
 def difference_map(
@@ -37,7 +27,7 @@ def difference_map(
     """|image - target| averaged over colours, in a fixed colour map; [H, W, 3] float in [0, 1] both, uint8 out.
 
     Differences of `full_scale` and above take the brightest colour. `legend`: a labelled scale is drawn below the map,
-    which makes the result 14 px taller.
+    which makes the result LEGEND_HEIGHT px taller.
     """
     difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
     colored = _colored(difference / full_scale)
@@ -63,9 +53,7 @@ def overlay_outline(image: Pixels, mask: np.ndarray, color: tuple[int, int, int]
 
 def outline(mask: np.ndarray) -> np.ndarray:
     """bool [H, W]: pixels of the mask with a 4-neighbour outside it; the image's border is no outside."""
-    padded = np.pad(mask, 1, mode="edge")
-    inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    return mask & ~inner
+    return mask & ~binary_erosion(mask, border_value=1)
 
 
 def _colored(fraction: np.ndarray) -> Pixels:
@@ -76,24 +64,13 @@ def _colored(fraction: np.ndarray) -> Pixels:
 
 
 def _legend(width: int, full_scale: float) -> Pixels:
-    """A strip [14, width, 3]: the colour scale with its ends and middle labelled."""
-    strip = np.zeros((14, width, 3), np.uint8)
-    strip[2:6] = _colored(np.linspace(0, 1, width)[None].repeat(4, 0))
-    for place in (0.0, 0.5, 1.0):
-        text = _text(f"{place * full_scale:.3g}")
-        left = round(place * (width - text.shape[1]))
-        area = strip[8:13, left : left + text.shape[1]]
-        area[text[:, : area.shape[1]]] = 255
-    return strip
-
-
-def _text(text: str) -> np.ndarray:
-    """bool [5, w]: digits and points in a 3x5 font."""
-    columns = []
-    for character in text:
-        glyph = np.array([[pixel == "1" for pixel in row] for row in _GLYPHS[character]])
-        columns += [glyph, np.zeros((5, 1), bool)]
-    return np.concatenate(columns[:-1], axis=1)
+    """A strip [LEGEND_HEIGHT, width, 3]: the colour scale with its ends and middle labelled."""
+    strip = Image.new("RGB", (width, LEGEND_HEIGHT))
+    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
+    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(LEGEND_FONT)
+    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
+        pen.text((round(place * width), LEGEND_HEIGHT - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+    return np.asarray(strip)
 
 
 def _to_uint8(pixels: np.ndarray) -> Pixels:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,9 +16,9 @@ from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
 from neeco.evaluation.align import align_frame, moved_by
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips, find_lpips
+from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
-from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, Photograph, photograph, score
+from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.composited import LABEL_THRESHOLD
@@ -43,7 +43,6 @@ class _Split:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     parts: PartTally = field(default_factory=PartTally)
-    frames_with_parts: int = 0
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class _Context:
 
     scene: Drawable
     capture: Capture
-    networks: dict[str, Lpips]
+    networks: Mapping[str, Lpips]
     coverage: Coverage
 
 
@@ -62,26 +61,26 @@ def evaluate_run(
     splits: Sequence[str] | None = None,
     *,
     align: bool = False,
-    lpips_weights: Path | None = None,
+    networks: Mapping[str, Lpips] = MappingProxyType({}),
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
     "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}. None is
-    "not known", never zero. psnr* in dB. Raises NeecoError for unknown splits, wrong LPIPS folders, unreadable frames.
+    "not known", never zero. psnr* in dB. networks: of `find_lpips`; they keep the threads that torch had when they were
+    found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
+    unreadable frames.
     """
     scene = run.scene
     splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")
-    networks = find_lpips(lpips_weights)  # these keep torch's threads, the rest of the scoring takes fewer
     report = progress or (lambda what, done, total: None)
-    with scene.torch_threads():
-        report("training views", 0, 1)
-        context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
-        report("training views", 1, 1)
-        evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
+    report("training views", 0, 1)
+    context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
+    report("training views", 1, 1)
+    evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -144,23 +143,10 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) ->
         if kind == "aligned":
             state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
             row |= _fit_of(frame, state, camera)
-        _add(tally, row, scene, state, camera, photo, context.networks)
-
-
-def _add(
-    tally: _Split,
-    row: dict[str, Any],
-    scene: Drawable,
-    state: State,
-    camera: Camera,
-    photo: Photograph,
-    networks: dict[str, Lpips],
-) -> None:
-    drawing = draw(scene, state, camera)
-    tally.rows.append(row | score(drawing, photo, networks))
-    if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
-        tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
-        tally.frames_with_parts += 1
+        drawing = draw(scene, state, camera)
+        tally.rows.append(row | score(drawing, photo, context.networks))
+        if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
+            tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
 
 
 def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
@@ -181,7 +167,7 @@ def _summary(scene: Drawable, tally: _Split) -> tuple[dict[str, Any], str | None
     known |= {"jaws"} & {"jaws" for part in known if part in ("jaw_left", "jaw_right")}
     parts: dict[str, float | None] = dict.fromkeys(PART_SCORES)
     assignment = None
-    if tally.frames_with_parts:
+    if tally.parts:
         means, assignment = tally.parts.result()
         parts |= {part: value for part, value in means.items() if part in known}
     numbers["part_iou"] = parts
@@ -203,7 +189,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 
 
-def _scene_notes(scene: Drawable, networks: dict[str, Lpips]) -> list[str]:
+def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips]) -> list[str]:
     notes = []
     missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
     if missing:

@@ -10,11 +10,11 @@ import numpy as np
 from PIL import Image
 
 from neeco.capture import read_capture
-from neeco.capture.images import open_image, read_labels, read_mask
+from neeco.capture.images import open_image
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
-from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.evaluation.truth import REFERENCE_FOLDER, read_reference, truth_file
 from neeco.files import read_json
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
@@ -34,13 +34,10 @@ class Masks:
 
     def load(self, name: str) -> np.ndarray:
         """Ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
-        file = self.files[name]
         if name not in self.frames:
-            return read_ids(file)
-        size = self.frames[name].camera.width, self.frames[name].camera.height
-        if file.parent.name == REFERENCE_FOLDER:
-            return read_mask(file, size).numpy().astype(np.uint8)
-        return read_labels(file, size).numpy()
+            return read_ids(self.files[name])
+        known = read_reference(self.files[name], self.frames[name])
+        return (known.mask if known.parts is None else known.parts).numpy().astype(np.uint8)
 
     def counted(self, name: str) -> np.ndarray | None:
         """bool [H, W], False where the image's pixels are to be ignored; None when all count. Raises NeecoError."""
@@ -143,8 +140,7 @@ def _capture_masks(path: Path, frames: Sequence[Frame], classes: Mapping[int, st
     files: dict[str, Path] = {}
     masked: dict[str, Frame] = {}
     for frame in frames:
-        places = path / "truth" / "masks", path / REFERENCE_FOLDER
-        file = next((file for place in places if (file := place / f"{frame.name}.png").is_file()), None)
+        file = truth_file(path, frame.name)
         if file is None:
             continue
         if frame.name in files:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -22,19 +23,22 @@ COCO_THRESHOLDS = tuple(np.linspace(0.5, 0.95, 10).round(2))
 RECALLS = np.linspace(0, 1, 101)
 
 
-def iou(mask: Tensor, truth: Tensor, counted: Tensor | None = None) -> float:
+Pixels = TypeVar("Pixels", Tensor, np.ndarray)
+
+
+def iou(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
     """Intersection over union of bool masks [H, W]; NaN when both are empty. `counted` [H, W]: pixels that count."""
     both, either = _overlap(mask, truth, counted)
     return both / either if either else math.nan
 
 
-def dice(mask: Tensor, truth: Tensor, counted: Tensor | None = None) -> float:
+def dice(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
     """Dice coefficient (F1 of the pixels) of two bool masks [H, W]; NaN when both are empty."""
     both, either = _overlap(mask, truth, counted)
     return 2 * both / (both + either) if either else math.nan
 
 
-def _overlap(mask: Tensor, truth: Tensor, counted: Tensor | None) -> tuple[int, int]:
+def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, int]:
     if counted is not None:
         mask, truth = mask & counted, truth & counted
     return int((mask & truth).sum()), int((mask | truth).sum())
@@ -57,6 +61,10 @@ class PartTally:
     """
 
     frames: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"as named": [], "swapped": []})
+
+    def __bool__(self) -> bool:
+        """Whether it has counted any frame."""
+        return any(self.frames.values())
 
     def add(self, parts: Tensor, truth: Tensor, counted: Tensor | None = None) -> None:
         """Count one frame: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""

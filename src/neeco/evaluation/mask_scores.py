@@ -14,7 +14,7 @@ from neeco import __version__
 from neeco.capture import Capture
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
-from neeco.evaluation.mask_metrics import TRUTH_PARTS, average_precision, boundary_f, boxes_of, mean_of
+from neeco.evaluation.mask_metrics import TRUTH_PARTS, average_precision, boundary_f, boxes_of, dice, iou, mean_of
 
 SCHEMA = "neeco-mask-scores/1"
 SCORES = ("iou", "dice", "boundary_f", "box_ap", "box_ap50")
@@ -175,11 +175,9 @@ def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, co
 
 def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) -> dict[str, float]:
     """IoU, Dice and boundary F; NaN where neither mask has a pixel that counts."""
-    seen, shown = (mask, truth) if counted is None else (mask & counted, truth & counted)
-    both, either = int((seen & shown).sum()), int((seen | shown).sum())
-    if not either:
-        return {"iou": math.nan, "dice": math.nan, "boundary_f": math.nan}
-    return {"iou": both / either, "dice": 2 * both / (both + either), "boundary_f": boundary_f(mask, truth, counted)}
+    overlap = iou(mask, truth, counted)
+    contours = math.nan if math.isnan(overlap) else boundary_f(mask, truth, counted)
+    return {"iou": overlap, "dice": dice(mask, truth, counted), "boundary_f": contours}
 
 
 def _summary(images: Sequence[_Image], regions: Regions, reason: str | None) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -40,7 +41,7 @@ class Photograph:
 
 
 def photograph(
-    frame: Frame, reference: Reference | None, seen: tuple[Tensor, Tensor], networks: dict[str, Lpips]
+    frame: Frame, reference: Reference | None, seen: tuple[Tensor, Tensor], networks: Mapping[str, Lpips]
 ) -> Photograph:
     """Read a frame. `seen`: what `coverage.unseen_tissue` returned for it."""
     image, mask = frame.load_image(), frame.load_mask()
@@ -49,7 +50,7 @@ def photograph(
     return Photograph(image, mask, reference, seen[0], seen[1], features)
 
 
-def score(drawing: Drawing, photo: Photograph, networks: dict[str, Lpips]) -> dict[str, float | None]:
+def score(drawing: Drawing, photo: Photograph, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
     """All numbers of one frame, by the names in SCORES; None where there is nothing to compare with."""
     image, mask = drawing.image, photo.mask
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask

@@ -1,16 +1,20 @@
-"""What a frame's instrument mask is compared with: exact truth of rendered captures, or hand-made reference masks."""
+"""What a frame's instrument mask is compared with: exact truth of rendered captures, or hand-made reference masks.
+
+For evaluation only: nothing that learns may read them.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor
 
-from neeco.capture.images import read_mask
+from neeco.capture.images import read_labels, read_mask
 from neeco.capture.model import Capture, Frame
-from neeco.capture.truth import load_truth_mask
 
 REFERENCE_FOLDER = "reference_masks"
+MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # in which a frame's is looked for, in this order
 
 
 @dataclass(frozen=True)
@@ -21,15 +25,24 @@ class Reference:
     parts: Tensor | None  # [H, W] uint8, the truth's numbers
 
 
+def truth_file(root: Path, name: str) -> Path | None:
+    """The mask that the frame called `name` of the capture in `root` is scored against; None when it has none."""
+    return next((file for folder in MASK_FOLDERS if (file := root / folder / f"{name}.png").is_file()), None)
+
+
 def load_reference(capture: Capture, frame: Frame) -> Reference | None:
     """The mask to score a frame against: `truth/masks/<stem>.png` (parts), else `reference_masks/<stem>.png` (0/255).
 
     None when the capture has neither. Raises NeecoError when the file is damaged or of another size than the frame.
     """
-    parts = load_truth_mask(capture, frame)
-    if parts is not None:
-        return Reference(parts > 0, parts)
-    path = capture.root / REFERENCE_FOLDER / f"{frame.name}.png"
-    if not path.is_file():
-        return None
-    return Reference(read_mask(path, (frame.camera.width, frame.camera.height)), None)
+    file = truth_file(capture.root, frame.name)
+    return None if file is None else read_reference(file, frame)
+
+
+def read_reference(file: Path, frame: Frame) -> Reference:
+    """What `truth_file` found of a frame: part ids (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), or a mask."""
+    size = frame.camera.width, frame.camera.height
+    if file.parent.name == REFERENCE_FOLDER:
+        return Reference(read_mask(file, size), None)
+    parts = read_labels(file, size)
+    return Reference(parts > 0, parts)

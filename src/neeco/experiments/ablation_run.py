@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from neeco import __version__
 from neeco.capture import Capture
@@ -18,45 +20,27 @@ from neeco.experiments.derived import derive_capture
 from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
 from neeco.experiments.jobs import Budget, Job, JobNews, check_folder, check_settings, settings_for
 from neeco.experiments.masks import LabelScores, score_label_ways
+from neeco.experiments.plans import AblationPlan
 from neeco.experiments.running import require_ray, run_jobs
 from neeco.files import new_folder, read_json, write_json
+from neeco.raster.devices import device_of
 from neeco.training.options import training_config
-from neeco.training.run import load_run
+from neeco.training.run import open_run
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
 
 
-@dataclass(frozen=True)
-class AblationPlan:
-    """What to run. `iterations` are those of `neeco`, `kinematic_iterations` of `kinematic`, whose steps cost less."""
-
-    capture: Path
-    output: Path
-    tables: tuple[str, ...] = ("paper", "ours")
-    iterations: int = 1_000
-    kinematic_iterations: int | None = None  # None: as many, but at least the family's least
-    seed: int = 0
-    transforms: str = "transforms.json"
-    settings: tuple[str, ...] = ()
-
-    def steps(self, family: Family) -> int:
-        """Iterations of a run of `family`."""
-        given = {NEECO_RUNS: self.iterations, KINEMATIC_RUNS: self.kinematic_iterations}[family]
-        return given or max(family.least_steps, self.iterations)
-
-
-def run_ablations(
-    plan: AblationPlan, workers: int = 1, progress: Callable[[JobNews], None] | None = None
-) -> dict[str, Any]:
+def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None = None) -> dict[str, Any]:
     """Train and score every variant of the chosen tables, write DIR/ablation.json and return what it holds.
 
     Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
     for unknown tables and settings, a capture without instruments, or an output that holds other runs.
     """
-    if workers > 1:
+    if plan.workers > 1:
         require_ray()
+    device = device_of(plan.device)
     chosen = chosen_ablations(plan.tables)
     variants = distinct_variants(chosen)
     capture = _open_capture(plan, variants)
@@ -68,24 +52,24 @@ def run_ablations(
         for job, variant in zip(jobs, variants, strict=True):
             if variant.derived is not None:
                 derive_capture(capture, plan.transforms, variant.derived, plan.seed, job.capture)
-        results = run_jobs(jobs, workers, progress, {plan.capture: capture})
+        results = run_jobs(jobs, plan.workers, progress, {plan.capture: capture})
     finished = {job.name: result for job, result in zip(jobs, results, strict=True) if "error" not in result}
     failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
     folders = {job.name: job.folder for job in jobs if job.name in finished}
     families = [family for family in (NEECO_RUNS, KINEMATIC_RUNS) if any(v.family is family for v in variants)]
-    labels, untold = _label_scores(chosen, folders, capture, splits)
+    labels, untold = _label_scores(chosen, folders, capture, splits, device)
     ablation = {
         "schema": SCHEMA,
         "version": __version__,
         "capture": str(plan.capture.absolute()),
         "seed": plan.seed,
-        "iterations": dict(sorted((family.method, plan.steps(family)) for family in families)),
+        "iterations": dict(sorted((family.method, _steps(plan, family)) for family in families)),
         "settings": list(plan.settings),
         "splits": list(splits),
         "tables": [table_of(table, folders, finished, labels, splits) for table in chosen],
         "runs": [finished[name] for name in finished],
         "failures": failures + untold,
-        "notes": [note for family in families for note in family.shortcomings(plan.steps(family))],
+        "notes": [note for family in families for note in family.shortcomings(_steps(plan, family))],
     }
     write_json(plan.output / "ablation.json", ablation)
     return ablation
@@ -123,9 +107,15 @@ def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
     return capture
 
 
+def _steps(plan: AblationPlan, family: Family) -> int:
+    """Iterations of a run of `family`."""
+    given = {NEECO_RUNS: plan.iterations, KINEMATIC_RUNS: plan.kinematic_iterations}[family]
+    return given or max(family.least_steps, plan.iterations)
+
+
 def _job(plan: AblationPlan, variant: Variant) -> Job:
     """The job of one variant. Settings: its family's, then the user's, then what the variant is about."""
-    family, steps = variant.family, plan.steps(variant.family)
+    family, steps = variant.family, _steps(plan, variant.family)
     values = {"iterations": steps, "seed": plan.seed, "transforms": plan.transforms}
     given = settings_for(family.method, plan.settings)
     common = family.settings(steps)
@@ -134,11 +124,16 @@ def _job(plan: AblationPlan, variant: Variant) -> Job:
     if variant.derived is not None:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
-    return Job(variant.name, plan.seed, capture, plan.output / "runs" / variant.name, config, Budget(None, steps))
+    folder = plan.output / "runs" / variant.name
+    return Job(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
 
 
 def _label_scores(
-    chosen: Sequence[Ablation], folders: dict[str, Path], capture: Capture, splits: tuple[str, ...]
+    chosen: Sequence[Ablation],
+    folders: dict[str, Path],
+    capture: Capture,
+    splits: tuple[str, ...],
+    device: torch.device,
 ) -> tuple[dict[str, LabelScores], list[dict[str, str]]]:
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     entries = [entry for table in chosen for item in table.comparisons for entry in item.entries]
@@ -151,7 +146,8 @@ def _label_scores(
         stored = read_json(file) if file.exists() else None
         if stored is None or stored["splits"] != list(splits):
             try:
-                scored = score_label_ways(load_run(folders[name]), capture, splits)
+                with open_run(folders[name], device) as run:
+                    scored = score_label_ways(run, capture, splits)
             except NeecoError as error:
                 failures.append({"run": name, "error": f"label ways: {error}"})
                 continue

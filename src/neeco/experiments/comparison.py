@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -30,8 +29,9 @@ from neeco.experiments.masks import check_masks, score_folder, score_runs, split
 from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
-from neeco.experiments.watching import CURVE_FILE, TOTALS
+from neeco.experiments.watching import CURVE_FILE, TOTALS, read_rows
 from neeco.files import new_folder, read_json, write_json
+from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.training.config import TrainConfig
 from neeco.training.options import variant_config
@@ -57,6 +57,7 @@ class ComparisonSpec:
     masks: Mapping[str, Path] = field(default_factory=dict)
     transforms: str = "transforms.json"
     assignments: tuple[str, ...] = ()
+    device: str = "auto"  # a word for `device_of`
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class ComparisonPlan:
 def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
     spec.budget.check()
+    device_of(spec.device)
     if spec.seeds < 1:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     if spec.workers < 1:
@@ -169,6 +171,7 @@ def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job
             spec.budget,
             spec.splits,
             spec.lpips_weights,
+            spec.device,
         )
         for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
         for name, config in configs.items()
@@ -247,9 +250,7 @@ def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[
     """Held-out PSNR of every finished job at about ten moments; seconds on the budget's clock."""
     rows = []
     for job in (job for job in results if "error" not in job):
-        path = job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE
-        for line in path.read_text(encoding="utf-8").splitlines():
-            entry = json.loads(line)
+        for entry in read_rows(job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE):
             row = {"name": job["name"], "seed": job["seed"], "seconds": entry[TOTALS[spec.budget.clock]]}
             rows.append(row | {key: entry[key] for key in ("iteration", "split", "psnr")})
     return rows
@@ -274,10 +275,12 @@ def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> 
     """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
     folder = plan.spec.output
     done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
-    runs = [(name, seed, load_run(job_folder(folder, name, seed))) for name, seed in done]
+    runs = [(name, seed, job_folder(folder, name, seed)) for name, seed in done]
     if runs:
         told = splits_with_truth(plan.capture, plan.splits)
-        scored = score_runs(runs, folder, plan.capture, told, partial(report, "scoring masks"))
+        device = device_of(plan.spec.device)
+        scored = score_runs(runs, folder, plan.capture, told, device, partial(report, "scoring masks"))
         result["masks"] = [*plan.given_masks, *scored]
-        result["speed"] = measure_speed(runs, plan.capture, partial(report, "measuring speed"))
+        opened = [(name, seed, load_run(path)) for name, seed, path in runs]
+        result["speed"] = measure_speed(opened, plan.capture, partial(report, "measuring speed"))
     result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])

@@ -16,13 +16,12 @@ import torch
 from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.evaluation.truth import MASK_FOLDERS
 from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
 from neeco.files import read_json, write_atomically, write_json
 from neeco.scene.rotations import rotation_from_vector
 
 RECIPE_FILE = "derived.json"
-MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)
 
 
 def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: int, output: Path) -> Path:

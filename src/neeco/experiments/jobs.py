@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
@@ -16,9 +18,10 @@ from neeco.evaluation.lpips import find_lpips
 from neeco.experiments.machine import reset_peak_memory
 from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
 from neeco.files import read_json, write_json, write_text
+from neeco.raster.devices import device_of
 from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
-from neeco.training.run import load_run, read_config, stored_config
+from neeco.training.run import open_run, read_config, stored_config
 from neeco.training.train import ProgressRow, train
 
 JOB_SCHEMA = "neeco-job/1"
@@ -80,6 +83,7 @@ class Job:
     budget: Budget
     splits: tuple[str, ...] | None = None
     lpips_weights: Path | None = None
+    device: str = "auto"  # a word for `device_of`, opened where the job runs
 
     @property
     def title(self) -> str:
@@ -129,30 +133,31 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
     check_folder(job)
     capture = capture or read_capture(job.capture, job.config.transforms)
     splits = held_out_splits(capture, job.splits)
-    networks = sorted(find_lpips(job.lpips_weights))
+    networks, device = find_lpips(job.lpips_weights), device_of(job.device)
     file = job.folder / JOB_FILE
     if file.exists():
         stored = read_json(file)
-        if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == networks:
+        if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == sorted(networks):
             return dict(stored)
         totals = {key: stored[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
         totals["iteration"] = stored["iterations"]
     else:
-        totals = _train(job, capture, splits, report)
+        totals = _train(job, capture, splits, device, report)
     report("evaluating", 0.0, "")
-    evaluation = evaluate_run(
-        load_run(job.folder),
-        capture,
-        splits,
-        lpips_weights=job.lpips_weights,
-        progress=lambda what, done, total: report("evaluating", done / max(total, 1), what),
-    )
+    with open_run(job.folder, device) as run:
+        evaluation = evaluate_run(
+            run,
+            capture,
+            splits,
+            networks=networks,
+            progress=lambda what, done, total: report("evaluating", done / max(total, 1), what),
+        )
     given = evaluation["given"]
     first = given[splits[0]]
     result = {"schema": JOB_SCHEMA} | job.identity()
     result |= {"iterations": totals["iteration"]}
     result |= {key: totals[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
-    result |= {"num_gaussians": first["num_gaussians"], "fps": first["fps"], "lpips_networks": networks}
+    result |= {"num_gaussians": first["num_gaussians"], "fps": first["fps"], "lpips_networks": sorted(networks)}
     result |= {"splits": {split: {key: given[split][key] for key in SPLIT_SCORES} for split in splits}}
     write_json(file, result)
     return result
@@ -183,7 +188,9 @@ def check_folder(job: Job) -> None:
         raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 
 
-def _train(job: Job, capture: Capture, splits: tuple[str, ...], report: JobProgress) -> dict[str, Any]:
+def _train(
+    job: Job, capture: Capture, splits: tuple[str, ...], device: torch.device, report: JobProgress
+) -> dict[str, Any]:
     """Train or go on training; returns what the run took."""
     reset_peak_memory()
     held_out = HeldOut(capture, splits, field=not method_class(job.config.method).has_gaussians)
@@ -197,23 +204,31 @@ def _train(job: Job, capture: Capture, splits: tuple[str, ...], report: JobProgr
     config, clock = job.train_config, CLOCKS[job.budget.clock]
     resume = (job.folder / "config.yaml").exists()
     try:
-        train(job.capture, job.folder, config, resume=resume, progress=tell, watch=watcher.watch, clock=clock)
+        train(
+            job.capture,
+            job.folder,
+            config,
+            device=device,
+            resume=resume,
+            progress=tell,
+            watch=watcher.watch,
+            clock=clock,
+        )
     finally:
         if watcher.started:
             watcher.save()
-    _complete(job, watcher)
+    _complete(job, watcher, device)
     return watcher.totals
 
 
-def _complete(job: Job, watcher: Watcher) -> None:
+def _complete(job: Job, watcher: Watcher, device: torch.device) -> None:
     """Add the curve's last row where the run was stopped between its last step and its finish."""
     if not watcher.started:
         watcher.read_curve()
     if not watcher.rows or watcher.rows[-1]["progress"] < 1:
-        scene = load_run(job.folder).scene
-        watcher.totals["iteration"] = scene.diagnostics.get("iterations", watcher.totals["iteration"])
-        with scene.torch_threads():
-            watcher.add_row(scene, 1.0)
+        with open_run(job.folder, device) as run:
+            watcher.totals["iteration"] = run.scene.diagnostics.get("iterations", watcher.totals["iteration"])
+            watcher.add_row(run.scene, 1.0)
 
 
 def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:

@@ -15,14 +15,14 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.truth import REFERENCE_FOLDER, load_reference
+from neeco.evaluation.truth import load_reference, truth_file
 from neeco.files import write_json
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import Labeller, draw, draw_layers
 from neeco.labels.threshold import ThresholdLabels
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.settings import Settings
-from neeco.training.run import Run
+from neeco.training.run import Run, open_run
 
 NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument
 Row = dict[str, Any]
@@ -31,12 +31,9 @@ LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and sp
 
 def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:
     """Those of `splits` in which at least one frame has a true or reference mask."""
-    places = (capture.root / "truth" / "masks", capture.root / REFERENCE_FOLDER)
-
-    def told(split: str) -> bool:
-        return any((place / f"{frame.name}.png").is_file() for frame in capture.split(split) for place in places)
-
-    return tuple(split for split in splits if told(split))
+    return tuple(
+        split for split in splits if any(truth_file(capture.root, frame.name) for frame in capture.split(split))
+    )
 
 
 def check_masks(masks: Mapping[str, Path], capture: Capture, splits: Sequence[str], taken: Sequence[str]) -> None:
@@ -76,35 +73,36 @@ def score_folder(
 @torch.no_grad()
 def draw_masks(run: Run, folder: Path, frames: Sequence[Frame]) -> bool:
     """Write the run's part ids of `frames` as `folder`/<stem>_parts.png, and parts.json, which names them; False, and
-    nothing written, when its scene carries no labels."""
+    nothing written, when its scene carries no labels. Threads of torch: the caller's to set."""
     scene = run.scene
     if not scene.label_names:
         return False
     ids = [{"id": index + 1, "part": part} for index, (_, part) in enumerate(scene.label_names)]
     write_json(folder / PARTS_FILE, {"ids": ids})
-    with scene.torch_threads():
-        for frame in frames:
-            parts = draw(scene, frame.state, frame.camera).parts
-            assert parts is not None, "a scene with label names draws parts"
-            write_labels(folder / f"{frame.name}{PARTS_SUFFIX}.png", parts)
+    for frame in frames:
+        parts = draw(scene, frame.state, frame.camera).parts
+        assert parts is not None, "a scene with label names draws parts"
+        write_labels(folder / f"{frame.name}{PARTS_SUFFIX}.png", parts)
     return True
 
 
 def score_runs(
-    runs: Sequence[tuple[str, int, Run]],
+    runs: Sequence[tuple[str, int, Path]],
     output: Path,
     capture: Capture,
     splits: Sequence[str],
+    device: torch.device,
     report: Callable[[int, int], None],
 ) -> list[Row]:
-    """Draw the masks of every (name, seed, run) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
+    """Draw the masks of every (name, seed, run folder) into `output`/masks/<name>-seed<k>/<split>/ and score them."""
     rows: list[Row] = []
-    for index, (name, seed, run) in enumerate(runs):
+    for index, (name, seed, path) in enumerate(runs):
         report(index, len(runs))
-        for split in splits:
-            folder = output / "masks" / f"{name}-seed{seed}" / split
-            if draw_masks(run, folder, capture.split(split)):
-                rows += score_folder(name, seed, folder, capture, [split])[0]
+        with open_run(path, device) as run:
+            for split in splits:
+                folder = output / "masks" / f"{name}-seed{seed}" / split
+                if draw_masks(run, folder, capture.split(split)):
+                    rows += score_folder(name, seed, folder, capture, [split])[0]
     report(len(runs), len(runs))
     return rows
 
@@ -113,26 +111,25 @@ def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> Label
     """Mean mask IoU of a run by label way ("composited", "threshold") and split, each as `synthesize` makes its labels.
 
     None where no frame has a true or reference mask, or where a way cannot label the scene (nothing moves in it).
-    Raises NeecoError for an unreadable mask.
+    Threads of torch: the caller's to set. Raises NeecoError for an unreadable mask.
     """
     scene = gaussian_scene(run.scene, "label ways")
     speckle = Settings(count=1).speckle
     scores: LabelScores = {}
-    with scene.torch_threads():
-        for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
-            try:
-                labeller: Labeller = kind(scene)
-            except NeecoError:  # it has no labels, or its deltas tell nothing apart: a finding, not a failure
-                scores[way] = dict.fromkeys(splits)
-                continue
-            scores[way] = {}
-            for split in splits:
-                values = []
-                for frame in capture.split(split):
-                    reference = load_reference(capture, frame)
-                    if reference is not None:
-                        drawing = draw_layers(scene, labeller, frame.state, frame.camera, speckle)
-                        values.append(iou(drawing.parts > 0, reference.mask, frame.load_mask()))
-                mean = mean_of(values)
-                scores[way][split] = None if mean != mean else round(mean, 6)  # NaN is unequal to itself
+    for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
+        try:
+            labeller: Labeller = kind(scene)
+        except NeecoError:  # it has no labels, or its deltas tell nothing apart: a finding, not a failure
+            scores[way] = dict.fromkeys(splits)
+            continue
+        scores[way] = {}
+        for split in splits:
+            values = []
+            for frame in capture.split(split):
+                reference = load_reference(capture, frame)
+                if reference is not None:
+                    drawing = draw_layers(scene, labeller, frame.state, frame.camera, speckle)
+                    values.append(iou(drawing.parts > 0, reference.mask, frame.load_mask()))
+            mean = mean_of(values)
+            scores[way][split] = None if mean != mean else round(mean, 6)  # NaN is unequal to itself
     return scores

@@ -93,10 +93,12 @@ def require_ray() -> None:
 def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
-    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them.
+    With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
+    device is opened in its worker; jobs that name the same one share it.
     """
     require_ray()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else it hides them: no job reserves one
     import ray
 
     address = os.environ.get("RAY_ADDRESS")

@@ -35,6 +35,11 @@ TOTALS = {"wall": "seconds", "processor": "processor_seconds"}  # their names in
 Row = dict[str, Any]
 
 
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a run's JSON-lines file; none where it ended before it wrote the first."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
 class HeldOut:
     """Some held-out frames of every split and their photographs, read once; fewer to score a `field` by."""
 
@@ -107,9 +112,7 @@ class Watcher:
 
     def read_curve(self) -> None:
         """Take the rows as an earlier start of this job left them."""
-        path = self.folder / CURVE_FILE
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        self.rows = [json.loads(line) for line in lines]
+        self.rows = read_rows(self.folder / CURVE_FILE)
 
     def _take_up(self, iteration: int) -> None:
         """Keep the rows before `iteration`: what a lost piece of the run had added will come again."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from neeco.labels.composited import instruments_of
 from neeco.labels.contours import bounding_box, minimum_rectangle, outer_polygons
 from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.raster.pinhole import project
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
@@ -112,11 +113,12 @@ def visibility(seen: np.ndarray, alone: np.ndarray) -> float:
     return round(int(seen.sum()) / whole, 4) if whole else 0.0
 
 
-def project(point: np.ndarray, camera: Camera) -> tuple[float, float, float]:
-    """Image position (x, y) px and depth mm of a world point [3] mm; depth <= 0 lies behind the camera."""
-    x, y, z = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
-    scale = 1.0 / z if z > camera.near else 0.0
-    return float(camera.fx * x * scale + camera.cx), float(camera.fy * y * scale + camera.cy), float(z)
+def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
+    """Position (x, y) px and depth mm of a world point [3] mm; None where the image does not show the place."""
+    local = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
+    x, y = project(local, camera.fx, camera.fy, camera.cx, camera.cy, nearest=camera.near)
+    seen = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
+    return (float(x), float(y), float(local[2])) if seen else None
 
 
 def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instrument: str) -> dict[str, Keypoint]:
@@ -129,10 +131,11 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
     absent = not drawing.alone[instrument].mask.any()
     projected = {}
     for name in sorted(points, key=lambda known: KEYPOINTS.index(known) if known in KEYPOINTS else len(KEYPOINTS)):
-        x, y, z = project(to_numpy(points[name]), camera)
-        if absent or z <= camera.near or not (0 <= x < camera.width and 0 <= y < camera.height):
+        place = place_in_image(to_numpy(points[name]), camera)
+        if absent or place is None:
             projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
             continue
+        x, y, z = place
         row, column = int(y), int(x)
         hidden = any(0 < depth[row, column] < z - OTHERS_MM for depth in others)
         hidden |= 0 < drawing.alone[instrument].depth[row, column] < z - SELF_MM

@@ -18,7 +18,7 @@ from neeco.evaluation.truth import load_reference
 from neeco.experiments.comparison import job_folder
 from neeco.labels.drawing import draw
 from neeco.report.figures import difference, jpeg, to_bytes
-from neeco.training.run import load_run
+from neeco.training.run import open_run
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,9 @@ def frame_rows(comparison: Mapping[str, Any], capture: Capture, output: Path) ->
     chosen = [frame for split in comparison["splits"] if (frame := median_frame(comparison, capture, split))]
     shots: list[list[Shot]] = [[] for _ in chosen]
     for name, seed in _first_seeds(comparison["jobs"]):
-        scene = load_run(job_folder(output, name, seed)).scene
-        with scene.torch_threads():
+        with open_run(job_folder(output, name, seed)) as run:
             for index, frame in enumerate(chosen):
-                image = draw(scene, frame.state, frame.camera).image
+                image = draw(run.scene, frame.state, frame.camera).image
                 shots[index].append(_shot(name, seed, frame, image.numpy()))
     return [_row(capture, frame, drawn) for frame, drawn in zip(chosen, shots, strict=True)]
 

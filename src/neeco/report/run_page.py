@@ -59,13 +59,13 @@ def write_report(
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. Raises NeecoError
-    when a picture cannot be read or the page cannot be written.
+    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. How many threads
+    torch takes is the caller's to set (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot
+    be written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
-    with scene.torch_threads():
-        figures = frame_figures(evaluation, capture, scene, kind)
+    figures = frame_figures(evaluation, capture, scene, kind)
     config = run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 
 from neeco.capture.model import State
-from neeco.labels.annotation import project
+from neeco.labels.annotation import place_in_image
 from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers, to_numpy
 from neeco.raster.types import Camera
 
@@ -43,7 +44,7 @@ class Acceptance:
             return ENTERS_TISSUE
         if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
             return LEAVES_IMAGE
-        if keypoints and not any(in_image(point, drawing.camera) for points in keypoints.values() for point in points):
+        if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
         return None
 
@@ -63,8 +64,8 @@ def buried_depth(scene: Scene, drawing: LayeredDrawing) -> float:
         if len(below):
             deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
         for point in keypoints.get(name, []):
-            if in_image(point, drawing.camera):
-                x, y, z = project(point, drawing.camera)
+            if place := place_in_image(point, drawing.camera):
+                x, y, z = place
                 under = float(surface[int(y), int(x)])
                 deepest = max(deepest, z - under if under > 0 else 0.0)
     return deepest
@@ -97,13 +98,12 @@ def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
 
 def shows_working_end(scene: Scene, state: State, camera: Camera) -> bool:
     """Whether any hinge or tip projects into the image; where none is known, any instrument's origin."""
-    ends = [point for points in working_ends(scene, state).values() for point in points]
+    ends = working_ends(scene, state)
     if not ends:
-        ends = [to_numpy(instrument.pose[:3, 3]) for instrument in scene.registered(state).instruments.values()]
-    return any(in_image(point, camera) for point in ends)
+        ends = {name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()}
+    return any_in_image(camera, ends)
 
 
-def in_image(point: np.ndarray, camera: Camera) -> bool:
-    """Whether a world point [3] mm projects into the image."""
-    x, y, z = project(point, camera)
-    return z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
+def any_in_image(camera: Camera, points: Mapping[str, Sequence[np.ndarray]]) -> bool:
+    """Whether the image shows the place of any of the instruments' points [3] mm of the world."""
+    return any(place_in_image(point, camera) is not None for some in points.values() for point in some)

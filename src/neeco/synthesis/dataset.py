@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,8 +75,9 @@ def synthesize(
 
     Image `index` depends on (scene, settings, index) alone. Interrupted (Ctrl-C) or failing, it keeps and indexes what
     is done, for `resume`; where no image was drawn at all, `output` is left as it was found. `on_progress` is told how
-    many images are done. Raises NeecoError for bad settings, an output that is not empty (without `resume`) or was
-    made with other settings, and when no acceptable state is found.
+    many images are done. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for bad
+    settings, an output that is not empty (without `resume`) or was made with other settings, and when no acceptable
+    state is found.
     """
     settings.check()
     output = Path(output)
@@ -106,9 +107,9 @@ def synthesize(
                 records.append(record)
                 on_progress(index + 1)
             if not _drawn(records):
-                reasons = ", ".join(f"{reason}: {count}" for reason, count in _refusals(records).items())
-                remedies = "; ".join(REMEDIES[reason] for reason in _refusals(records) if reason in REMEDIES)
-                raise NeecoError(f"{settings.states}: every state was refused ({reasons}); {remedies}")
+                refused = _refusals(records)
+                remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
+                raise NeecoError(f"{settings.states}: every state was refused ({_counted(refused)}); {remedies}")
         except (KeyboardInterrupt, NeecoError):
             if begun or _drawn(records):
                 with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
@@ -131,6 +132,10 @@ def _refusals(records: list[Record]) -> dict[str, int]:
     for record in records:
         refused.update(record["refused"])
     return dict(sorted(refused.items()))
+
+
+def _counted(refused: Mapping[str, int]) -> str:
+    return ", ".join(f"{reason}: {count}" for reason, count in refused.items())
 
 
 def _forget(output: Path) -> None:
@@ -175,9 +180,8 @@ def make_sample(
         return write_sample(output, index, drawing, annotate(scene, drawing, labeller.names), refused)
     if sampler.prescribed:
         return write_skipped(output, index, refused)
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in refused.items())
     raise NeecoError(
-        f"{output}: image {index}: no acceptable state in {settings.tries} tries ({reasons}); "
+        f"{output}: image {index}: no acceptable state in {settings.tries} tries ({_counted(refused)}); "
         "use --states inside, a smaller --margin, --no-tissue-check or --resume with more --tries"
     )
 

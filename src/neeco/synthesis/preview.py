@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from scipy import ndimage
 
+from neeco.evaluation.difference import outline
 from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED, SKELETON
 from neeco.synthesis.writers.folder import Record
@@ -90,9 +90,9 @@ def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
 
 def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
     colors = np.concatenate([np.zeros((1, 3)), PALETTE[np.arange(max(int(ids.max()), 1)) % len(PALETTE)]])[ids]
-    inside = (ids > 0)[..., None]
-    tinted = np.where(inside, (1 - TINT) * image + TINT * colors, image)
-    edge = (ids > 0) & ~ndimage.binary_erosion(ids > 0, border_value=1)
+    inside = ids > 0
+    tinted = np.where(inside[..., None], (1 - TINT) * image + TINT * colors, image)
+    edge = outline(inside)
     tinted[edge] = colors[edge]
     return tinted
 

@@ -75,18 +75,17 @@ def render(
     scene: Drawable, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
 ) -> Rendered:
     """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
-    mean. Raises NeecoError."""
+    mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
     labelled = bool(scene.label_names)
     done = 0
-    with scene.torch_threads():
-        for view in views:
-            drawing = draw(scene, view.state, view.camera)
-            write_image(folder / f"{view.name}.png", drawing.image)
-            if drawing.parts is not None:
-                write_labels(folder / f"{view.name}_parts.png", drawing.parts)
-                write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
-            done += 1
-            on_progress(done)
+    for view in views:
+        drawing = draw(scene, view.state, view.camera)
+        write_image(folder / f"{view.name}.png", drawing.image)
+        if drawing.parts is not None:
+            write_labels(folder / f"{view.name}_parts.png", drawing.parts)
+            write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
+        done += 1
+        on_progress(done)
     if labelled:
         names = [
             {"id": index + 1, "instrument": name, "part": part} for index, (name, part) in enumerate(scene.label_names)

@@ -18,18 +18,31 @@ class Settings:
     """What decides the pixels and labels of a data set, apart from the scene. Every field goes into dataset.json."""
 
     count: int
+    """How many images."""
     seed: int = 0
-    states: str = "inside"  # inside | beyond | grid | path:FILE.jsonl | FILE.jsonl
-    margin: float = 0.2  # of the recorded range at either end, for beyond
+    """The same seed gives the same data set."""
+    states: str = "inside"
+    """inside or beyond the recorded range, grid, path:FILE.jsonl (between key states), or FILE.jsonl (as given)."""
+    margin: float = 0.2
+    """How far `beyond` goes, as a share of the recorded range at either end."""
     views: Views = "recorded"
+    """Cameras: as recorded, near recorded ones, or in orbit about the tissue."""
     labels: LabelWay = "composited"
-    label_threshold: float | None = None  # composited: share of a pixel that must be instrument; None: the project's
-    delta_thresholds: tuple[float, float, float] | None = None  # threshold: position mm, rotation, scale mm; None: Otsu
-    speckle: float = 0.01  # pieces of an instrument smaller than this share of its largest piece are not labelled
-    tissue_check: bool = True  # refuse states that enter the tissue
-    tissue_tolerance_mm: float | None = None  # None: found from the recorded states
-    min_share: float = 0.005  # of the image's pixels that the instruments must cover
+    """composited: what compositing says, occlusion-correct. threshold: the paper's, from what moves."""
+    label_threshold: float | None = None
+    """Share of a pixel that must be instrument (composited); the project's measured best when not given."""
+    delta_thresholds: tuple[float, float, float] | None = None
+    """Position (mm), rotation and scale (mm) above which a Gaussian has moved (threshold); found when not given."""
+    speckle: float = 0.01
+    """Drop label pieces smaller than this share of the instrument's largest piece."""
+    tissue_check: bool = True
+    """Refuse states whose instrument enters the tissue, as far as the view shows it."""
+    tissue_tolerance_mm: float | None = None
+    """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
+    min_share: float = 0.005
+    """Refuse images with less than this share of instrument pixels."""
     tries: int = 50
+    """How often to draw a state anew when it is refused."""
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""

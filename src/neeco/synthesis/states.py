@@ -39,6 +39,10 @@ class JointRange:
     lower: float
     upper: float
 
+    def at(self, share: float) -> float:
+        """The value with `share` of the range below it."""
+        return float(self.lower + share * (self.upper - self.lower))
+
     def widened(self, margin: float, limits: tuple[float, float] | None) -> JointRange:
         """The range, wider by `margin` of its length at either end, but never outside `limits`."""
         reach = margin * (self.upper - self.lower)
@@ -50,6 +54,19 @@ class JointRange:
         return JointRange(lower, upper)
 
 
+def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """The pose [4, 4] of a rotation [3, 3] and a position [3] mm."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
+def turn_about(point: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
+    """The rigid motion [4, 4] that turns by a rotation vector [3] rad and leaves `point` [3] mm where it is."""
+    rotation = Rotation.from_rotvec(rotvec).as_matrix()
+    return rigid(rotation, point - rotation @ point)
+
+
 def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np.ndarray:
     """The rigid pose [4, 4] between two: positions on a line, rotations by slerp.
 
@@ -57,10 +74,8 @@ def interpolate_pose(first: np.ndarray, second: np.ndarray, weight: float) -> np
     """
     start, end = Rotation.from_matrix(first[:3, :3]), Rotation.from_matrix(second[:3, :3])
     turn = (start.inv() * end).as_rotvec()
-    pose = np.eye(4)
-    pose[:3, :3] = (start * Rotation.from_rotvec(weight * turn)).as_matrix()
-    pose[:3, 3] = (1 - weight) * first[:3, 3] + weight * second[:3, 3]
-    return pose
+    rotation = (start * Rotation.from_rotvec(weight * turn)).as_matrix()
+    return rigid(rotation, (1 - weight) * first[:3, 3] + weight * second[:3, 3])
 
 
 def interpolate_state(first: State, second: State, weight: float) -> State:
@@ -83,10 +98,8 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
 
 def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
     """The mean of poses [4, 4]: mean position and the chordal mean of the rotations."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_matrix(np.stack([p[:3, :3] for p in poses])).mean().as_matrix()
-    pose[:3, 3] = np.mean([p[:3, 3] for p in poses], axis=0)
-    return pose
+    rotation = Rotation.from_matrix(np.stack([pose[:3, :3] for pose in poses])).mean().as_matrix()
+    return rigid(rotation, np.mean([pose[:3, 3] for pose in poses], axis=0))
 
 
 def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
@@ -138,7 +151,7 @@ class Inside:
             second = first
         state = interpolate_state(first, second, float(rng.random()))
         state = self._shaken(state, rng)
-        return with_joints(state, lambda name, joint: _uniform(rng, self.ranges[name, joint]))
+        return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
 
     def _angular_spread(self, name: str) -> float:
         mean = Rotation.from_matrix(self.means[name][:3, :3])
@@ -146,17 +159,15 @@ class Inside:
         return float((mean.inv() * Rotation.from_matrix(np.stack(poses))).magnitude().max())
 
     def _shaken(self, state: State, rng: Generator) -> State:
-        poses = {name: to_numpy(instrument.pose) for name, instrument in state.instruments.items()}
-        centre = np.mean([pose[:3, 3] for pose in poses.values()], axis=0)
+        centre = np.mean([to_numpy(given.pose)[:3, 3] for given in state.instruments.values()], axis=0)
         turn = Rotation.from_rotvec(self.shake_rad * rng.standard_normal(3)).as_matrix()
         shift = self.shake_mm * rng.standard_normal(3)
-        instruments = {}
-        for name, pose in poses.items():
-            moved = np.eye(4)
-            moved[:3, :3] = turn @ pose[:3, :3]
-            moved[:3, 3] = np.clip(turn @ (pose[:3, 3] - centre) + centre + shift, *self.bounds[name])
-            instruments[name] = InstrumentState(torch.from_numpy(moved), state.instruments[name].joints)
-        return State(instruments, state.time)
+        return with_poses(
+            state,
+            lambda name, pose: rigid(
+                turn @ pose[:3, :3], np.clip(turn @ (pose[:3, 3] - centre) + centre + shift, *self.bounds[name])
+            ),
+        )
 
 
 class Beyond(Inside):
@@ -178,11 +189,7 @@ class Beyond(Inside):
     def __call__(self, index: int, rng: Generator) -> State:
         state = super().__call__(index, rng)
         factor = 1 + 2 * self.margin * float(rng.random())
-        instruments = {}
-        for name, given in state.instruments.items():
-            pose = interpolate_pose(self.means[name], to_numpy(given.pose), factor)
-            instruments[name] = InstrumentState(torch.from_numpy(pose), given.joints)
-        return State(instruments, state.time)
+        return with_poses(state, lambda name, pose: interpolate_pose(self.means[name], pose, factor))
 
 
 class Grid:
@@ -214,19 +221,12 @@ class Grid:
         fraction, roll = self.fractions[cell // len(self.rolls)], self.rolls[cell % len(self.rolls)]
         # golden-ratio steps: successive rounds stand far apart in the recording
         base = self.states[int(round_number * 0.6180339887 * len(self.states)) % len(self.states)]
-        instruments = {}
-        for name, instrument in base.instruments.items():
+
+        def rolled(name: str, pose: np.ndarray) -> np.ndarray:
             point, direction = self.axes[name]
-            about = np.eye(4)
-            about[:3, :3] = Rotation.from_rotvec(roll * direction).as_matrix()
-            about[:3, 3] = point - about[:3, :3] @ point
-            instruments[name] = InstrumentState(torch.from_numpy(to_numpy(instrument.pose) @ about), instrument.joints)
+            return pose @ turn_about(point, roll * direction)
 
-        def value(name: str, joint: str) -> float:
-            joint_range = self.ranges[name, joint]
-            return float(joint_range.lower + fraction * (joint_range.upper - joint_range.lower))
-
-        return with_joints(State(instruments, base.time), value)
+        return with_joints(with_poses(base, rolled), lambda name, joint: self.ranges[name, joint].at(fraction))
 
 
 class AlongPath:
@@ -257,6 +257,15 @@ class Listed:
         return self.states[index % len(self.states)]
 
 
+def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> State:
+    """The same state with every pose [4, 4] replaced by `moved(instrument, pose)`."""
+    instruments = {
+        name: InstrumentState(torch.from_numpy(moved(name, to_numpy(given.pose))), given.joints)
+        for name, given in state.instruments.items()
+    }
+    return State(instruments, state.time)
+
+
 def with_joints(state: State, value: Callable[[str, str], float]) -> State:
     """The same state with every joint set to `value(instrument, joint)`."""
     instruments = {
@@ -264,7 +273,3 @@ def with_joints(state: State, value: Callable[[str, str], float]) -> State:
         for name, instrument in state.instruments.items()
     }
     return State(instruments, state.time)
-
-
-def _uniform(rng: Generator, joint_range: JointRange) -> float:
-    return float(joint_range.lower + rng.random() * (joint_range.upper - joint_range.lower))

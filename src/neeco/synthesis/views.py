@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
+from neeco.synthesis.states import rigid, turn_about
 
 
 class ViewSampler(Protocol):
@@ -49,9 +50,8 @@ class PerturbedViews:
 
     def __call__(self, rng: Generator) -> Camera:
         camera = self.recorded(rng)
-        offset = np.eye(4)
-        offset[:3, :3] = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
-        offset[:3, 3] = self.mm * rng.standard_normal(3)
+        turn = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
+        offset = rigid(turn, self.mm * rng.standard_normal(3))
         return moved_camera(camera, to_numpy(camera.world_from_camera) @ offset)
 
 
@@ -72,9 +72,7 @@ class OrbitViews:
         direction = 2 * np.pi * rng.random()
         # the axis lies in the image plane: the camera moves sideways, it does not roll
         axis = world_from_camera[:3, :3] @ np.array([np.cos(direction), np.sin(direction), 0.0])
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.random() * axis).as_matrix()
-        turn[:3, 3] = self.centre - turn[:3, :3] @ self.centre
+        turn = turn_about(self.centre, np.deg2rad(self.degrees) * rng.random() * axis)
         return moved_camera(camera, turn @ world_from_camera)
 
 

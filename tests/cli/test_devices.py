@@ -1,0 +1,104 @@
+"""`--device` on every verb that draws or learns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from neeco.capture import Capture
+from neeco.capture.writer import write_capture
+from neeco.cli import main
+from neeco.experiments import jobs
+from neeco.raster import devices
+from neeco.training.options import training_config
+from neeco.training.train import train
+
+OF_A_RUN = {
+    "evaluate": [],
+    "render": ["--output", "out"],
+    "synthesize": ["--output", "out", "--count", "1", "--min-share", "0", "--labels", "threshold"],
+}
+OF_A_CAPTURE = {
+    "train": ["--output", "out"],
+    "compare": ["--output", "out", "--methods", "3dgs", "--iterations", "5"],
+    "ablate": ["--output", "out", "--tables", "joints", "--iterations", "5", "--kinematic-iterations", "5"],
+}
+
+
+@pytest.fixture
+def made(world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """By verb, what it takes: a capture or a run of five steps. The working folder is one of its own."""
+    monkeypatch.delenv("NEECO_LPIPS_WEIGHTS", raising=False)
+    root, work = tmp_path / "capture", tmp_path / "work"
+    write_capture(world.make_capture(root, world.TinyScene(), ("train",) * 4 + ("test",)), root)
+    run = train(root, tmp_path / "run", training_config("3dgs", {"iterations": 5}))
+    work.mkdir()
+    monkeypatch.chdir(work)
+    return dict.fromkeys(OF_A_RUN, str(run)) | dict.fromkeys(OF_A_CAPTURE, str(root))
+
+
+def command(verb: str, made: dict[str, str], device: str) -> list[str]:
+    return [verb, made[verb], *(OF_A_RUN | OF_A_CAPTURE)[verb], "--device", device]
+
+
+@pytest.mark.parametrize("verb", [*OF_A_RUN, *OF_A_CAPTURE])
+@pytest.mark.parametrize(
+    ("device", "told"),
+    [("cuda", "PyTorch finds no CUDA device"), ("cuda:3", "PyTorch finds no CUDA"), ("tpu", "'tpu' is unknown")],
+)
+def test_a_device_that_is_not_there_is_one_line_and_nothing_is_written(
+    verb: str, device: str, told: str, made, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert main(command(verb, made, device)) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("neeco: error: --device: ")
+    assert told in lines[0]
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "render"])
+def test_a_run_is_drawn_on_the_device_that_is_named(verb: str, made, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = noted_words(monkeypatch)
+    assert main(command(verb, made, "cpu")) == 0
+    assert asked == ["cpu"]
+
+
+def test_the_jobs_of_a_comparison_are_given_the_word(made, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[jobs.Job] = []
+
+    def run_job(job: jobs.Job, progress: object, capture: Capture) -> dict[str, object]:
+        taken.append(job)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs, "run_job", run_job)
+    for verb in ("compare", "ablate"):
+        assert main(command(verb, made, "cpu")) == 130
+    assert [job.device for job in taken] == ["cpu", "cpu"]
+    assert "device" not in taken[0].identity()
+
+
+def test_a_job_opens_its_device_where_it_runs(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = noted_words(monkeypatch)
+    config = training_config("3dgs", {})
+    job = jobs.Job("3dgs", 0, Path(made["train"]), tmp_path / "job", config, jobs.Budget(None, 3), device="cpu")
+    jobs.run_job(job)
+    assert asked == ["cpu"]
+
+
+def noted_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words of `--device` that are opened from now on."""
+    words: list[str] = []
+    real = devices.device_of
+
+    def noting(word: str) -> torch.device:
+        words.append(word)
+        return real(word)
+
+    monkeypatch.setattr(devices, "device_of", noting)
+    monkeypatch.setattr(jobs, "device_of", noting)
+    return words
