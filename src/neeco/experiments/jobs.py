@@ -12,6 +12,7 @@ from typing import Any, Literal
 import torch
 
 from neeco.capture import Capture, read_capture
+from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.lpips import find_lpips
@@ -125,16 +126,18 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
 
     A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
     (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are asked for.
-    capture: the job's, where it is read already. Raises NeecoError when `folder` is another job's, and what `train` and
+    capture: the job's, where it is read and checked already. Raises NeecoError when `folder` is another job's, and what `train` and
     `evaluate_run` raise.
     """
     report = progress or (lambda stage, share, text: None)
     job.budget.check()
     check_folder(job)
-    capture = capture or read_capture(job.capture, job.config.transforms)
+    file = job.folder / JOB_FILE
+    if capture is None:
+        read = read_capture if file.exists() else read_checked
+        capture = read(job.capture, job.config.transforms)
     splits = held_out_splits(capture, job.splits)
     networks, device = find_lpips(job.lpips_weights), device_of(job.device)
-    file = job.folder / JOB_FILE
     if file.exists():
         stored = read_json(file)
         if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == sorted(networks):
@@ -208,6 +211,7 @@ def _train(
             job.capture,
             job.folder,
             config,
+            capture=capture,
             device=device,
             resume=resume,
             progress=tell,
