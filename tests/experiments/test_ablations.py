@@ -77,10 +77,10 @@ def test_a_second_start_trains_nothing_and_says_the_same(plan: AblationPlan, mon
 def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     real = jobs.train
 
-    def fails(capture, folder, *rest, **more):
+    def fails(path, folder, *rest, **more):
         if folder.name == "neeco-no-density":
             raise NeecoError("the loss became nan")
-        return real(capture, folder, *rest, **more)
+        return real(path, folder, *rest, **more)
 
     monkeypatch.setattr(jobs, "train", fails)
     ablation = run_ablations(plan)

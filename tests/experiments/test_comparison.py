@@ -123,9 +123,9 @@ def test_more_seeds_and_methods_are_added_without_training_the_others_again(
     trained: list[str] = []
     train = jobs_module.train
 
-    def counted(capture, output, *rest, **options):
+    def counted(path, output, *rest, **options):
         trained.append(output.name)
-        return train(capture, output, *rest, **options)
+        return train(path, output, *rest, **options)
 
     monkeypatch.setattr(jobs_module, "train", counted)
     result = compared(replace(spec, methods=("3dgs", "3dgs+dta"), seeds=1))
