@@ -126,8 +126,8 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
 
     A begun training goes on from its checkpoint, and ends in the scene that it would have without the interruption
     (unless minutes end it). A finished one is only scored again when other splits or LPIPS networks are asked for.
-    capture: the job's, where it is read and checked already. Raises NeecoError when `folder` is another job's, and what `train` and
-    `evaluate_run` raise.
+    capture: the job's, where it is read and checked already. Raises NeecoError when `folder` is another job's, and what
+    `train` and `evaluate_run` raise.
     """
     report = progress or (lambda stage, share, text: None)
     job.budget.check()
