@@ -9,7 +9,7 @@ from typing import Any
 from neeco.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.experiments.ablation_tables import agreement, csv_text, grid
 from neeco.experiments.ablations import ABLATIONS
-from neeco.experiments.families import PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.families import NEECO_RUNS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.experiments.tables import csv_text as csv_of
 from neeco.report.charts import Series, legend, line_chart
 from neeco.report.render import REPORT_FILE, write_page
@@ -30,7 +30,7 @@ def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
         subtitle="ablations",
         steps=steps + f", seed {ablation['seed']}",
         settings=", ".join(ablation["settings"]),
-        scaled="neeco" in ablation["iterations"],
+        scaled=NEECO_RUNS.method in ablation["iterations"],
         published=f"{PUBLISHED_STEPS:,}",
         phase_1=f"{PHASE_1_SHARE:.0%}",
         even=EVEN_DB,
@@ -60,7 +60,7 @@ def _learning_curves(table: dict[str, Any], ablation: dict[str, Any]) -> list[Fi
         rows = [row for row in table["curves"] if row["comparison"] == comparison]
         labels = list(dict.fromkeys(row["label"] for row in rows))
         series = _series(labels, [(row["label"], row["iteration"], row["psnr"]) for row in rows])
-        phase_2 = (PHASE_1_SHARE * ablation["iterations"]["neeco"], "phase 2")
+        phase_2 = (PHASE_1_SHARE * ablation["iterations"][NEECO_RUNS.method], "phase 2")
         drawn = line_chart(f"{comparison}: PSNR on {split}, dB", "steps", series, starts=[phase_2])
         data = [{"setting": r["label"], "iteration": r["iteration"], f"psnr_{split}": r["psnr"]} for r in rows]
         words = "".join(letter if letter.isalnum() else "-" for letter in comparison)

@@ -109,13 +109,13 @@ def _evidence_after(
 ) -> Evidence:
     """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
     tissue = scene.canonical.map(lambda tensor: tensor.clone())
-    alone = Scene("3dgs", tissue, Static(), (), Recorded(), scene.center)
+    alone = Scene(Static.method, tissue, Static(), (), Recorded(), scene.center)
     alone.background = scene.background  # or what lies behind transparent images would be evidence
     short = replace(
         config,
         iterations=steps,
         minutes=None,
-        schedule=method_defaults("3dgs").schedule,
+        schedule=method_defaults(Static.method).schedule,
         refine=RefineConfig(),
         density_start=density_start,
         density_stop=0.8,
