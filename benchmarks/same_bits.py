@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import yaml
@@ -26,6 +26,7 @@ from torch import Tensor
 TIMES = ("seconds", "fps", "version")  # fields that differ between two runs of the same program
 SHOWN = 12  # differences told of one file
 RUN_FILES = ("*.safetensors", "checkpoint/*.safetensors", "metrics.jsonl", "evaluation.json", "config.yaml")
+T = TypeVar("T")
 Fields = dict[str, Any]  # dotted name -> text of a number, word, null or empty container
 
 
@@ -62,6 +63,15 @@ def flatten(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def differing_fields(before: Fields, after: Fields, rules: Rules) -> list[str]:
+    return _differing(before, after, rules, lambda a, b: "" if a == b else f"{a} before, {b} after")
+
+
+def differing_tensors(before: dict[str, Tensor], after: dict[str, Tensor], rules: Rules) -> list[str]:
+    return _differing(before, after, rules, _how_tensors_differ)
+
+
+def _differing(before: dict[str, T], after: dict[str, T], rules: Rules, how: Callable[[T, T], str]) -> list[str]:
+    """What is on one side only, and what `how` says of the rest."""
     before = {rules.name(name): value for name, value in before.items()}
     told = []
     for name in sorted(before.keys() | after.keys()):
@@ -69,21 +79,8 @@ def differing_fields(before: Fields, after: Fields, rules: Rules) -> list[str]:
             continue
         if name not in before or name not in after:
             told.append(f"{name}: only {'before' if name in before else 'after'}")
-        elif before[name] != after[name]:
-            told.append(f"{name}: {before[name]} before, {after[name]} after")
-    return told
-
-
-def differing_tensors(before: dict[str, Tensor], after: dict[str, Tensor], rules: Rules) -> list[str]:
-    before = {rules.name(name): tensor for name, tensor in before.items()}
-    told = []
-    for name in sorted(before.keys() | after.keys()):
-        if rules.left_out(name):
-            continue
-        if name not in before or name not in after:
-            told.append(f"{name}: only {'before' if name in before else 'after'}")
-        elif how := _how_tensors_differ(before[name], after[name]):
-            told.append(f"{name}: {how}")
+        elif difference := how(before[name], after[name]):
+            told.append(f"{name}: {difference}")
     return told
 
 
