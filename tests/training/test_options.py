@@ -12,7 +12,7 @@ from neeco.errors import NeecoError
 from neeco.scene.methods import METHODS, method_settings
 from neeco.training.config import config_from_dict, config_to_dict, method_defaults
 from neeco.training.options import schedule_parts, training_config, variant_config
-from neeco.training.run import stored_config, write_config
+from neeco.training.run import read_config, stored_config, write_config
 
 ROD = (Instrument("rod"),)
 
@@ -23,7 +23,7 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
     assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
     write_config(tmp_path, tmp_path / "capture", config)
-    assert stored_config(tmp_path) == config
+    assert stored_config(tmp_path, read_config(tmp_path)) == config
     assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
 

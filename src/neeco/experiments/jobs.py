@@ -184,7 +184,7 @@ def check_folder(job: Job) -> None:
         for key in (key for key in identity if values[key] != identity[key]):
             raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
     try:
-        old, new = vars(stored_config(folder)), vars(job.train_config)
+        old, new = vars(stored_config(folder, stored)), vars(job.train_config)
     except NeecoError as error:  # of another version
         raise NeecoError(f"{str(error).removesuffix('; train again')}; {differs}") from None
     for field in (name for name in new if old[name] != new[name]):

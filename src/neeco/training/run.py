@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,10 +86,10 @@ def write_config(path: Path, capture: Path, config: TrainConfig) -> None:
     write_text(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
 
 
-def stored_config(path: Path) -> TrainConfig:
-    """The settings that the run in `path` was started with. Raises NeecoError for a field that is unknown or does not
-    fit."""
-    known = {key: value for key, value in read_config(path).items() if key not in ("schema", "version", "capture")}
+def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
+    """The settings that the run in `path` was started with, of what `read_config` read there. Raises NeecoError for a
+    field that is unknown or does not fit."""
+    known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture")}
     try:
         return config_from_dict(known)
     except NeecoError as error:

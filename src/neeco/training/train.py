@@ -111,7 +111,7 @@ def _stored_config(output: Path, capture_path: Path) -> TrainConfig:
         raise NeecoError(
             f"{output / 'config.yaml'}: capture: this run was started on {stored['capture']}; resume with that"
         )
-    return stored_config(output)
+    return stored_config(output, stored)
 
 
 def _begin(
