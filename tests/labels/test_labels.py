@@ -4,9 +4,10 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.labels.annotation import annotate, place_in_image, visibility
-from neeco.labels.composited import CompositedLabels
-from neeco.labels.drawing import draw, draw_layers
+from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels
+from neeco.labels.drawing import draw, draw_layers, select
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
+from neeco.raster import rasterize
 from neeco.raster.types import Camera
 
 
@@ -145,6 +146,60 @@ def test_no_gaussian_over_the_thresholds_means_an_empty_mask(scene, state, camer
     drawing, label = labelled(scene, state(), camera, labeller)
     assert not drawing.parts.any()
     assert label.shape is None
+
+
+def test_the_share_is_the_sum_of_the_label_channels_and_the_mask_is_where_it_exceeds_the_threshold(
+    scene, state, camera
+):
+    for threshold in (LABEL_THRESHOLD, 0.3):
+        drawing, _ = labelled(scene, state(), camera, CompositedLabels(scene, threshold))
+        channels = rasterize(scene.at(state()), camera, channels=scene.label_channels()).channels
+        assert (drawing.share == channels.sum(dim=-1).clamp(0, 1)).all()
+        assert ((drawing.parts > 0) == (drawing.share > threshold)).all()
+
+
+def test_what_the_tissue_hides_has_no_share(scene, state, camera):
+    drawing, _ = labelled(scene, state(z=130.0), camera)
+    assert drawing.share.max() < 0.05
+    assert not drawing.ignored.any()
+
+
+def test_a_dropped_speck_is_in_neither_parts_nor_share_nor_band(scene, state, camera, monkeypatch):
+    whole = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
+    strayed = scene.canonical.map(torch.clone)
+    strayed.means[scene.canonical.counts[0] + 30] = torch.tensor([25.0, -5.0, 0.0])  # one of the shaft's
+    monkeypatch.setattr(scene, "canonical", strayed)
+    with_speck = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.0)
+    cleaned = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
+    speck = slice(14, 26), slice(46, 62)  # rows and columns round it
+    assert with_speck.parts[speck].any()
+    assert with_speck.ignored[speck].any()
+    for pixels in (cleaned.parts, cleaned.share, cleaned.ignored):
+        assert not pixels[speck].any()
+    near = slice(0, 48), slice(20, 44)
+    assert (cleaned.share[near] - whole.share[near]).abs().max() < 0.1
+
+
+def test_the_band_covers_both_sides_of_the_edge_and_nothing_far_from_it(scene, state, camera):
+    drawing, _ = labelled(scene, state(), camera)
+    shaft = drawing.ignored[10]
+    inside = drawing.parts[10] > 0
+    first, last = np.flatnonzero(inside)[[0, -1]]
+    assert shaft[[first - 1, first, last, last + 1]].all()
+    assert not shaft[: first - 3].any()
+    assert not shaft[last + 4 :].any()
+    assert not shaft[first + 3 : last - 2].any()
+
+
+def test_threshold_labels_share_is_the_alpha_of_what_moved(scene, state, camera):
+    labeller = ThresholdLabels(scene)
+    drawing, _ = labelled(scene, state(), camera, labeller)
+    posed = scene.at(state())
+    alone = rasterize(select(posed, labeller.owners(state(), posed) >= 0), camera)
+    assert (drawing.share == alone.alpha).all()
+    assert drawing.share[drawing.parts > 0].mean() > 0.7
+    assert (drawing.ignored & (drawing.parts > 0)).any()
+    assert (drawing.ignored & (drawing.parts == 0)).any()
 
 
 def test_a_drawing_and_its_layers_agree(scene, state, camera):

@@ -6,7 +6,7 @@ import torch
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
-from neeco.labels.composited import CompositedLabels
+from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels
 from neeco.labels.drawing import draw_layers
 from neeco.labels.threshold import ThresholdLabels
 from neeco.scene import CanonicalGaussians, Recorded, Scene
@@ -74,6 +74,17 @@ def test_the_instrument_in_front_hides_the_other(bars, camera, front, state):
     assert 0.6 < labels[back].visibility < 0.95
     assert len(labels[back].shape.polygons) == 2  # cut in two by the one in front
     assert labels[back].shape.area < drawing.alone[back].mask.sum()
+
+
+def test_where_one_instrument_meets_another_all_is_instrument_and_no_edge(bars, camera):
+    drawing = draw_layers(bars, CompositedLabels(bars), at(60, 70), camera, 0.01)
+    middle = drawing.parts[24].numpy()
+    meeting = np.flatnonzero((middle[:-1] != middle[1:]) & (middle[:-1] > 0) & (middle[1:] > 0))
+    assert len(meeting) == 2  # level, upright, level
+    assert (drawing.share[24, meeting] > LABEL_THRESHOLD).all()
+    assert not drawing.ignored[24, meeting].any()
+    for part in (1, 2):  # at the edges of both
+        assert (drawing.ignored & (drawing.parts == part)).any()
 
 
 def test_threshold_labels_tell_instruments_apart_by_nearness(bars, camera):

@@ -16,6 +16,7 @@ from torch import Tensor
 from neeco.capture.model import State
 from neeco.labels.composited import LABEL_THRESHOLD, composited_parts, instruments_of
 from neeco.labels.contours import without_speckle
+from neeco.labels.edges import uncertain_edge, without_pieces
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
 
@@ -46,11 +47,17 @@ class LayeredDrawing(Drawing):
     """A drawing as some labeller sees it, with what stands behind and before it; depths [H, W] in mm, 0 = none."""
 
     parts: Tensor  # [H, W] uint8, 0 tissue, else index into the labeller's names + 1
+    share: Tensor  # [H, W] in [0, 1]: how much of a pixel is instrument, whichever; 0 in pieces that are not labelled
     state: State
     camera: Camera
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue drawn alone
     alone: dict[str, Alone]  # by instrument
+
+    @property
+    def ignored(self) -> Tensor:
+        """[H, W] bool: the edge, whose pixels a trainer had better not count (see `edges.uncertain_edge`)."""
+        return torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
 
 
 class Labeller(Protocol):
@@ -62,8 +69,8 @@ class Labeller(Protocol):
         """[N] int64: index of each Gaussian's instrument in `instruments_of(names)`, -1 for tissue."""
         ...
 
-    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor]:
-        """The whole scene drawn, and its part ids [H, W] uint8."""
+    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor, Tensor]:
+        """The whole scene drawn, its part ids [H, W] uint8, and how much of each pixel is instrument [H, W]."""
         ...
 
 
@@ -84,7 +91,8 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
     gaussians = scene.at(state)
     learned_camera = scene.camera(camera)
     owners = labeller.owners(state, gaussians)
-    rendering, parts = labeller.draw(gaussians, learned_camera, owners)
+    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners)
+    parts, share = _without_speckle(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, speckle)
     alone = {}
     for k, name in enumerate(instruments_of(labeller.names)):
         if name in state.instruments:
@@ -93,7 +101,8 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
     tissue = rasterize(select(gaussians, owners < 0), learned_camera)
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
-        parts=_without_speckle(parts.cpu(), labeller.names, speckle),
+        parts=parts,
+        share=share,
         state=state,
         camera=camera,
         depth=surface_depth(rendering),
@@ -126,10 +135,13 @@ def to_numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().double().numpy()
 
 
-def _without_speckle(parts: Tensor, names: tuple[tuple[str, str], ...], share: float) -> Tensor:
+def _without_speckle(
+    parts: Tensor, share: Tensor, names: tuple[tuple[str, str], ...], speckle: float
+) -> tuple[Tensor, Tensor]:
     cleaned = torch.zeros_like(parts)
     for instrument in instruments_of(names):
         ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
-        keep = torch.from_numpy(without_speckle(np.isin(parts.numpy(), ids), share))
+        keep = torch.from_numpy(without_speckle(np.isin(parts.numpy(), ids), speckle))
         cleaned[keep] = parts[keep]
-    return cleaned
+    kept = (cleaned > 0).numpy()
+    return cleaned, torch.from_numpy(without_pieces(share.numpy(), kept, dropped=(parts > 0).numpy() & ~kept))

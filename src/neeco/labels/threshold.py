@@ -74,15 +74,15 @@ class ThresholdLabels:
         )
         return torch.where(moved, torch.cdist(means, origins).argmin(dim=1), -1)
 
-    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor]:
-        """Colour of the whole scene; ids from the moved Gaussians drawn alone."""
+    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor, Tensor]:
+        """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
         alone = rasterize(select(gaussians, moved), camera, channels=shares)
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
         lit = alone.color.norm(dim=2) > self.black
-        return rasterize(gaussians, camera), torch.where(lit, ids, 0).to(torch.uint8)
+        return rasterize(gaussians, camera), torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
 
 
 @torch.no_grad()
