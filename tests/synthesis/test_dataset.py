@@ -11,6 +11,7 @@ from pycocotools.coco import COCO
 
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
+from neeco.labels.composited import LABEL_THRESHOLD
 from neeco.synthesis import dataset
 from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
 from neeco.synthesis.render import render, split_views, state_views
@@ -46,13 +47,29 @@ def states_file(path, states) -> str:
 
 def test_the_folder_is_laid_out_as_promised(made):
     assert {path.name for path in made.iterdir()} == {
-        ".records", "images", "masks", "parts", "depth", "coco", "yolo", "states.jsonl", "dataset.json", "preview.png",
+        ".records", "images", "masks", "soft", "ignore", "parts", "depth", "coco", "yolo",
+        "states.jsonl", "dataset.json", "preview.png",
     }  # fmt: skip
     image, mask, parts = (pixels(made / folder / "000002.png") for folder in ("images", "masks", "parts"))
     assert image.shape == (48, 64, 3)
     assert set(np.unique(mask)) == {0, 255}
     assert ((parts > 0) == (mask == 255)).all()
     assert set(np.unique(parts)) == {0, 1, 2}
+
+
+def test_soft_and_ignore_lie_beside_the_mask(made):
+    info = json.loads((made / "dataset.json").read_text())
+    mask, soft, ignore = (pixels(made / folder / "000002.png") for folder in ("masks", "soft", "ignore"))
+    assert soft.dtype == ignore.dtype == np.uint8
+    share = soft * info["soft"]["share_per_count"]
+    rounded = np.abs(share - LABEL_THRESHOLD) <= info["soft"]["share_per_count"]
+    assert ((share > LABEL_THRESHOLD) == (mask > 0))[~rounded].all()
+    assert {0, 255} < set(np.unique(soft))
+    assert set(np.unique(ignore)) == {0, info["ignore"]["ignored"]}
+    unclear = (share > info["ignore"]["clear_shares"][0]) & (share < info["ignore"]["clear_shares"][1])
+    assert unclear[ignore > 0].mean() > 0.5
+    assert (mask[ignore > 0] > 0).any()
+    assert (mask[ignore > 0] == 0).any()
 
 
 def test_depth_is_stored_in_twentieths_of_a_millimetre(made):
@@ -178,6 +195,41 @@ def test_interrupted_and_resumed_is_the_same_data_set(made, run, tmp_path, monke
     (output / "masks/.000003.abc.png").write_bytes(b"left over from a kill")
     summary = synthesize(run, output, SETTINGS, resume=True)
     assert summary.made_now == COUNT - 2
+    assert contents(output) == contents(made)
+
+
+@pytest.mark.parametrize("folder", ["soft", "ignore"])
+def test_an_image_without_one_of_its_files_is_drawn_again(made, run, tmp_path, folder):
+    output = tmp_path / "dataset"
+    shutil.copytree(made, output)
+    (output / folder / "000001.png").unlink()
+    assert synthesize(run, output, SETTINGS, resume=True).made_now == 1
+    assert contents(output) == contents(made)
+
+
+def test_a_data_set_from_before_soft_and_ignore_gets_them_for_every_image(made, run, tmp_path):
+    output = tmp_path / "dataset"
+    shutil.copytree(made, output)
+    info = json.loads((output / "dataset.json").read_text())
+    for folder in ("soft", "ignore"):
+        shutil.rmtree(output / folder)
+        del info[folder]
+    (output / "dataset.json").write_text(json.dumps(info))
+    for path in (output / ".records").iterdir():
+        record = json.loads(path.read_text())
+        for folder in ("soft", "ignore"):
+            del record["files"][f"{folder}/{path.stem}.png"]
+        path.write_text(json.dumps(record))
+    assert synthesize(run, output, SETTINGS, resume=True).made_now == COUNT
+    assert contents(output) == contents(made)
+
+
+def test_a_data_set_with_another_band_is_not_continued(made, run, tmp_path, monkeypatch):
+    output = tmp_path / "dataset"
+    shutil.copytree(made, output)
+    monkeypatch.setattr(dataset, "CLEAR_SHARES", (0.3, 0.8))
+    with pytest.raises(NeecoError, match=r"ignore: begun with .*0\.15.* now .*0\.3.*; use a new folder"):
+        synthesize(run, output, SETTINGS, resume=True)
     assert contents(output) == contents(made)
 
 

@@ -125,7 +125,7 @@ def test_a_full_disk_is_told_with_the_file_and_gone_on_from(run, tmp_path, monke
     synthesize(run, whole, SETTINGS)
     with monkeypatch.context() as patched:
         real = os.fsync
-        left = iter(range(8))  # dataset.json, one image's five files, and two of the next's
+        left = iter(range(10))  # dataset.json, one image's seven files, and two of the next's
 
         def full(descriptor: int) -> None:
             if next(left, None) is None:

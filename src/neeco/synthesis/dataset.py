@@ -18,8 +18,9 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.files import new_folder, read_json, write_json
 from neeco.labels.annotation import KEYPOINTS, annotate
-from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels, instruments_of
+from neeco.labels.composited import CLEAR_SHARES, LABEL_THRESHOLD, CompositedLabels, instruments_of
 from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers
+from neeco.labels.edges import REACH
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, find_tolerance
@@ -30,6 +31,8 @@ from neeco.synthesis.writers.coco import write_coco
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
     FOLDERS,
+    IGNORED,
+    SHARE_PER_COUNT,
     Record,
     load_record,
     record_path,
@@ -212,6 +215,8 @@ def _description(run: Run, settings: Settings) -> dict[str, Any]:
         "version": neeco.__version__,
         "scene_sha256": digest,
         "settings": settings.identity() | {"states_sha256": states_fingerprint(settings.states)},
+        "soft": {"share_per_count": SHARE_PER_COUNT},
+        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
         "scene": str(run.path),
     }
 
@@ -233,6 +238,11 @@ def _check_output(output: Path, description: dict[str, Any], resume: bool) -> bo
         if begun.get(key) != description[key]:
             raise NeecoError(
                 f"{output / INFO}: {key}: begun with {begun.get(key)!r}, now {description[key]!r}; use a new folder"
+            )
+    for key in ("soft", "ignore"):  # a version that wrote neither named neither: all its images are drawn anew
+        if begun.get(key) not in (None, description[key]):
+            raise NeecoError(
+                f"{output / INFO}: {key}: begun with {begun[key]!r}, now {description[key]!r}; use a new folder"
             )
     for key, value in description["settings"].items():
         before = begun["settings"].get(key)

@@ -1,4 +1,4 @@
-"""The data set as plain files: images, masks, part ids, depth, states, and one record per image.
+"""The data set as plain files: images, masks, share of instrument, part ids, depth, states, and one record per image.
 
 A record says everything about its image and is written last, so an image without a whole record is not there yet.
 """
@@ -23,8 +23,11 @@ from neeco.labels.drawing import LayeredDrawing, to_numpy
 Record = dict[str, Any]
 
 DEPTH_MM_PER_COUNT = 0.05
+SHARE_PER_COUNT = 1 / 255
+IGNORED = 255
 RECORDS = ".records"
-FOLDERS = ("images", "masks", "parts", "depth", RECORDS)
+PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth")  # folders with a PNG of every image
+FOLDERS = (*PIXELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation
 
 
@@ -41,10 +44,12 @@ def split_of(index: int) -> str:
 def write_sample(
     root: Path, index: int, drawing: LayeredDrawing, labels: list[InstrumentLabel], refused: Mapping[str, int]
 ) -> Record:
-    """Write one image with its masks, part ids and depth, then its record; returns the record. Raises NeecoError."""
+    """Write one image with all that its pixels say, then its record; returns the record. Raises NeecoError."""
     name = f"{stem(index)}.png"
     write_image(root / "images" / name, drawing.image)
     write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
+    write_labels(root / "soft" / name, (drawing.share / SHARE_PER_COUNT).round().to(torch.uint8))
+    write_labels(root / "ignore" / name, drawing.ignored.to(torch.uint8) * IGNORED)
     write_labels(root / "parts" / name, drawing.parts)
     write_depth(root / "depth" / name, drawing.depth)
     camera = drawing.camera
@@ -59,10 +64,7 @@ def write_sample(
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
         "labels": [label.to_json() for label in labels],
         "refused": dict(sorted(refused.items())),
-        "files": {
-            f"{folder}/{name}": (root / folder / name).stat().st_size
-            for folder in ("images", "masks", "parts", "depth")
-        },
+        "files": {file: (root / file).stat().st_size for file in _files_of(index)},
     }
     write_json(record_path(root, index), record)
     return record
@@ -81,13 +83,21 @@ def record_path(root: Path, index: int) -> Path:
 
 
 def load_record(root: Path, index: int) -> Record | None:
-    """The record of image `index` when it and all its files are there and whole, else None."""
+    """The record of image `index` when it and all its files are there and whole, else None.
+
+    The record of a version that wrote fewer files is not whole: its image is to be drawn again.
+    """
     try:
         record = json.loads(record_path(root, index).read_text(encoding="utf-8"))
-        sizes = {name: (root / name).stat().st_size for name in record["files"]}
-    except (OSError, ValueError, KeyError, TypeError):
+        files = () if record.get("skipped") else _files_of(index)
+        sizes = {name: (root / name).stat().st_size for name in files}
+    except (OSError, ValueError, AttributeError):
         return None
-    return record if sizes == record["files"] and record.get("index") == index else None
+    return record if sizes == record.get("files") and record.get("index") == index else None
+
+
+def _files_of(index: int) -> list[str]:
+    return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
 
 
 def remove_leftovers(root: Path) -> None:
