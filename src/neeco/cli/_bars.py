@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from neeco.experiments.jobs import JobNews
+    from neeco.experiments.work import JobNews
     from neeco.training.train import ProgressRow
 
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training

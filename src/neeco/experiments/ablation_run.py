@@ -18,10 +18,11 @@ from neeco.experiments.ablation_results import table_of
 from neeco.experiments.ablations import ABLATIONS, OURS, PAPER, Ablation, Variant
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
-from neeco.experiments.jobs import Budget, Job, JobNews, check_folder, check_settings, settings_for
+from neeco.experiments.jobs import Budget, Job, check_settings, settings_for
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.plans import AblationPlan
 from neeco.experiments.running import require_ray, run_jobs
+from neeco.experiments.work import JobNews
 from neeco.files import new_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.training.options import training_config
@@ -48,7 +49,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None
     with new_folder(plan.output):
         jobs = [_job(plan, variant) for variant in variants]
         for job in jobs:
-            check_folder(job)
+            job.check()
         for job, variant in zip(jobs, variants, strict=True):
             if variant.derived is not None:
                 derive_capture(capture, plan.transforms, variant.derived, plan.seed, job.capture)

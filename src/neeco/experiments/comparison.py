@@ -19,8 +19,6 @@ from neeco.experiments.jobs import (
     JOB_FILE,
     Budget,
     Job,
-    JobNews,
-    check_folder,
     check_settings,
     settings_for,
 )
@@ -30,6 +28,7 @@ from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
 from neeco.experiments.watching import CURVE_FILE, TOTALS, read_rows
+from neeco.experiments.work import JobNews
 from neeco.files import new_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
@@ -88,7 +87,7 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     _check_output(spec)
     jobs = _jobs(spec, configs)
     for job in jobs:
-        check_folder(job)
+        job.check()
     splits = held_out_splits(capture, spec.splits)
     check_masks(spec.masks, capture, splits, spec.methods)
     notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +17,8 @@ from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.lpips import find_lpips
 from neeco.experiments.machine import reset_peak_memory
 from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
-from neeco.files import read_json, write_json, write_text
+from neeco.experiments.work import JobProgress
+from neeco.files import read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
@@ -30,8 +30,6 @@ JOB_FILE = "job.json"
 UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
 OWN_OPTION = {"transforms": "--transforms", "iterations": "the budget's option", "minutes": "the budget's option"}
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames")
-
-JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
 
 
 @dataclass(frozen=True)
@@ -106,19 +104,14 @@ class Job:
             "budget": asdict(self.budget),
         }
 
+    def check(self) -> None:
+        """Raises NeecoError when the budget is none, or the folder holds another job's run."""
+        self.budget.check()
+        check_folder(self)
 
-@dataclass(frozen=True)
-class JobNews:
-    """What `run_jobs` tells: `stage` is training, evaluating, done or failed; `share` in [0, 1] of that stage; `result`
-    is there once the job is done or has failed."""
-
-    index: int
-    total: int
-    job: Job
-    stage: str
-    share: float = 0.0
-    text: str = ""
-    result: dict[str, Any] | None = None
+    def run(self, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
+        """`run_job`."""
+        return run_job(self, progress, capture)
 
 
 def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
@@ -130,8 +123,7 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
     `train` and `evaluate_run` raise.
     """
     report = progress or (lambda stage, share, text: None)
-    job.budget.check()
-    check_folder(job)
+    job.check()
     file = job.folder / JOB_FILE
     if capture is None:
         read = read_capture if file.exists() else read_checked
@@ -233,28 +225,6 @@ def _complete(job: Job, watcher: Watcher, device: torch.device) -> None:
         with open_run(job.folder, device) as run:
             watcher.totals["iteration"] = run.scene.diagnostics.get("iterations", watcher.totals["iteration"])
             watcher.add_row(run.scene, 1.0)
-
-
-def ended(index: int, total: int, job: Job, result: dict[str, Any]) -> JobNews:
-    """The news that a job is done or has failed."""
-    failure = result.get("error", "")
-    return JobNews(index, total, job, "failed" if failure else "done", 1.0, failure, result)
-
-
-def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture | None = None) -> dict[str, Any]:
-    """`run_job`, a failure told in its result. A failure that no user can cause leaves its traceback beside the
-    folder."""
-    record = job.folder.with_name(job.folder.name + ".error.txt")
-    try:
-        result = run_job(job, progress, capture)
-    except NeecoError as error:
-        return job.identity() | {"error": " ".join(str(error).split()), "splits": {}}
-    except Exception as error:
-        write_text(record, traceback.format_exc())
-        told = " ".join(str(error).split()) or "no reason given"
-        return job.identity() | {"error": f"{type(error).__name__}: {told}; see {record}", "splits": {}}
-    record.unlink(missing_ok=True)
-    return result
 
 
 def check_settings(assignments: Sequence[str], methods: Collection[str], seed_option: str) -> None:

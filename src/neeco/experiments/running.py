@@ -14,15 +14,15 @@ from typing import Any
 
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.experiments.jobs import Job, JobNews, attempt_job, check_folder, ended
 from neeco.experiments.machine import usable_cores
+from neeco.experiments.work import JobNews, Work, attempt_job, ended
 
 CONNECT = 5.0  # s that a cluster's head gets to answer
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
 
 def run_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[Work],
     workers: int = 1,
     progress: Callable[[JobNews], None] | None = None,
     captures: Mapping[Path, Capture] | None = None,
@@ -31,7 +31,7 @@ def run_jobs(
 
     workers 1: in this process, one after another; more: so many at once by Ray. captures: those of the jobs that are
     read already, by path, for this process; jobs read the others. A job that fails does not stop the
-    others: its place holds {name, method, seed, capture, budget, "error": why, "splits": {}}, and no job.json is
+    others: its place holds its identity, "error" (why) and empty "splits", and no job.json is
     written, so that the next start tries again. Raises NeecoError before any work when a job's folder is another job's
     or Ray is not there, and KeyboardInterrupt saying which job was stopped.
     """
@@ -39,8 +39,7 @@ def run_jobs(
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
     report = progress or (lambda news: None)
     for job in jobs:
-        job.budget.check()
-        check_folder(job)
+        job.check()
     if workers > 1:
         return _run_on_cluster(jobs, workers, report)
     known = captures or {}
@@ -48,7 +47,7 @@ def run_jobs(
 
 
 def _run_here(
-    index: int, total: int, job: Job, capture: Capture | None, report: Callable[[JobNews], None]
+    index: int, total: int, job: Work, capture: Capture | None, report: Callable[[JobNews], None]
 ) -> dict[str, Any]:
     """One job of `total` in this process."""
 
@@ -90,7 +89,7 @@ def require_ray() -> None:
         ) from None
 
 
-def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
+def _run_on_cluster(jobs: Sequence[Work], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
@@ -119,7 +118,7 @@ def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobNews
 
 
 def _run_remotely(
-    ray: Any, jobs: Sequence[Job], workers: int, threads: int, report: Callable[[JobNews], None]
+    ray: Any, jobs: Sequence[Work], workers: int, threads: int, report: Callable[[JobNews], None]
 ) -> list[dict[str, Any]]:
     """Keep `workers` jobs going until all are done."""
     # a process serves one job: its peak memory is the job's own, and no thread setting outlives it
@@ -149,7 +148,7 @@ def _run_remotely(
     return [result for result in results if result is not None]
 
 
-def _result(ray: Any, reference: Any, job: Job) -> dict[str, Any]:
+def _result(ray: Any, reference: Any, job: Work) -> dict[str, Any]:
     """What the job returned; a worker that died is a failure of its job alone."""
     try:
         return dict(ray.get(reference))
@@ -157,7 +156,7 @@ def _result(ray: Any, reference: Any, job: Job) -> dict[str, Any]:
         return job.identity() | {"error": f"its worker died: {str(error).strip().splitlines()[0]}", "splits": {}}
 
 
-def _run_there(job: Job, threads: int) -> dict[str, Any]:
+def _run_there(job: Work, threads: int) -> dict[str, Any]:
     """In the worker: use no more threads than its share, then run the job."""
     import torch
 

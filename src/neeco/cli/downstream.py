@@ -1,0 +1,155 @@
+"""`neeco downstream`: does a model trained on drawn images do better on recorded frames?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from neeco.cli._tables import fitted
+from neeco.settings import Device
+
+if TYPE_CHECKING:
+    from neeco.experiments.downstream.experiment import DownstreamSpec
+    from neeco.experiments.downstream.samples import DataSet
+
+
+@dataclass(frozen=True)
+class Downstream:
+    """Train detectors and segmenters on recorded and on drawn images, and test them on recorded frames.
+
+    Each model is trained from scratch in every condition, with as many steps, on the same labelled frames of a fold;
+    tests are frames of the other splits. Conditions are sums of words: `real`, names of sets, `augment`, and for the
+    edges of drawn labels `hard`, `soft` or `ignore`. Interrupted, the same command goes on where it stopped; with more
+    models, sets, conditions or folds it adds them. Needs neeco[downstream].
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Capture folder, with true masks of the frames to test on."""
+    output: Path
+    """Folder to write; absent, empty, or of this experiment begun earlier."""
+    sets: tuple[str, ...] = ()
+    """NAME=DATASET, folders that `neeco synthesize` wrote; NAME=DATASET:COUNT takes its first COUNT images."""
+    models: tuple[str, ...] = ("unet",)
+    """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
+    real: tuple[str, ...] = ("0", "20", "all")
+    """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
+    folds: int = 3
+    """Each takes other labelled frames and another seed; intervals are over folds."""
+    conditions: tuple[str, ...] | None = None
+    """What to teach with, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
+    labels: Path | None = None
+    """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
+    classes: Literal["instrument", "parts"] = "instrument"
+    """One class, or shaft, wrist and jaws."""
+    pick: Literal["spread", "first"] = "spread"
+    """Which frames are labelled: spread over the recording, or its first."""
+    splits: tuple[str, ...] = ()
+    """Splits to test on; default: all but train that have true masks."""
+    steps: int | None = None
+    """Optimisation steps of every training; default: the model's own."""
+    size: int | None = None
+    """Longer side in pixels of images as a model sees them; default: the model's own. Scores are at full size."""
+    batch: int | None = None
+    """Images in a step; default: the model's own."""
+    weights: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """MODEL=FILE.safetensors to begin from instead of from scratch; repeatable."""
+    workers: int = 1
+    """Trainings at once, by Ray (install neeco[cluster]); each gets its share of the cores."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    device: Device = "auto"
+
+
+def run(args: Downstream) -> int:
+    """Teach and test with progress bars; print tables, answers and where the files lie; 1 when a training failed."""
+    from neeco.cli._bars import Bars
+    from neeco.experiments.downstream.experiment import failed_jobs, plan_downstream, run_downstream
+    from neeco.experiments.downstream.tables import tables_of, write_tables
+    from neeco.report.downstream_page import write_downstream_report
+
+    with Bars() as bars:
+        plan = plan_downstream(_spec(args))
+        experiment = run_downstream(plan, bars.job)
+        write_tables(args.output, experiment)
+        bars.stage("report", 0, 1)
+        page = write_downstream_report(args.output, experiment, plan.capture)
+        bars.stage("report", 1, 1)
+    console = Console()
+    for table in tables_of(experiment):
+        for part in fitted(table, console.width):
+            console.print(part)
+    for sentence in experiment["answers"]:
+        console.print(sentence, markup=False, highlight=False)
+    for note in experiment["notes"]:
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    for what, name in (("tables", "downstream.md, .csv, .tex"), ("all numbers", "downstream.json, data/")):
+        console.print(f"{what}: {args.output}/: {name}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
+    if failed := failed_jobs(experiment):
+        more = f" (and {len(failed) - 1} more, told above)" if len(failed) > 1 else ""
+        Console(stderr=True).print(
+            f"neeco: error: {len(failed)} of {len(experiment['jobs'])} trainings failed: {failed[0]}{more}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+        return 1
+    return 0
+
+
+def _spec(args: Downstream) -> DownstreamSpec:
+    """What the words mean. Raises NeecoError for sets and weights that cannot be understood."""
+    from neeco.experiments.downstream.experiment import DownstreamSpec
+    from neeco.experiments.downstream.job import Teaching
+
+    teaching = Teaching(
+        capture=args.capture,
+        sets=tuple(_data_set(word) for word in args.sets),
+        classes=args.classes,
+        splits=args.splits,
+        labels=args.labels,
+        transforms=args.transforms,
+        pick=args.pick,
+        steps=args.steps,
+        side=args.size,
+        batch=args.batch,
+        device=args.device,
+    )
+    weights = dict(_named("--weights", word, "unet=unet.safetensors") for word in args.weights)
+    return DownstreamSpec(
+        teaching,
+        args.output,
+        tuple(dict.fromkeys(args.models)),
+        tuple(dict.fromkeys(args.real)),
+        args.folds,
+        args.conditions,
+        {name: Path(file) for name, file in weights.items()},
+        args.workers,
+    )
+
+
+def _data_set(word: str) -> DataSet:
+    """`NAME=DATASET` or `NAME=DATASET:COUNT`; a folder whose name ends so is the folder."""
+    from neeco.errors import NeecoError
+    from neeco.experiments.downstream.samples import DataSet
+
+    name, place = _named("--sets", word, "kinematic=dataset")
+    folder, colon, count = place.rpartition(":")
+    if not colon or not count.isdecimal() or Path(place).exists():
+        return DataSet(name, Path(place))
+    if int(count) < 1:
+        raise NeecoError(f"--sets {word}: {count} images is nothing to learn from; give at least 1")
+    return DataSet(name, Path(folder), int(count))
+
+
+def _named(option: str, word: str, example: str) -> tuple[str, str]:
+    from neeco.errors import NeecoError
+
+    name, equals, value = word.partition("=")
+    if not (name and equals and value):
+        raise NeecoError(f"{option}: {word!r} is not NAME=PATH; write such as {example}")
+    return name, value

@@ -1,0 +1,1 @@
+"""Does it help? Models trained on recorded and on drawn images, tested on recorded frames."""

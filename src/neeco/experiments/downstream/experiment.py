@@ -1,0 +1,344 @@
+"""`downstream`: models taught with recorded and with drawn images under one budget, tested on recorded frames."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from neeco import __version__
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
+from neeco.errors import NeecoError
+from neeco.experiments.downstream.conditions import (
+    DEFAULT_EDGES,
+    HELD_BACK_EVERY,
+    REAL,
+    RESERVED,
+    Condition,
+    default_conditions,
+    labelled_count,
+    parse_condition,
+)
+from neeco.experiments.downstream.job import JOB_FILE, DownstreamJob, Teaching, as_settings
+from neeco.experiments.downstream.model import input_size, model_class
+from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds
+from neeco.experiments.downstream.samples import (
+    CLASSES,
+    INFO,
+    RecordedSample,
+    drawn_samples,
+    frame_size,
+    has_labels,
+    recorded_samples,
+)
+from neeco.experiments.machine import machine
+from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
+from neeco.experiments.work import JobNews
+from neeco.files import new_folder, read_json, write_json
+from neeco.raster.devices import device_of
+
+SCHEMA = "neeco-downstream/1"
+FILE = "downstream.json"
+JOBS = "jobs"
+
+
+@dataclass(frozen=True)
+class DownstreamSpec:
+    """What to find out. `conditions` None: the usual ones. `real`: counts of labelled frames as words, 0 for none.
+    `weights`: files to begin from, by model."""
+
+    teaching: Teaching  # its splits empty: all held-out ones with truth
+    output: Path
+    models: tuple[str, ...]
+    real: tuple[str, ...]
+    folds: int = 5
+    conditions: tuple[str, ...] | None = None
+    weights: Mapping[str, Path] = field(default_factory=dict)
+    workers: int = 1
+
+
+@dataclass(frozen=True)
+class DownstreamPlan:
+    """A checked specification, ready to work on."""
+
+    spec: DownstreamSpec
+    teaching: Teaching
+    capture: Capture
+    jobs: tuple[DownstreamJob, ...]
+    images: Mapping[str, int]  # of each set
+    labelled: int  # recorded training frames with a label
+    notes: tuple[str, ...]
+
+
+def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
+    """Check everything that can be known before the work. Raises NeecoError for whatever cannot be taught or tested."""
+    if spec.folds < 1:
+        raise NeecoError(f"--folds: {spec.folds} is none at all; give at least 1")
+    if spec.workers < 1:
+        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
+    if spec.workers > 1:
+        require_ray()
+    _check_models(spec)
+    device_of(spec.teaching.device)
+    conditions = _conditions(spec)
+    capture = read_checked(spec.teaching.capture, spec.teaching.transforms)
+    teaching = replace(spec.teaching, splits=_splits(capture, spec.teaching.splits))
+    tested = recorded_samples(capture, teaching.splits[0], teaching.classes)
+    images = {}
+    for data in teaching.sets:
+        edges = {condition.edges for condition in conditions if data.name in condition.sets}
+        for edge in sorted(edges) or [DEFAULT_EDGES]:
+            images[data.name] = len(drawn_samples(data, teaching.classes, edge, frame_size(tested)))
+    counts, labelled = _counts(spec, teaching, capture, conditions)
+    _check_boxes(spec, capture, tested)
+    _check_output(spec)
+    jobs = _jobs(spec, teaching, conditions, counts)
+    if not jobs:
+        raise NeecoError("--real: leaves nothing to teach; add 0 for sets alone, or a number of labelled frames")
+    for job in jobs:
+        job.check()
+    return DownstreamPlan(spec, teaching, capture, jobs, images, labelled, tuple(_notes(spec, teaching, counts)))
+
+
+def run_downstream(plan: DownstreamPlan, news: Callable[[JobNews], None] | None = None) -> dict[str, Any]:
+    """Teach and test every model in every condition on every fold; writes downstream.json, and returns what it holds.
+
+    Given again after an interruption it goes on where it stopped; given again with more models, sets, conditions,
+    labelled frames or folds, it adds them. A job that fails is told in its place.
+    """
+    output = plan.spec.output
+    with new_folder(output):
+        finished: dict[int, dict[str, Any]] = {}
+        for index, job in enumerate(plan.jobs):
+            if (file := job.folder / JOB_FILE).exists():
+                finished[index] = read_json(file)
+
+        def keep(latest: JobNews) -> None:
+            if latest.result is not None:
+                finished[latest.index] = latest.result
+                write_json(output / FILE, document(plan, [finished[k] for k in sorted(finished)]))
+            if news:
+                news(latest)
+
+        results = run_jobs(plan.jobs, plan.spec.workers, keep, {plan.teaching.capture: plan.capture})
+        result = document(plan, results) | {"complete": True}
+        write_json(output / FILE, result)
+    return result
+
+
+def document(plan: DownstreamPlan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """downstream.json as far as these results tell it."""
+    spec, teaching = plan.spec, plan.teaching
+    kinds = {name: model_class(name) for name in spec.models}
+    answers = {name: kind.answers for name, kind in kinds.items()}
+    size = frame_size(recorded_samples(plan.capture, teaching.splits[0], teaching.classes))
+    models = [
+        {
+            "name": name,
+            "answers": kind.answers,
+            "steps": teaching.steps or kind.steps,
+            "batch": teaching.batch or kind.batch,
+            "input": list(input_size(size, teaching.side or kind.side, kind.multiple)),
+            "weights": str(spec.weights[name].absolute()) if name in spec.weights else None,
+        }
+        for name, kind in kinds.items()
+    ]
+    done = [job for job in results if "error" not in job]
+    names = [data.name for data in teaching.sets]
+    made: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "complete": False,
+        "capture": str(teaching.capture.absolute()),
+        "machine": machine()
+        | {
+            "workers": spec.workers,
+            "threads_per_worker": threads_per_worker(spec.workers) if spec.workers > 1 else None,
+        },
+        "teaching": as_settings(teaching),
+        "classes": list(CLASSES[teaching.classes]),
+        "splits": list(teaching.splits),
+        "folds": spec.folds,
+        "labelled": plan.labelled,
+        "held_back_every": HELD_BACK_EVERY,
+        "sets": [
+            {
+                "name": data.name,
+                "path": str(data.path.absolute()),
+                "images": plan.images[data.name],
+                "made_by": _made_by(data.path),
+            }
+            for data in teaching.sets
+        ],
+        "models": models,
+        "jobs": list(results),
+        "summary": summarise_folds(results, answers, teaching.splits),
+        "paired": comparisons(done, answers, teaching.splits, names),
+        "notes": list(plan.notes) + _told_by(results),
+    }
+    return made | {"answers": answers_of(made)}
+
+
+def job_folder(output: Path, model: str, condition: str, real: int, fold: int) -> Path:
+    """Where one job lies."""
+    return output / JOBS / f"{model}-{condition}-real{real}-fold{fold}"
+
+
+def failed_jobs(experiment: Mapping[str, Any]) -> list[str]:
+    """`model, condition, …: why` of every job that failed."""
+    return [
+        f"{job['model']}, {job['condition']}, {job['real']} labelled, fold {job['fold']}: {job['error']}"
+        for job in experiment["jobs"]
+        if "error" in job
+    ]
+
+
+def _check_models(spec: DownstreamSpec) -> None:
+    if not spec.models:
+        raise NeecoError("--models: none is given; name at least one")
+    for name in spec.models:
+        kind = model_class(name)
+        if need := kind.unmet():
+            raise NeecoError(f"--models {name}: {need}")
+        if name in spec.weights and not kind.accepts_weights:
+            raise NeecoError(f"--weights {name}: this model takes none")
+    for name, file in spec.weights.items():
+        if name not in spec.models:
+            raise NeecoError(f"--weights: {name!r} is not among --models {' '.join(spec.models)}")
+        if not file.is_file():
+            raise NeecoError(f"--weights {name}: {file}: no such file")
+    teaching = spec.teaching
+    for option, value in (("--steps", teaching.steps), ("--size", teaching.side), ("--batch", teaching.batch)):
+        if value is not None and value < 1:
+            raise NeecoError(f"{option}: {value} is none at all; give at least 1")
+
+
+def _conditions(spec: DownstreamSpec) -> list[Condition]:
+    names = [data.name for data in spec.teaching.sets]
+    for name in names:
+        if name in RESERVED or "+" in name or not name:
+            raise NeecoError(f"--sets {name}: this name has a meaning of its own; call the set otherwise")
+    if len(set(names)) < len(names):
+        raise NeecoError(f"--sets: a name stands twice in {' '.join(names)}; name each set differently")
+    words = default_conditions(names) if spec.conditions is None else spec.conditions
+    return [parse_condition(word, names) for word in dict.fromkeys(words)]
+
+
+def _splits(capture: Capture, asked: Sequence[str]) -> tuple[str, ...]:
+    for split in asked:
+        if split not in capture.splits:
+            raise NeecoError(f"--splits: {capture.root} has no split {split!r}; it has {', '.join(capture.splits)}")
+        if split == "train":
+            raise NeecoError("--splits: train: what is taught is not tested; choose other splits")
+        if not has_labels(capture, split):
+            raise NeecoError(f"--splits: {split}: no frame of it has a true mask in {capture.root}; nothing to test on")
+    held_out = [split for split in capture.splits if split != "train"]
+    found = tuple(asked) or tuple(split for split in held_out if has_labels(capture, split))
+    if not found:
+        raise NeecoError(
+            f"{capture.root}: no frame outside of split train has a true mask (truth/masks or reference_masks); "
+            "nothing to test on"
+        )
+    return found
+
+
+def _counts(
+    spec: DownstreamSpec, teaching: Teaching, capture: Capture, conditions: Sequence[Condition]
+) -> tuple[list[int], int]:
+    """The counts of labelled frames, and how many there are."""
+    for word in spec.real:
+        labelled_count(word, 10**9)
+    if not any(condition.real for condition in conditions) or set(spec.real) <= {"0"}:
+        return [0] if "0" in spec.real else [], 0
+    labelled = len(recorded_samples(capture, "train", teaching.classes, teaching.labels))
+    return sorted({labelled_count(word, labelled) for word in spec.real}), labelled
+
+
+def _check_boxes(spec: DownstreamSpec, capture: Capture, tested: Sequence[RecordedSample]) -> None:
+    for name in spec.models:
+        if model_class(name).answers == "boxes" and len(capture.instruments) > 1:
+            raise NeecoError(
+                f"--models {name}: {tested[0].masks.path}: labels do not tell the {len(capture.instruments)} "
+                "instruments apart, so there is no box of each; use a model that answers with masks"
+            )
+
+
+def _check_output(spec: DownstreamSpec) -> None:
+    """Raises NeecoError when `output` holds something else, or another capture's experiment."""
+    output = spec.output
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give another --output")
+    if not output.is_dir() or not any(output.iterdir()):
+        return
+    if not (output / FILE).exists():
+        if [entry.name for entry in output.iterdir()] == [JOBS]:
+            return  # stopped before its first result
+        raise NeecoError(f"{output}: not empty, and no downstream experiment; give another --output")
+    stored = read_json(output / FILE)
+    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA:
+        raise NeecoError(f"{output / FILE}: schema: is not {SCHEMA}; give another --output")
+    if stored["capture"] != str(spec.teaching.capture.absolute()):
+        raise NeecoError(f"{output / FILE}: capture: is about {stored['capture']}; give another --output")
+
+
+def _jobs(
+    spec: DownstreamSpec, teaching: Teaching, conditions: Sequence[Condition], counts: Sequence[int]
+) -> tuple[DownstreamJob, ...]:
+    jobs = []
+    for fold in range(spec.folds):  # the first fold of everything comes first: a look halfway sees all
+        for model in spec.models:
+            for condition in conditions:
+                for real in [count for count in counts if bool(count) == condition.real]:
+                    folder = job_folder(spec.output, model, condition.name, real, fold)
+                    jobs.append(DownstreamJob(teaching, model, condition, real, fold, folder, spec.weights.get(model)))
+    return tuple(jobs)
+
+
+def _notes(spec: DownstreamSpec, teaching: Teaching, counts: Sequence[int]) -> list[str]:
+    notes = []
+    if spec.folds < 3:
+        notes.append("intervals of fewer than three folds are wide or absent; give --folds 5 before concluding")
+    if few := [count for count in counts if 0 < count < HELD_BACK_EVERY]:
+        notes.append(
+            f"{', '.join(map(str, few))} labelled frames: too few to hold one back; the last weights are taken"
+        )
+    if teaching.labels is not None:
+        notes.append(f"labels of recorded training frames: {teaching.labels}; tests are scored by the capture's truth")
+    return notes
+
+
+def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the jobs' courses say of the numbers."""
+    notes = [f"failed: {line}" for line in failed_jobs({"jobs": results})]
+    done = [job for job in results if "error" not in job]
+    late = sorted({f"{job['model']}, {job['condition']}" for job in done if job["still_learning"]})
+    if late:
+        notes.append(f"still getting better at the last step: {'; '.join(late)}; give more --steps")
+    for model in dict.fromkeys(job["model"] for job in done):
+        gaps = [
+            scores["precision"] - scores["recall"]
+            for job in done
+            if job["model"] == model and job["condition"] == REAL
+            for scores in job["splits"].values()
+            if scores.get("precision") is not None and scores.get("recall") is not None
+        ]
+        if gaps and abs(sum(gaps) / len(gaps)) > 0.02:
+            how = "over-segments" if sum(gaps) < 0 else "under-segments"
+            notes.append(
+                f"{model}: taught with labelled frames alone it {how} (precision - recall "
+                f"{sum(gaps) / len(gaps):+.3f}); that flatters labels with the opposite fault"
+            )
+    return notes
+
+
+def _made_by(path: Path) -> dict[str, Any] | None:
+    """What dataset.json says of how a set was drawn, and its fingerprint."""
+    file = path / INFO
+    if not file.is_file():
+        return None
+    stated = read_json(file)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return {"settings": stated.get("settings"), "scene": stated.get("scene"), "sha256": digest}

@@ -1,0 +1,105 @@
+"""`dfine`: a small D-FINE (Peng et al., "D-FINE: redefine regression task in DETRs as fine-grained distribution
+refinement", ICLR 2025) as transformers has it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neeco.experiments.downstream.model import Boxes, Prediction, lacking
+from neeco.experiments.downstream.samples import Example
+from neeco.experiments.downstream.torch_training import TorchModel
+
+STAGES = (64, 256, 512, 1024)  # channels of the backbone's stages; the last two are detected on
+WIDTH = 128
+QUERIES = 20  # boxes it can tell: few instruments are in an image
+
+
+class DFine(TorchModel):
+    """Finds a box for each class of each instrument."""
+
+    model = "dfine"
+    answers = "boxes"
+    side = 192
+    multiple = 32
+    steps = 800
+    batch = 8
+    learning_rate = 8e-4
+
+    @classmethod
+    def unmet(cls) -> str | None:
+        return lacking("transformers", "pycocotools")
+
+    def build(self, classes: int) -> nn.Module:
+        from transformers import DFineConfig, DFineForObjectDetection
+        from transformers.models.hgnet_v2 import HGNetV2Config
+
+        backbone = HGNetV2Config(  # type: ignore[call-arg]
+            stem_channels=[3, 16, 16],
+            stage_in_channels=[16, *STAGES[:3]],
+            stage_mid_channels=[16, 32, 64, 128],
+            stage_out_channels=list(STAGES),
+            stage_num_blocks=[1, 1, 2, 1],
+            stage_numb_of_layers=[3, 3, 3, 3],
+            stage_downsample=[False, True, True, True],
+            stage_light_block=[False, False, True, True],
+            stage_kernel_size=[3, 3, 5, 5],
+            out_features=["stage3", "stage4"],
+            hidden_sizes=list(STAGES),
+            depths=[3, 4, 6, 3],
+            embedding_size=32,
+            use_learnable_affine_block=True,
+        )
+        config = DFineConfig(  # type: ignore[call-arg]
+            backbone_config=backbone,
+            freeze_backbone_batch_norms=False,
+            num_labels=classes,
+            encoder_in_channels=list(STAGES[2:]),
+            feat_strides=[16, 32],
+            num_feature_levels=2,
+            encode_proj_layers=[1],
+            encoder_hidden_dim=WIDTH,
+            d_model=WIDTH,
+            decoder_in_channels=[WIDTH, WIDTH],
+            encoder_ffn_dim=4 * WIDTH,
+            decoder_ffn_dim=4 * WIDTH,
+            decoder_layers=3,
+            num_queries=QUERIES,
+            decoder_n_points=[6, 6],
+            num_denoising=20,
+            hidden_expansion=0.34,
+            depth_mult=0.5,
+        )
+        return DFineForObjectDetection(config)
+
+    def loss(self, module: Any, images: Tensor, examples: Sequence[Example]) -> Tensor:
+        labels = [_labels(example, images.device) for example in examples]
+        return module(pixel_values=images, labels=labels).loss
+
+    def answer(self, module: Any, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Prediction]:
+        output = module(pixel_values=images)
+        scores = output.logits.sigmoid().float().cpu().numpy()  # [B, Q, C]
+        boxes = output.pred_boxes.float().cpu().numpy()  # [B, Q, 4] centre and size in [0, 1]
+        answers: list[Prediction] = []
+        for score, box, (height, width) in zip(scores, boxes, sizes, strict=True):
+            corners = np.concatenate([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2], 1)
+            corners = corners.clip(0, 1) * np.array([width, height, width, height])
+            queries, classes = np.unravel_index(np.argsort(-score, axis=None, kind="stable"), score.shape)
+            answers.append(Boxes(corners[queries].astype(np.float64), classes + 1, score[queries, classes]))
+        return answers
+
+
+def _labels(example: Example, device: torch.device) -> dict[str, Tensor]:
+    """What transformers wants of one image: classes from 0, boxes as centre and size, shares of the image's."""
+    boxes, classes = example.boxes()
+    height, width = example.classes.shape
+    scale = np.array([width, height, width, height], np.float64)
+    centres = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]], 1) / scale
+    return {
+        "class_labels": torch.from_numpy(classes - 1).to(device),
+        "boxes": torch.from_numpy(centres.astype(np.float32)).to(device),
+    }

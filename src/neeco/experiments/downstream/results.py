@@ -1,0 +1,190 @@
+"""From jobs to what they say: means over folds, paired differences with their intervals, and answers in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from neeco.experiments.downstream.conditions import AUGMENT, REAL
+from neeco.experiments.downstream.scores import BOX_SCORES, MASK_SCORES
+from neeco.experiments.summary import spread
+
+MAIN = {"masks": "iou", "boxes": "ap"}
+TITLES = {
+    "iou": "IoU",
+    "dice": "Dice",
+    "precision": "precision",
+    "recall": "recall",
+    "boundary_f": "boundary F",
+    "iou_jaws": "IoU near the jaws",
+    "ap": "AP50-95",
+    "ap50": "AP50",
+    "ap75": "AP75",
+    "box_precision": "precision",
+    "box_recall": "recall",
+}
+CONFIDENCE = 0.95  # of intervals
+LEAST_FOLDS = 2  # for an interval
+
+Row = Mapping[str, Any]
+
+
+def metrics_of(jobs: Sequence[Row], answers: str) -> list[str]:
+    """The scores that these jobs have, the usual ones first, then those of classes."""
+    usual = [*MASK_SCORES, "iou_jaws"] if answers == "masks" else list(BOX_SCORES)
+    found = dict.fromkeys(
+        key
+        for job in jobs
+        for scores in job["splits"].values()
+        for key, value in scores.items()
+        if isinstance(value, float)
+    )
+    return [key for key in usual if key in found] + [key for key in found if "." in key]
+
+
+def summarise_folds(jobs: Sequence[Row], models: Mapping[str, str], splits: Sequence[str]) -> list[dict[str, Any]]:
+    """A row per model, condition, count of labelled frames and split; every score as {"mean", "std", "n"} over folds.
+
+    models: what each answers with, by name. `failed` counts the folds that did not finish.
+    """
+    rows = []
+    for model, condition, real in dict.fromkeys((job["model"], job["condition"], job["real"]) for job in jobs):
+        same = [job for job in jobs if (job["model"], job["condition"], job["real"]) == (model, condition, real)]
+        done = [job for job in same if "error" not in job]
+        metrics = metrics_of([job for job in jobs if job["model"] == model], models[model])
+        for split in splits:
+            row: dict[str, Any] = {"model": model, "condition": condition, "real": real, "split": split}
+            row["failed"] = len(same) - len(done)
+            row |= {metric: spread([job["splits"].get(split, {}).get(metric) for job in done]) for metric in metrics}
+            rows.append(row)
+    return rows
+
+
+def paired(
+    jobs: Sequence[Row], first: tuple[str, str, int], second: tuple[str, str, int], split: str, metric: str
+) -> dict[str, Any] | None:
+    """How much better `first` (model, condition, labelled frames) does than `second` on the folds that both finished:
+    the mean difference, and the interval in which its mean lies with 95 % (Student's t; None for a single fold)."""
+    scores = []
+    for wanted in (first, second):
+        found = [job for job in jobs if (job["model"], job["condition"], job["real"]) == wanted and "error" not in job]
+        scores.append({job["fold"]: job["splits"].get(split, {}).get(metric) for job in found})
+    folds = [fold for fold in scores[0] if scores[0][fold] is not None and scores[1].get(fold) is not None]
+    if not folds:
+        return None
+    differences = np.array([scores[0][fold] - scores[1][fold] for fold in folds])
+    row: dict[str, Any] = {"model": first[0], "split": split, "metric": metric, "condition": first[1], "real": first[2]}
+    row |= {"against": second[1], "against_real": second[2], "folds": len(folds)}
+    row |= {"difference": float(differences.mean()), "low": None, "high": None}
+    if len(folds) >= LEAST_FOLDS:
+        reach = stats.t.ppf((1 + CONFIDENCE) / 2, len(folds) - 1) * differences.std(ddof=1) / math.sqrt(len(folds))
+        row |= {"low": row["difference"] - float(reach), "high": row["difference"] + float(reach)}
+    return row
+
+
+def comparisons(
+    jobs: Sequence[Row], models: Mapping[str, str], splits: Sequence[str], sets: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The differences that the experiment is about.
+
+    With drawn images against without, at every count of labelled frames; drawn images alone against the most labelled
+    frames; the first set against each other set, alone and beside labelled frames; every condition that does something
+    to a set (`set+soft`) against the set as it is.
+    """
+    keys = list(dict.fromkeys((job["model"], job["condition"], job["real"]) for job in jobs))
+    rows = []
+    for first in keys:
+        for second in _against(first, keys, sets):
+            for split in splits:
+                for metric in metrics_of([job for job in jobs if job["model"] == first[0]], models[first[0]]):
+                    row = paired(jobs, first, second, split, metric)
+                    rows += [] if row is None else [row]
+    return rows
+
+
+def _against(
+    first: tuple[str, str, int], keys: Sequence[tuple[str, str, int]], sets: Sequence[str]
+) -> list[tuple[str, str, int]]:
+    model, condition, real = first
+    words = condition.split("+")
+    drawn = [word for word in words if word in sets]
+    wanted: list[tuple[str, str, int]] = []
+    if not drawn:
+        plain = "+".join(word for word in words if word != AUGMENT)
+        return [key for key in keys if key == (model, plain, real) and key != first]
+    if REAL in words:
+        wanted += [(model, REAL, real), (model, f"{REAL}+{AUGMENT}", real)]
+    else:
+        most = max((key[2] for key in keys if key[0] == model), default=0)
+        wanted += [(model, REAL, most)]
+    rest = "+".join(word for word in words if word in sets or word == REAL)
+    if rest != condition:  # how the set is used
+        wanted += [(model, rest, real)]
+    if drawn == [sets[0]]:
+        wanted += [(model, "+".join(other if word == sets[0] else word for word in words), real) for other in sets[1:]]
+    return [key for key in dict.fromkeys(wanted) if key in keys and key != first]
+
+
+def answers_of(document: Row) -> list[str]:
+    """What the numbers say, a sentence each, for every model and split."""
+    told = []
+    for model in document["models"]:
+        metric = MAIN[model["answers"]]
+        rows = [row for row in document["summary"] if row["model"] == model["name"]]
+        for split in document["splits"]:
+            of_split = [row for row in rows if row["split"] == split and row[metric]["n"]]
+            told += [f"{model['name']}, {split}: {text}" for text in _answers(of_split, document, model, split, metric)]
+    return told
+
+
+def _answers(rows: Sequence[Row], document: Row, model: Row, split: str, metric: str) -> list[str]:
+    title, sets = TITLES[metric], [entry["name"] for entry in document["sets"]]
+    real = sorted((row["real"], row[metric]["mean"]) for row in rows if row["condition"] == REAL)
+    told = []
+    for row in rows:
+        words = row["condition"].split("+")
+        drawn = [entry for entry in document["sets"] if entry["name"] in words]
+        if not drawn or not real or set(words) - set(sets) - {REAL}:
+            continue
+        value, count = row[metric]["mean"], " and ".join(f"{entry['images']:,} of {entry['name']}" for entry in drawn)
+        if REAL not in words:
+            share = 100 * value / real[-1][1] if real[-1][1] else math.nan
+            told.append(
+                f"{count} drawn images and no manual label: {title} {value:.3f}, {share:.1f} % of what "
+                f"{real[-1][0]} labelled frames alone teach ({real[-1][1]:.3f})"
+            )
+            continue
+        as_many = equivalent(real, value)
+        sure = _sure(row, document, model, split, metric)
+        told.append(f"{row['real']} labelled frames and {count} drawn: {title} {value:.3f}, {as_many}{sure}")
+    return told
+
+
+def _sure(row: Row, document: Row, model: Row, split: str, metric: str) -> str:
+    """What the paired difference to the same labelled frames alone allows to say."""
+    for entry in document["paired"]:
+        same = (entry["model"], entry["split"], entry["metric"]) == (model["name"], split, metric)
+        if same and (entry["condition"], entry["real"]) == (row["condition"], row["real"]) and entry["against"] == REAL:
+            if entry["low"] is None:
+                return f" ({entry['difference']:+.3f} against them alone; one fold has no interval)"
+            verdict = "helps" if entry["low"] > 0 else "hurts" if entry["high"] < 0 else "no difference shown"
+            return f": {verdict} ({entry['difference']:+.3f}, {entry['low']:+.3f} to {entry['high']:+.3f})"
+    return ""
+
+
+def equivalent(real: Sequence[tuple[int, float]], value: float) -> str:
+    """As how many labelled frames alone: the curve of (frames, score) is read between its points along log frames."""
+    counts, scores = [count for count, _ in real], list(np.maximum.accumulate([score for _, score in real]))
+    if value >= scores[-1]:
+        return f"at least as good as {counts[-1]} labelled frames alone"
+    if value < scores[0]:
+        return f"not as good as {counts[0]} labelled frames alone"
+    after = next(k for k, score in enumerate(scores) if score > value)
+    low, high = scores[after - 1], scores[after]
+    share = (value - low) / (high - low)
+    as_many = counts[after - 1] * (counts[after] / counts[after - 1]) ** share
+    return f"as good as about {as_many:.0f} labelled frames alone"

@@ -1,0 +1,257 @@
+"""Labelled images to learn from and to be tested on: recorded frames, and data sets of drawn images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image, read_labels
+from neeco.capture.model import Capture, Frame
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_folders import Masks, open_masks, open_truth
+from neeco.evaluation.mask_metrics import TRUTH_PARTS
+from neeco.files import read_json
+
+ClassNames = Literal["instrument", "parts"]
+Edges = Literal["hard", "soft", "ignore"]
+CLASSES: Mapping[str, tuple[str, ...]] = {"instrument": ("instrument",), "parts": ("shaft", "wrist", "jaws")}
+JAWS = ("jaw_left", "jaw_right")  # one class: which of them is left is a name that images do not show
+INFO = "dataset.json"
+DRAWN_IN = "images"
+MASK = 255  # an id that means instrument and nothing more, as in black and white masks
+
+
+@dataclass(frozen=True)
+class Example:
+    """One image with its labels, in pixels."""
+
+    image: np.ndarray  # uint8 [H, W, 3]
+    classes: np.ndarray  # uint8 [H, W], 0 tissue, else number of the class, from 1
+    instruments: np.ndarray  # uint8 [H, W], 0 tissue, else number of the instrument, from 1
+    counted: np.ndarray | None = None  # bool [H, W], False where nothing may be learned or judged; None: all count
+    share: np.ndarray | None = None  # float32 [H, W], how much of a pixel is instrument; None: all or nothing
+
+    def boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class of each instrument, and the classes [n]."""
+        codes = self.instruments.astype(np.int64) * 256 + self.classes
+        boxes, classes = [], []
+        for code in np.unique(codes[self.classes > 0]):
+            rows, columns = np.nonzero(codes == code)
+            boxes.append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
+            classes.append(code % 256)
+        return np.array(boxes, np.float64).reshape(-1, 4), np.array(classes, np.int64)
+
+
+class Sample(Protocol):
+    """Where one example lies."""
+
+    @property
+    def name(self) -> str:
+        """What the image is called."""
+        ...
+
+    def load(self) -> Example:
+        """Read it. Raises NeecoError."""
+        ...
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What the ids of label images mean: the number of the class and of the instrument, uint8 [256] each."""
+
+    classes: np.ndarray
+    instruments: np.ndarray
+
+    def unknown(self, ids: np.ndarray) -> list[int]:
+        """Those of `ids` that belong to no class."""
+        return [int(number) for number in np.unique(ids) if number and not self.classes[number]]
+
+
+@dataclass(frozen=True)
+class RecordedSample:
+    """A recorded frame; its labels are the truth's, or somebody's."""
+
+    frame: Frame
+    masks: Masks
+    meaning: Meaning
+
+    @property
+    def name(self) -> str:
+        return self.frame.name
+
+    def load(self) -> Example:
+        """Raises NeecoError where the labels are of another size than the image."""
+        ids = self.masks.load(self.name)
+        pixels = (self.frame.load_image().numpy() * 255).round().astype(np.uint8)
+        counted = self.frame.load_mask()
+        if ids.shape != pixels.shape[:2]:
+            raise NeecoError(
+                f"{self.masks.files[self.name]}: is {ids.shape[1]}x{ids.shape[0]}, its frame is "
+                f"{pixels.shape[1]}x{pixels.shape[0]}; label the frames as recorded"
+            )
+        return Example(
+            pixels,
+            self.meaning.classes[ids],
+            self.meaning.instruments[ids],
+            None if counted is None else counted.numpy(),
+        )
+
+
+@dataclass(frozen=True)
+class DrawnSample:
+    """An image of a data set. `soft`, `ignore`: read where they are to be used."""
+
+    image: Path
+    labels: Path
+    meaning: Meaning
+    soft: Path | None = None
+    ignore: Path | None = None
+
+    @property
+    def name(self) -> str:
+        return self.image.stem
+
+    def load(self) -> Example:
+        """Raises NeecoError where a file is of another size, or has an id that means nothing."""
+        size = image_size(self.image)
+        ids = read_labels(self.labels, size).numpy()
+        if unknown := self.meaning.unknown(ids):
+            raise NeecoError(f"{self.labels}: id {unknown[0]} means nothing; name it in {INFO}, or draw the set again")
+        pixels = (read_image(self.image).numpy() * 255).round().astype(np.uint8)
+        counted = None if self.ignore is None else _grey(self.ignore, size) < 128
+        share = None if self.soft is None else _grey(self.soft, size).astype(np.float32) / 255
+        return Example(pixels, self.meaning.classes[ids], self.meaning.instruments[ids], counted, share)
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A folder of drawn images to learn from. `count`: use so many of them, None for all."""
+
+    name: str
+    path: Path
+    count: int | None = None
+
+
+def recorded_samples(
+    capture: Capture, split: str, classes: ClassNames, labels: Path | None = None
+) -> tuple[RecordedSample, ...]:
+    """The labelled frames of a split: by the capture's truth, or by a folder of masks named as the frames.
+
+    Frames without a label are left out. Raises NeecoError where there is none at all, or parts are asked for and the
+    labels tell none.
+    """
+    if labels is None:
+        masks = _truth(capture, split)
+    else:
+        masks = open_masks(labels, option="--labels")
+    frames = [frame for frame in capture.split(split) if frame.name in masks.files]
+    if not frames:
+        where = f"{capture.root}: split {split}" if labels is None else f"--labels {labels}"
+        raise NeecoError(f"{where}: no frame has a label; give --labels FOLDER with masks named as the frames")
+    if masks.names is None:
+        if classes == "parts":
+            raise NeecoError(f"--classes parts: the labels in {masks.path} tell no parts; use --classes instrument")
+        meaning = _meaning({number: (1, "instrument") for number in (1, MASK)}, classes)
+    else:
+        meaning = _meaning({number: (1, part) for number, part in masks.names.items()}, classes)
+    return tuple(RecordedSample(frame, masks, meaning) for frame in frames)
+
+
+def has_labels(capture: Capture, split: str) -> bool:
+    """Whether any frame of the split has a true mask."""
+    try:
+        return bool(_truth(capture, split).files)
+    except NeecoError:
+        return False
+
+
+def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[int, int]) -> tuple[DrawnSample, ...]:
+    """The images of a data set in their order, each with its labels; the first `count` of them.
+
+    A set that `neeco synthesize` wrote says what its ids mean; of another's, masks/ tell instrument from tissue. size:
+    (width, height) that they must have. Raises NeecoError.
+    """
+    folder = data.path / DRAWN_IN
+    if not folder.is_dir():
+        raise NeecoError(f"--sets {data.name}: {data.path}: no folder {DRAWN_IN}/; give what `neeco synthesize` wrote")
+    images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
+    if not images:
+        raise NeecoError(f"--sets {data.name}: {folder}: has no image; give what `neeco synthesize` wrote")
+    if data.count is not None and data.count > len(images):
+        raise NeecoError(f"--sets {data.name}: {data.path}: has {len(images)} images, not {data.count}; draw more")
+    labels, meaning = _labels_of(data, classes)
+    samples = [DrawnSample(image, data.path / labels / f"{image.stem}.png", meaning) for image in images[: data.count]]
+    for sample in samples:
+        if not sample.labels.is_file():
+            raise NeecoError(f"--sets {data.name}: {sample.labels}: no such file; every image needs its labels")
+    found = image_size(samples[0].image)
+    if found != size:
+        raise NeecoError(
+            f"--sets {data.name}: {samples[0].image} is {found[0]}x{found[1]}, the capture's frames are "
+            f"{size[0]}x{size[1]}; draw it from a run of this capture"
+        )
+    samples[0].load()  # whether its ids mean anything is known before the work
+    return tuple(_with_edges(sample, data, edges) for sample in samples)
+
+
+def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample:
+    """The sample with the file that says how its edges are to be learned."""
+    if edges == "hard":
+        return sample
+    file = data.path / edges / f"{sample.name}.png"
+    if not file.is_file():
+        raise NeecoError(f"--sets {data.name}: {file}: no such file; draw the set again, or use {data.name}+hard")
+    return replace(sample, soft=file) if edges == "soft" else replace(sample, ignore=file)
+
+
+def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, Meaning]:
+    """In which folder of a data set its labels are, and what they mean."""
+    file = data.path / INFO
+    if not file.is_file():
+        if classes == "parts":
+            raise NeecoError(
+                f"--sets {data.name}: {file}: no such file, so no parts are known; use --classes instrument"
+            )
+        return "masks", _meaning({number: (1, "instrument") for number in (1, MASK)}, classes)
+    stated = read_json(file)
+    try:
+        entries = [(int(entry["id"]), str(entry["instrument"]), str(entry["part"])) for entry in stated["ids"][1:]]
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise NeecoError(f"--sets {data.name}: {file}: ids: not as `neeco synthesize` writes them") from None
+    instruments = list(dict.fromkeys(instrument for _, instrument, _ in entries))
+    parts = {number: (instruments.index(instrument) + 1, part) for number, instrument, part in entries}
+    if classes == "parts" and not {part for _, part in parts.values()} & set(TRUTH_PARTS):
+        raise NeecoError(f"--sets {data.name}: {data.path}: its labels tell no parts; use --classes instrument")
+    return "parts", _meaning(parts, classes)
+
+
+def _meaning(parts: Mapping[int, tuple[int, str]], classes: ClassNames) -> Meaning:
+    """From (number of the instrument, part) by id."""
+    class_of, instrument_of = np.zeros(256, np.uint8), np.zeros(256, np.uint8)
+    for number, (instrument, part) in parts.items():
+        name = "instrument" if classes == "instrument" else "jaws" if part in JAWS else part
+        names = CLASSES[classes]
+        class_of[number] = names.index(name) + 1 if name in names else 0
+        instrument_of[number] = instrument
+    return Meaning(class_of, instrument_of)
+
+
+def _truth(capture: Capture, split: str) -> Masks:
+    return open_truth(capture, splits=[split])
+
+
+def _grey(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """uint8 [H, W] of an 8-bit grey image."""
+    return np.asarray(open_image(file, size).convert("L"))
+
+
+def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
+    """(width, height) of recorded frames. Raises NeecoError where they differ."""
+    sizes = {(sample.frame.camera.width, sample.frame.camera.height) for sample in samples}
+    if len(sizes) > 1:
+        raise NeecoError(f"{samples[0].frame.image_path.parent}: frames of several sizes; make captures of one size")
+    return next(iter(sizes))
