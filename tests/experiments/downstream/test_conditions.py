@@ -66,7 +66,7 @@ def test_usual_conditions_are_each_set_alone_and_beside_labelled_frames() -> Non
 def test_counts_of_labelled_frames_are_numbers_or_all() -> None:
     assert [labelled_count(word, 30) for word in ("0", "7", "30", "all")] == [0, 7, 30, 30]
     for word in ("-1", "half", "1.5", ""):
-        with pytest.raises(NeecoError, match="--real: .* neither a number of labelled frames nor all"):
+        with pytest.raises(NeecoError, match=r"--real: .* neither a number of labelled frames nor all"):
             labelled_count(word, 30)
     with pytest.raises(NeecoError, match="31 labelled frames are asked for, the capture has 30; use all"):
         labelled_count("31", 30)
@@ -115,5 +115,5 @@ def test_what_is_held_back_is_not_learned_and_nothing_is_lost(count: int, fold: 
 
 def test_each_fold_holds_back_other_images() -> None:
     kept = [held_back(range(20), fold)[1] for fold in range(5)]
-    assert sorted(sum(kept, [])) == list(range(20))
+    assert sorted(frame for fold in kept for frame in fold) == list(range(20))
     assert held_back(range(20), 5) == held_back(range(20), 0)
