@@ -319,7 +319,8 @@ def _notes(spec: DownstreamSpec, teaching: Teaching, counts: Sequence[int]) -> l
         notes.append("intervals of fewer than three folds are wide or absent; give --folds 5 before concluding")
     if few := [count for count in counts if 0 < count < HELD_BACK_EVERY]:
         notes.append(
-            f"{', '.join(map(str, few))} labelled frames: too few to hold one back; the last weights are taken"
+            f"{', '.join(map(str, few))} labelled frames: too few to hold one back; taught with them alone the last "
+            "weights are taken, beside a set those that do best on drawn images"
         )
     if teaching.labels is not None:
         notes.append(f"labels of recorded training frames: {teaching.labels}; tests are scored by the capture's truth")

@@ -242,6 +242,7 @@ def _plain(row: dict[str, float]) -> dict[str, float | None]:
 def as_settings(teaching: Teaching) -> dict[str, Any]:
     """`teaching` as plain values, for a file."""
     values = asdict(teaching)
+    values["splits"] = list(teaching.splits)
     values["capture"] = str(teaching.capture.absolute())
     values["labels"] = None if teaching.labels is None else str(teaching.labels.absolute())
     values["sets"] = [
