@@ -23,6 +23,7 @@ WITH_BAD_PATH = {
     "render": [MISSING, "--output", "drawn"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
     "score-masks": [MISSING, MISSING],
+    "downstream": [MISSING, "--output", "taught"],
     "ablate": [MISSING, "--output", "ablated"],
     "demo": ["--output", "taken"],
 }
