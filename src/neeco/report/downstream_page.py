@@ -27,6 +27,7 @@ from neeco.report.downstream_figures import (
     score_chart,
     signed,
     verdict_of,
+    with_labelled,
 )
 from neeco.report.downstream_shots import Gallery, galleries
 from neeco.report.render import REPORT_FILE, split_counts, write_page
@@ -170,7 +171,7 @@ def _as_many(row: Mapping[str, Any], experiment: Experiment) -> str:
     same = [
         entry
         for entry in experiment["summary"]
-        if (entry["model"], entry["split"]) == (row["model"], row["split"]) and entry[metric]["n"]
+        if (entry["model"], entry["split"]) == (row["model"], row["split"]) and entry.get(metric, {}).get("n")
     ]
     alone = sorted((entry["real"], entry[metric]["mean"]) for entry in same if entry["condition"] == REAL)
     means = [
@@ -265,7 +266,8 @@ def command_of(experiment: Experiment) -> str:
     words += ["--real", *("all" if count and count == experiment["labelled"] else str(count) for count in counts)]
     words += ["--folds", str(experiment["folds"])]
     conditions = list(dict.fromkeys(job["condition"] for job in jobs))
-    if not set(conditions) <= set(default_conditions([entry["name"] for entry in teaching["sets"]])):
+    defaults = default_conditions([entry["name"] for entry in teaching["sets"]])
+    if set(conditions) != {word for word in defaults if any(bool(count) == with_labelled(word) for count in counts)}:
         words += ["--conditions", *conditions]
     if teaching["labels"] is not None:
         words += ["--labels", teaching["labels"]]

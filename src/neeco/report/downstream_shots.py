@@ -125,7 +125,9 @@ def _pair(
     scored = [
         row
         for row in experiment["summary"]
-        if (row["model"], row["split"]) == wanted[:2] and sets_in(row["condition"], experiment) and row[metric]["n"]
+        if (row["model"], row["split"]) == wanted[:2]
+        and sets_in(row["condition"], experiment)
+        and row.get(metric, {}).get("n")
     ]
     if not scored:
         return None, None
