@@ -196,6 +196,19 @@ def test_without_sets_classical_augmentation_is_compared(capture, output):
     assert "--sets" not in text
 
 
+def test_as_good_as_is_read_over_the_same_folds(capture, output):
+    jobs = jobs_of(capture, output, models=("unet",), conditions=("real", "kinematic+real"), counts=(5, 20))
+    for job, value in zip(jobs, (0.2, 0.4, 0.3, 0.3, 0.8, 0.9, 0.0, 0.0), strict=True):
+        job["splits"]["test"]["iou"] = value
+    first = [job for job in jobs if job["fold"] == 0 or job["condition"] == "real"]
+    text, _ = page_of(output, experiment_of(capture, first), capture)
+    assert text.count("<small>as good as about 10</small>") == 2  # halfway from 5 to 20 on a logarithmic axis
+    for job in jobs:
+        job["splits"]["test"]["iou"] = 0.0
+    glance = page_of(output, experiment_of(capture, jobs), capture)[0].partition("In words")[0]
+    assert glance.count("<small>at least as good as 20</small>") == 2  # of the other split alone
+
+
 def test_failed_trainings_are_told_and_the_rest_is_shown(capture, output):
     jobs = jobs_of(capture, output, models=("unet",))
     lost = [

@@ -43,11 +43,12 @@ Experiment = Mapping[str, Any]
 class Glance:
     """Whether drawn images beside labelled frames help: a line per model, split and condition, a cell per count.
 
-    A cell: difference, verdict, and as good as how many labelled frames alone that is.
+    A cell: difference, verdict, and as good as how many labelled frames alone that is. `judged`: any has a verdict.
     """
 
     counts: tuple[int, ...]
     rows: tuple[tuple[str, str, str, tuple[tuple[str, str, str], ...]], ...]  # model, split, condition, cells
+    judged: bool
 
 
 def write_downstream_report(output: Path, experiment: dict[str, Any], capture: Capture) -> Path:
@@ -161,25 +162,24 @@ def _glance(experiment: Experiment) -> Glance:
         (*key, tuple(cells.get(count, ("–", "", "")) for count in counts))
         for key, cells in sorted(lines.items(), key=lambda line: order.index(line[0][:2]))
     ]
-    return Glance(counts, tuple(made))
+    return Glance(counts, tuple(made), any(verdict_of(row) for row in rows))
 
 
 def _as_many(row: Mapping[str, Any], experiment: Experiment) -> str:
-    """`as good as about 55`: how many labelled frames alone do as well as the first of a difference; "" where these
-    are of one number only."""
-    metric = row["metric"]
-    same = [
-        entry
-        for entry in experiment["summary"]
-        if (entry["model"], entry["split"]) == (row["model"], row["split"]) and entry.get(metric, {}).get("n")
-    ]
-    alone = sorted((entry["real"], entry[metric]["mean"]) for entry in same if entry["condition"] == REAL)
-    means = [
-        entry[metric]["mean"]
-        for entry in same
-        if (entry["condition"], entry["real"]) == (row["condition"], row["real"])
-    ]
-    return equivalent(alone, means[0]).removesuffix(ALONE) if len(alone) > 1 and means else ""
+    """`as good as about 55`: how many labelled frames alone do as well as the first of a difference, over the folds
+    that all of these finished; "" where that cannot be read: of one number of frames only, or scores all 0."""
+    found: dict[tuple[str, int], dict[int, float]] = {}
+    for job in experiment["jobs"]:
+        value = job["splits"].get(row["split"], {}).get(row["metric"])
+        if job["model"] == row["model"] and value is not None:
+            found.setdefault((job["condition"], job["real"]), {})[job["fold"]] = value
+    first = found[row["condition"], row["real"]]
+    alone = {real: scores for (condition, real), scores in sorted(found.items()) if condition == REAL}
+    folds = set(first).intersection(*alone.values())
+    curve = [(real, mean_of([alone[real][fold] for fold in folds])) for real in sorted(alone)]
+    if len(curve) < 2 or not folds or not any(score for _, score in curve):
+        return ""
+    return equivalent(curve, mean_of([first[fold] for fold in folds])).removesuffix(ALONE)
 
 
 def _answers(experiment: Experiment) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
