@@ -45,9 +45,7 @@ class Yolo(Model):
     @classmethod
     def unmet(cls) -> str | None:
         if shutil.which(PROGRAM) is None:
-            return (
-                f"needs the program `{PROGRAM}` (ultralytics, AGPL) on the PATH; install it, or leave it out"
-            )
+            return f"needs the program `{PROGRAM}` (ultralytics, AGPL) on the PATH; install it, or leave it out"
         return None
 
     def fit(self, task: Task) -> Fitted:
