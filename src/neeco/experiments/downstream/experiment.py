@@ -82,7 +82,7 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
     if spec.workers > 1:
         require_ray()
     _check_models(spec)
-    device_of(spec.teaching.device)
+    device_of(spec.teaching.device, drawing=False)
     conditions = _conditions(spec)
     capture = read_checked(spec.teaching.capture, spec.teaching.transforms)
     teaching = replace(spec.teaching, splits=_splits(capture, spec.teaching.splits))

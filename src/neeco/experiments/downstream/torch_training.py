@@ -1,14 +1,17 @@
 """Training of models that are PyTorch modules: one loop for all of them.
 
-AdamW under one cycle of the learning rate (Smith and Topin, "Super-convergence", 2019), so many steps in every
-condition; of ten moments along the way the weights that did best on the images held back are kept.
+AdamW for so many steps in every condition; the learning rate rises for the first tenth of them and falls as a cosine
+(Loshchilov and Hutter, "SGDR", 2017). Of ten moments along the way the weights that did best on the images held back
+are kept.
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -69,9 +72,7 @@ class TorchModel(Model):
 
     def _train(self, module: nn.Module, task: Task) -> tuple[list[tuple[int, float]], int]:
         optimizer = torch.optim.AdamW(module.parameters(), self.learning_rate, weight_decay=self.weight_decay)
-        cycle = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.learning_rate, total_steps=task.steps, pct_start=WARM_UP
-        )
+        course = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_course, steps=task.steps))
         watched = _evenly(task.validation, MOST_VALIDATION)
         truth = [sample.load() for sample in watched]
         moments = {round(task.steps * (k + 1) / MOMENTS) for k in range(MOMENTS)} if truth else set()
@@ -87,7 +88,7 @@ class TorchModel(Model):
             loss.backward()
             nn.utils.clip_grad_norm_(module.parameters(), CLIP)
             optimizer.step()
-            cycle.step()
+            course.step()
             if step % TELL_EVERY == 0 or step == task.steps:
                 told = f"  validation {curve[-1][1]:.3f}" if curve else ""
                 task.tell(step / task.steps, f"step {step}  loss {loss.item():.3f}{told}")
@@ -112,6 +113,11 @@ class TorchModel(Model):
                 answers += self.answer(module, to_input(some, task), sizes)
         module.train(training)
         return answers
+
+
+def _course(step: int, steps: int) -> float:
+    """The learning rate at a step, as a share of the highest."""
+    return min((step + 1) / (1 + WARM_UP * steps), (1 + math.cos(math.pi * step / steps)) / 2)
 
 
 def to_input(images: Sequence[np.ndarray], task: Task) -> Tensor:

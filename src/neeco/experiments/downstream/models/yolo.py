@@ -1,0 +1,154 @@
+"""`yolo`: YOLO11 by the user's own `yolo` program (ultralytics), run as it is from its command line.
+
+That program is under the AGPL: it is never imported and no dependency of ours. It is given a folder in its own format
+and answers with text files; nothing else passes between the two. Its settings go to the job's folder.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from itertools import cycle, islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from neeco.errors import NeecoError
+from neeco.experiments.downstream.model import Boxes, Fitted, Model, Prediction, Task
+from neeco.experiments.downstream.samples import Example, Sample
+from neeco.files import write_text
+
+PROGRAM = "yolo"
+ARCHITECTURE = "yolo11n.yaml"  # from scratch: a name ending in .pt would be fetched
+NO_AUGMENTATION = (
+    *(f"{name}=0" for name in ("hsv_h", "hsv_s", "hsv_v", "degrees", "translate", "scale", "shear", "perspective")),
+    *(f"{name}=0" for name in ("flipud", "fliplr", "mosaic", "mixup", "erasing")),
+)
+TOLD = 3  # last lines of the program's complaint that are passed on
+
+
+class Yolo(Model):
+    """Finds a box for each class of each instrument. Without `augment` the program's own augmentation is switched
+    off."""
+
+    model = "yolo"
+    answers = "boxes"
+    side = 160
+    multiple = 32
+    steps = 400
+    batch = 8
+    accepts_weights = False  # they are pickles: for that program alone to open
+
+    @classmethod
+    def unmet(cls) -> str | None:
+        if shutil.which(PROGRAM) is None:
+            return f"needs the program `{PROGRAM}` (ultralytics, AGPL) on the PATH; install it, or leave it out"
+        return None
+
+    def fit(self, task: Task) -> Fitted:
+        """Train by the program (see `Model.fit`). Raises NeecoError with its last words when it fails."""
+        work = (task.folder / "yolo").absolute()
+        shutil.rmtree(work, ignore_errors=True)
+        learned = _write_images(work / "data", "train", task.feed.sources)
+        kept = _write_images(work / "data", "val", [task.validation] if task.validation else task.feed.sources[:1])
+        lists = {"train": _equal_shares(learned), "val": [path for paths in kept for path in paths]}
+        for name, paths in lists.items():
+            write_text(work / f"{name}.txt", "".join(f"{path}\n" for path in paths))
+        names = "".join(f"  {k}: {name}\n" for k, name in enumerate(task.classes))
+        write_text(work / "data.yaml", f"train: {work / 'train.txt'}\nval: {work / 'val.txt'}\nnames:\n{names}")
+        epochs = max(1, round(task.steps * task.batch / len(lists["train"])))
+        task.tell(0.0, f"yolo: {epochs} epochs of {len(lists['train'])} images")
+        settings = [f"epochs={epochs}", f"batch={task.batch}", f"imgsz={max(task.size)}", f"seed={task.seed}"]
+        settings += [f"device={_device(task)}", f"project={work}", "name=train", "workers=0", "plots=False"]
+        settings += [] if task.feed.augment else NO_AUGMENTATION
+        _run(work, ["detect", "train", f"data={work / 'data.yaml'}", f"model={ARCHITECTURE}", *settings])
+        weights = work / "train" / "weights" / "best.pt"
+        if not weights.is_file():
+            raise NeecoError(f"{weights}: {PROGRAM} wrote no weights; see {work / 'train'}")
+        shutil.rmtree(work / "data")
+
+        def predict(images: Sequence[np.ndarray]) -> list[Prediction]:
+            return _predict(work, weights, images, task)
+
+        return Fitted(predict, task.steps)
+
+
+def _write_images(folder: Path, split: str, sources: Sequence[Sequence[Sample]]) -> list[list[Path]]:
+    """Write every sample as the program reads them; returns the images' paths of each source."""
+    paths: list[list[Path]] = []
+    for number, source in enumerate(sources):
+        paths.append([])
+        for index, sample in enumerate(source):
+            example, stem = sample.load(), f"{split}{number}_{index:06d}"
+            image = folder / "images" / f"{stem}.png"
+            image.parent.mkdir(parents=True, exist_ok=True)
+            if not cv2.imwrite(str(image), example.image[..., ::-1]):
+                raise NeecoError(f"{image}: cannot be written; check the disk")
+            write_text(folder / "labels" / f"{stem}.txt", _lines(example))
+            paths[-1].append(image)
+    return paths
+
+
+def _lines(example: Example) -> str:
+    """`class x y width height` per box, centre and size as shares of the image."""
+    boxes, classes = example.boxes()
+    height, width = example.classes.shape
+    scale = np.array([width, height, width, height])
+    shares = np.concatenate([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]], 1) / scale
+    return "".join(
+        f"{number - 1} {' '.join(f'{value:.6f}' for value in row)}\n"
+        for number, row in zip(classes, shares, strict=True)
+    )
+
+
+def _equal_shares(sources: Sequence[Sequence[Path]]) -> list[Path]:
+    """Every source's images as often as the largest's, as in our own batches (`feed.Feed`)."""
+    most = max(map(len, sources))
+    return [path for paths in sources for path in islice(cycle(paths), most)]
+
+
+def _device(task: Task) -> str:
+    return "cpu" if task.device.type == "cpu" else str(task.device.index or 0)
+
+
+def _run(work: Path, words: Sequence[str]) -> None:
+    environment = os.environ | {"YOLO_CONFIG_DIR": str(work / "settings"), "YOLO_OFFLINE": "true"}
+    done = subprocess.run(
+        [PROGRAM, *words], env=environment, cwd=work, capture_output=True, text=True, errors="replace", check=False
+    )
+    write_text(work / f"{words[1]}.log", done.stdout + done.stderr)
+    if done.returncode:
+        last = " ".join((done.stderr or done.stdout).strip().splitlines()[-TOLD:])
+        raise NeecoError(f"{PROGRAM} {words[1]} failed: {last}; see {work / words[1]}.log")
+
+
+def _predict(work: Path, weights: Path, images: Sequence[np.ndarray], task: Task) -> list[Prediction]:
+    shutil.rmtree(work / "asked", ignore_errors=True)
+    shutil.rmtree(work / "predict", ignore_errors=True)
+    (work / "asked").mkdir()
+    for index, image in enumerate(images):
+        cv2.imwrite(str(work / "asked" / f"{index:06d}.png"), np.ascontiguousarray(image[..., ::-1]))
+    words = [f"model={weights}", f"source={work / 'asked'}", f"imgsz={max(task.size)}", "conf=0.01", "save=False"]
+    words += ["save_txt=True", "save_conf=True", f"project={work}", "name=predict", f"device={_device(task)}"]
+    _run(work, ["detect", "predict", *words])
+    shutil.rmtree(work / "asked")
+    return [_boxes(work / "predict" / "labels" / f"{index:06d}.txt", image) for index, image in enumerate(images)]
+
+
+def _boxes(file: Path, image: np.ndarray) -> Boxes:
+    """What the program wrote of one image: no file where it found nothing."""
+    lines = file.read_text().splitlines() if file.is_file() else []
+    try:
+        rows = np.array([[float(word) for word in line.split()] for line in lines], np.float64).reshape(-1, 6)
+    except ValueError:
+        raise NeecoError(
+            f"{file}: not `class x y width height score` lines; this version of {PROGRAM} is unknown"
+        ) from None
+    rows = rows[np.argsort(-rows[:, 5], kind="stable")]
+    height, width = image.shape[:2]
+    centres, sizes = rows[:, 1:3], rows[:, 3:5]
+    corners = np.concatenate([centres - sizes / 2, centres + sizes / 2], 1) * np.array([width, height, width, height])
+    return Boxes(corners, rows[:, 0].astype(np.int64) + 1, rows[:, 5])
