@@ -188,9 +188,7 @@ def _found_ids(file: Path) -> set[int]:
 def _check_ids(files: Mapping[str, Path], known: set[int], meaning: str, option: str) -> None:
     for file in files.values():
         if unknown := sorted(_found_ids(file) - known):
-            raise NeecoError(
-                f"{file}: id {unknown[0]} is not among {meaning}; name it with --classes PART={unknown[0]}"
-            )
+            raise NeecoError(f"{file}: id {unknown[0]} is not among {meaning}; name it with {option} PART={unknown[0]}")
 
 
 def _guessed(path: Path, files: Mapping[str, Path], plain: bool, option: str) -> Masks:

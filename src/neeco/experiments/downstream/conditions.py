@@ -83,7 +83,10 @@ def labelled_frames(frames: int, count: int, fold: int, pick: Pick) -> list[int]
     edges = np.linspace(0, frames, count + 1)
     draws = np.random.default_rng(np.random.SeedSequence([fold, count])).random(count)
     places = edges[:-1] + draws * (edges[1:] - edges[:-1])
-    return sorted({min(int(place), frames - 1) for place in places})
+    chosen: list[int] = []
+    for place in places:  # a frame on the border of two stretches is taken once, and the next one after it
+        chosen.append(max(min(int(place), frames - 1), chosen[-1] + 1 if chosen else 0))
+    return chosen
 
 
 def held_back(samples: Sequence[T], fold: int) -> tuple[list[T], list[T]]:

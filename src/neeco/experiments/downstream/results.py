@@ -112,21 +112,25 @@ def _against(
     model, condition, real = first
     words = condition.split("+")
     drawn = [word for word in words if word in sets]
-    wanted: list[tuple[str, str, int]] = []
+    wanted: list[tuple[set[str], int]] = []
     if not drawn:
-        plain = "+".join(word for word in words if word != AUGMENT)
-        return [key for key in keys if key == (model, plain, real) and key != first]
-    if REAL in words:
-        wanted += [(model, REAL, real), (model, f"{REAL}+{AUGMENT}", real)]
+        wanted += [({REAL}, real)]
+    elif REAL in words:
+        wanted += [({REAL}, real), ({REAL, AUGMENT}, real)]
     else:
-        most = max((key[2] for key in keys if key[0] == model), default=0)
-        wanted += [(model, REAL, most)]
-    rest = "+".join(word for word in words if word in sets or word == REAL)
-    if rest != condition:  # how the set is used
-        wanted += [(model, rest, real)]
+        most = max((key[2] for key in keys if key[:2] == (model, REAL)), default=0)
+        wanted += [({REAL}, most)]
+    if drawn:  # how the set is used
+        wanted += [({word for word in words if word in sets or word == REAL}, real)]
     if drawn == [sets[0]]:
-        wanted += [(model, "+".join(other if word == sets[0] else word for word in words), real) for other in sets[1:]]
-    return [key for key in dict.fromkeys(wanted) if key in keys and key != first]
+        wanted += [({other if word == sets[0] else word for word in words}, real) for other in sets[1:]]
+    found = [key for some, count in wanted for key in keys if _is(key, model, some, count)]
+    return [key for key in dict.fromkeys(found) if key != first]
+
+
+def _is(key: tuple[str, str, int], model: str, words: set[str], real: int) -> bool:
+    """Whether a key is of these words, in whatever order."""
+    return (key[0], set(key[1].split("+")), key[2]) == (model, words, real)
 
 
 def answers_of(document: Row) -> list[str]:
@@ -136,7 +140,7 @@ def answers_of(document: Row) -> list[str]:
         metric = MAIN[model["answers"]]
         rows = [row for row in document["summary"] if row["model"] == model["name"]]
         for split in document["splits"]:
-            of_split = [row for row in rows if row["split"] == split and row[metric]["n"]]
+            of_split = [row for row in rows if row["split"] == split and row.get(metric, {}).get("n")]
             told += [f"{model['name']}, {split}: {text}" for text in _answers(of_split, document, model, split, metric)]
     return told
 
@@ -152,10 +156,11 @@ def _answers(rows: Sequence[Row], document: Row, model: Row, split: str, metric:
             continue
         value, count = row[metric]["mean"], " and ".join(f"{entry['images']:,} of {entry['name']}" for entry in drawn)
         if REAL not in words:
-            share = 100 * value / real[-1][1] if real[-1][1] else math.nan
+            most, best = real[-1]
+            share = f"{100 * value / best:.1f} % of what" if best else "where"
             told.append(
-                f"{count} drawn images and no manual label: {title} {value:.3f}, {share:.1f} % of what "
-                f"{real[-1][0]} labelled frames alone teach ({real[-1][1]:.3f})"
+                f"{count} drawn images and no manual label: {title} {value:.3f}, {share} {most} labelled frames alone "
+                f"teach ({best:.3f})"
             )
             continue
         as_many = equivalent(real, value)

@@ -12,8 +12,9 @@ import numpy as np
 from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import Masks, open_masks, open_truth
+from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
+from neeco.evaluation.truth import truth_file
 from neeco.files import read_json
 
 ClassNames = Literal["instrument", "parts"]
@@ -66,9 +67,11 @@ class Meaning:
     classes: np.ndarray
     instruments: np.ndarray
 
-    def unknown(self, ids: np.ndarray) -> list[int]:
-        """Those of `ids` that belong to no class."""
-        return [int(number) for number in np.unique(ids) if number and not self.classes[number]]
+    def check(self, ids: np.ndarray, file: Path, remedy: str) -> None:
+        """Raises NeecoError where one of `ids` (uint8) belongs to no class: it would be taught as tissue."""
+        strange = (self.classes[ids] == 0) & (ids > 0)
+        if strange.any():
+            raise NeecoError(f"{file}: id {ids[strange].min()} means nothing; {remedy}")
 
 
 @dataclass(frozen=True)
@@ -84,8 +87,9 @@ class RecordedSample:
         return self.frame.name
 
     def load(self) -> Example:
-        """Raises NeecoError where the labels are of another size than the image."""
+        """Raises NeecoError where the labels are of another size than the image, or have an id that means nothing."""
         ids = self.masks.load(self.name)
+        self.meaning.check(ids, self.masks.files[self.name], "mend the mask, or leave its frame out")
         pixels = (self.frame.load_image().numpy() * 255).round().astype(np.uint8)
         counted = self.frame.load_mask()
         if ids.shape != pixels.shape[:2]:
@@ -119,8 +123,7 @@ class DrawnSample:
         """Raises NeecoError where a file is of another size, or has an id that means nothing."""
         size = image_size(self.image)
         ids = read_labels(self.labels, size).numpy()
-        if unknown := self.meaning.unknown(ids):
-            raise NeecoError(f"{self.labels}: id {unknown[0]} means nothing; name it in {INFO}, or draw the set again")
+        self.meaning.check(ids, self.labels, f"name it in {INFO}, or draw the set again")
         pixels = (read_image(self.image).numpy() * 255).round().astype(np.uint8)
         counted = None if self.ignore is None else _grey(self.ignore, size) < 128
         share = None if self.soft is None else _grey(self.soft, size).astype(np.float32) / 255
@@ -144,20 +147,18 @@ def recorded_samples(
     Frames without a label are left out. Raises NeecoError where there is none at all, or parts are asked for and the
     labels tell none.
     """
-    if labels is None:
+    masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
+    if masks is None and any(truth_file(capture.root, frame.name) for frame in capture.split(split)):
         masks = _truth(capture, split)
-    else:
-        masks = open_masks(labels, option="--labels")
-    frames = [frame for frame in capture.split(split) if frame.name in masks.files]
-    if not frames:
+    frames = [] if masks is None else [frame for frame in capture.split(split) if frame.name in masks.files]
+    if masks is None or not frames:
         where = f"{capture.root}: split {split}" if labels is None else f"--labels {labels}"
         raise NeecoError(f"{where}: no frame has a label; give --labels FOLDER with masks named as the frames")
-    if masks.names is None:
-        if classes == "parts":
-            raise NeecoError(f"--classes parts: the labels in {masks.path} tell no parts; use --classes instrument")
-        meaning = _meaning({number: (1, "instrument") for number in (1, MASK)}, classes)
-    else:
-        meaning = _meaning({number: (1, part) for number, part in masks.names.items()}, classes)
+    if classes == "parts" and not set((masks.names or {}).values()) & set(TRUTH_PARTS):
+        raise NeecoError(f"--classes parts: the labels in {masks.path} tell no parts; use --classes instrument")
+    # where some frames' truth has parts and others' has none, every id is a piece of the instrument
+    named = dict.fromkeys(range(1, 256), "instrument") if masks.names is None else masks.names
+    meaning = _meaning({number: (1, part) for number, part in named.items()}, classes)
     return tuple(RecordedSample(frame, masks, meaning) for frame in frames)
 
 
@@ -188,12 +189,12 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
     for sample in samples:
         if not sample.labels.is_file():
             raise NeecoError(f"--sets {data.name}: {sample.labels}: no such file; every image needs its labels")
-    found = image_size(samples[0].image)
-    if found != size:
-        raise NeecoError(
-            f"--sets {data.name}: {samples[0].image} is {found[0]}x{found[1]}, the capture's frames are "
-            f"{size[0]}x{size[1]}; draw it from a run of this capture"
-        )
+        found = image_size(sample.image)
+        if found != size:
+            raise NeecoError(
+                f"--sets {data.name}: {sample.image} is {found[0]}x{found[1]}, the capture's frames are "
+                f"{size[0]}x{size[1]}; draw it from a run of this capture"
+            )
     samples[0].load()  # whether its ids mean anything is known before the work
     return tuple(_with_edges(sample, data, edges) for sample in samples)
 
@@ -220,6 +221,8 @@ def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, Meaning]:
     stated = read_json(file)
     try:
         entries = [(int(entry["id"]), str(entry["instrument"]), str(entry["part"])) for entry in stated["ids"][1:]]
+        if not all(0 < number < 256 for number, _, _ in entries):
+            raise ValueError
     except (KeyError, TypeError, ValueError, IndexError):
         raise NeecoError(f"--sets {data.name}: {file}: ids: not as `neeco synthesize` writes them") from None
     instruments = list(dict.fromkeys(instrument for _, instrument, _ in entries))
