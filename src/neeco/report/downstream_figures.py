@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.experiments.downstream.conditions import AUGMENT, REAL
-from neeco.experiments.downstream.results import MAIN, TITLES
+from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, verdict
 from neeco.experiments.downstream.tables import described
 from neeco.report.charts import Level, Point, Series, legend, line_chart, short
 from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
@@ -21,8 +21,6 @@ BAR, SCALE = (150, 16), (150, 14)  # view box units of an interval and of the sc
 BAR_EDGE = 8  # units at each side that a bar leaves free
 ROUND = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)  # first digits of what a scale ends with
 REACH = 3.0  # times the largest difference: what an interval shows at most, for folds so few that it says nothing
-HELPS, HURTS, NONE_SHOWN = "helps", "hurts", "no difference shown"
-VERDICTS = (HELPS, HURTS, NONE_SHOWN)
 GROUPS = (  # key of what is asked, as `question` finds it, and its words
     ("beside", "drawn images beside labelled frames, against the same frames alone"),
     ("augmented", "drawn images beside labelled frames, against these frames with classical augmentation"),
@@ -143,13 +141,6 @@ def course_charts(experiment: Experiment, model: Mapping[str, Any]) -> list[str]
     return [chart for chart in charts if chart]
 
 
-def verdict_of(row: Mapping[str, Any]) -> str:
-    """What a paired difference allows to say; "" where there is no interval."""
-    if row["low"] is None:
-        return ""
-    return HELPS if row["low"] > 0 else HURTS if row["high"] < 0 else NONE_SHOWN
-
-
 def question(row: Mapping[str, Any], experiment: Experiment) -> str:
     """Which of GROUPS a paired difference belongs to."""
     drawn, other = sets_in(row["condition"], experiment), sets_in(row["against"], experiment)
@@ -198,7 +189,7 @@ def _difference(row: Mapping[str, Any], span: float) -> Difference:
         signed(row["difference"]),
         f"{signed(row['low'])} to {signed(row['high'])}" if known else "–",
         row["folds"],
-        verdict_of(row),
+        verdict(row),
         _bar(row, span),
     )
 
@@ -214,7 +205,7 @@ def _bar(row: Mapping[str, Any], span: float) -> Markup:
     axes.set(xlim=(-span, span), ylim=(-1, 1))
     axes.set_axis_off()
     axes.axvline(0, color=STAND_INS["soft"], linewidth=1)
-    color = STAND_INS[{HELPS: "good", HURTS: "bad"}.get(verdict_of(row), "soft")]
+    color = STAND_INS[{HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")]
     style: dict[str, Any] = {"color": color, "clip_on": False, "linestyle": ""}
     if row["low"] is not None:
         low, high = max(row["low"], -span), min(row["high"], span)
@@ -223,7 +214,7 @@ def _bar(row: Mapping[str, Any], span: float) -> Markup:
             cut = end != shown
             axes.plot(shown, 0, marker=arrow if cut else "|", markersize=6 if cut else 9, **style)
     axes.plot(row["difference"], 0, marker="o", markersize=7, markeredgewidth=0, **style)
-    words = verdict_of(row) or "no interval"
+    words = verdict(row) or "no interval"
     return inline_svg(axes, f"difference {signed(row['difference'])}, {words}")
 
 

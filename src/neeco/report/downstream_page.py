@@ -14,19 +14,25 @@ from neeco.evaluation.difference import PART_COLORS
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.experiments.downstream.conditions import HELD_BACK_EVERY, REAL, default_conditions
 from neeco.experiments.downstream.experiment import failed_jobs
-from neeco.experiments.downstream.results import CONFIDENCE, MAIN, equivalent
+from neeco.experiments.downstream.results import (
+    CONFIDENCE,
+    MAIN,
+    VERDICTS,
+    by_fold,
+    equivalent,
+    real_curve,
+    verdict,
+)
 from neeco.experiments.downstream.tables import KEYS, budget_words, data_files, summary_csv, tables_of
 from neeco.experiments.tables import Table, csv_text
 from neeco.files import write_text
 from neeco.report.downstream_figures import (
-    VERDICTS,
     course_charts,
     differences,
     line_key,
     question,
     score_chart,
     signed,
-    verdict_of,
     with_labelled,
 )
 from neeco.report.downstream_shots import Gallery, galleries
@@ -125,7 +131,7 @@ def _headline(experiment: Experiment) -> tuple[str, str]:
     rows = _beside(experiment)
     if not rows:
         return "careful", "No condition has drawn images beside labelled frames to hold against these frames alone."
-    found = [verdict_of(row) for row in rows]
+    found = [verdict(row) for row in rows]
     helps, hurts, none_shown = (found.count(word) for word in VERDICTS)
     if helps + hurts + none_shown == 0:
         return "careful", "One fold: whether drawn images help cannot be told from chance; give --folds 5."
@@ -155,31 +161,25 @@ def _glance(experiment: Experiment) -> Glance:
     lines: dict[tuple[str, str, str], dict[int, tuple[str, str, str]]] = {}
     for row in rows:
         key = row["model"], row["split"], row["condition"]
-        cell = signed(row["difference"]), verdict_of(row), _as_many(row, experiment)
+        cell = signed(row["difference"]), verdict(row), _as_many(row, experiment)
         lines.setdefault(key, {})[row["real"]] = cell
     order = [(model["name"], split) for model, split in _models_and_splits(experiment)]
     made = [
         (*key, tuple(cells.get(count, ("–", "", "")) for count in counts))
         for key, cells in sorted(lines.items(), key=lambda line: order.index(line[0][:2]))
     ]
-    return Glance(counts, tuple(made), any(verdict_of(row) for row in rows))
+    return Glance(counts, tuple(made), any(verdict(row) for row in rows))
 
 
 def _as_many(row: Mapping[str, Any], experiment: Experiment) -> str:
     """`as good as about 55`: how many labelled frames alone do as well as the first of a difference, over the folds
     that all of these finished; "" where that cannot be read: of one number of frames only, or scores all 0."""
-    found: dict[tuple[str, int], dict[int, float]] = {}
-    for job in experiment["jobs"]:
-        value = job["splits"].get(row["split"], {}).get(row["metric"])
-        if job["model"] == row["model"] and value is not None:
-            found.setdefault((job["condition"], job["real"]), {})[job["fold"]] = value
-    first = found[row["condition"], row["real"]]
-    alone = {real: scores for (condition, real), scores in sorted(found.items()) if condition == REAL}
-    folds = set(first).intersection(*alone.values())
-    curve = [(real, mean_of([alone[real][fold] for fold in folds])) for real in sorted(alone)]
-    if len(curve) < 2 or not folds or not any(score for _, score in curve):
+    scores = by_fold(experiment["jobs"], row["model"], row["split"], row["metric"])
+    key = row["condition"], row["real"]
+    curve = real_curve(scores, key)
+    if len(curve) < 2 or not any(score for _, score in curve):
         return ""
-    return equivalent(curve, mean_of([first[fold] for fold in folds])).removesuffix(ALONE)
+    return equivalent(curve, mean_of(list(scores[key].values()))).removesuffix(ALONE)
 
 
 def _answers(experiment: Experiment) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
@@ -196,12 +196,13 @@ def _answers(experiment: Experiment) -> list[tuple[str, str, list[tuple[str, str
 
 
 def _cut(sentence: str) -> tuple[str, str, str]:
-    """A sentence cut about the verdict that stands before its numbers."""
-    for word in VERDICTS:
-        before, found, after = sentence.rpartition(f": {word} (")
-        if found:
-            return f"{before}: ", word, f" ({after}"
-    return sentence, "", ""
+    """A sentence cut about its first verdict."""
+    places = {sentence.find(f"; {word} against "): word for word in VERDICTS}
+    found = min((place for place in places if place >= 0), default=None)
+    if found is None:
+        return sentence, "", ""
+    start = found + len("; ")
+    return sentence[:start], places[found], sentence[start + len(places[found]) :]
 
 
 def _tables(experiment: Experiment) -> list[tuple[str, str, Table]]:
