@@ -93,7 +93,7 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
         for edge in sorted(edges) or [DEFAULT_EDGES]:
             images[data.name] = len(drawn_samples(data, teaching.classes, edge, frame_size(tested)))
     counts, labelled = _counts(spec, teaching, capture, conditions)
-    _check_boxes(spec, capture, tested)
+    _check_models_for(spec, capture, tested)
     _check_output(spec)
     jobs = _jobs(spec, teaching, conditions, counts)
     if not jobs:
@@ -221,10 +221,19 @@ def _conditions(spec: DownstreamSpec) -> list[Condition]:
     for name in names:
         if name in RESERVED or "+" in name or not name:
             raise NeecoError(f"--sets {name}: this name has a meaning of its own; call the set otherwise")
+        if "/" in name or "\\" in name:
+            raise NeecoError(f"--sets {name}: folders are named by it; call the set without / or \\")
     if len(set(names)) < len(names):
         raise NeecoError(f"--sets: a name stands twice in {' '.join(names)}; name each set differently")
     words = default_conditions(names) if spec.conditions is None else spec.conditions
-    return [parse_condition(word, names) for word in dict.fromkeys(words)]
+    conditions = [parse_condition(word, names) for word in dict.fromkeys(words)]
+    for condition in conditions:
+        if condition.edges == "soft" and spec.teaching.classes == "parts":
+            raise NeecoError(
+                f"--conditions {condition.name}: soft/ says how much of a pixel is instrument, not of which part; "
+                "use --classes instrument"
+            )
+    return conditions
 
 
 def _splits(capture: Capture, asked: Sequence[str]) -> tuple[str, ...]:
@@ -257,9 +266,16 @@ def _counts(
     return sorted({labelled_count(word, labelled) for word in spec.real}), labelled
 
 
-def _check_boxes(spec: DownstreamSpec, capture: Capture, tested: Sequence[RecordedSample]) -> None:
+def _check_models_for(spec: DownstreamSpec, capture: Capture, tested: Sequence[RecordedSample]) -> None:
     for name in spec.models:
-        if model_class(name).answers == "boxes" and len(capture.instruments) > 1:
+        kind = model_class(name)
+        size = input_size(frame_size(tested), spec.teaching.side or kind.side, kind.multiple)
+        if kind.sees_too_little(size):
+            raise NeecoError(
+                f"--models {name}: it would see images of {size[0]}x{size[1]} px, too small for it; give a larger "
+                "--size, or leave it out"
+            )
+        if kind.answers == "boxes" and len(capture.instruments) > 1:
             raise NeecoError(
                 f"--models {name}: {tested[0].masks.path}: labels do not tell the {len(capture.instruments)} "
                 "instruments apart, so there is no box of each; use a model that answers with masks"
@@ -280,8 +296,8 @@ def _check_output(spec: DownstreamSpec) -> None:
     stored = read_json(output / FILE)
     if not isinstance(stored, dict) or stored.get("schema") != SCHEMA:
         raise NeecoError(f"{output / FILE}: schema: is not {SCHEMA}; give another --output")
-    if stored["capture"] != str(spec.teaching.capture.absolute()):
-        raise NeecoError(f"{output / FILE}: capture: is about {stored['capture']}; give another --output")
+    if stored.get("capture") != str(spec.teaching.capture.absolute()):
+        raise NeecoError(f"{output / FILE}: capture: is about {stored.get('capture')}; give another --output")
 
 
 def _jobs(

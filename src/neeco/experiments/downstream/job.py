@@ -146,7 +146,11 @@ class DownstreamJob:
         tell("evaluating", 0.0, "")
         splits = {split: self._test(fitted, capture, split) for split in self.teaching.splits}
         result = {"schema": JOB_SCHEMA} | self.identity()
-        result |= {"iterations": self.steps, "best_step": fitted.best_step, "validation": fitted.validation}
+        result |= {
+            "iterations": self.steps,
+            "best_step": fitted.best_step,
+            "validation": list(map(list, fitted.validation)),
+        }
         result |= {"still_learning": fitted.best_step > (1 - ALMOST) * self.steps and _rises(fitted.validation)}
         result |= {"seconds": round(seconds, 1), "processor_seconds": round(processor, 1), "input": list(task.size)}
         result |= {"splits": splits}

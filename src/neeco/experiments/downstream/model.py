@@ -80,6 +80,11 @@ class Model(ABC):
     def unmet(cls) -> str | None:
         """What it needs and this machine lacks, with the remedy, in words; None when it can be trained."""
 
+    @classmethod
+    def sees_too_little(cls, size: tuple[int, int]) -> bool:
+        """Whether images of this size (width, height), as it would see them, are too small for it."""
+        return False
+
     @abstractmethod
     def fit(self, task: Task) -> Fitted:
         """Train it. The same task gives the same model on the CPU. Raises NeecoError for weights that do not fit."""
@@ -117,6 +122,6 @@ def model_class(name: str) -> type[Model]:
 def input_size(frame: tuple[int, int], side: int, multiple: int) -> tuple[int, int]:
     """(width, height) a model sees of frames of this size: the longer side at most `side`, both multiples of
     `multiple`, the nearest to the frame's shape."""
-    scale = min(1.0, side / max(frame))
+    scale = min(1.0, max(multiple, side - side % multiple) / max(frame))
     width, height = (max(multiple, multiple * round(edge * scale / multiple)) for edge in frame)
     return width, height

@@ -16,6 +16,7 @@ from neeco.experiments.downstream.torch_training import TorchModel
 
 STAGES = (64, 256, 512, 1024)  # channels of the backbone's stages; the last two are detected on
 WIDTH = 128
+STRIDES = (16, 32)  # px, of those two
 QUERIES = 20  # boxes it can tell: few instruments are in an image
 
 
@@ -32,7 +33,12 @@ class DFine(TorchModel):
 
     @classmethod
     def unmet(cls) -> str | None:
-        return lacking("transformers", "pycocotools")
+        return lacking("transformers", "pycocotools", "monai")
+
+    @classmethod
+    def sees_too_little(cls, size: tuple[int, int]) -> bool:
+        """It chooses its boxes among the places of two grids."""
+        return sum((size[0] // stride) * (size[1] // stride) for stride in STRIDES) < QUERIES
 
     def build(self, classes: int) -> nn.Module:
         from transformers import DFineConfig, DFineForObjectDetection
@@ -59,7 +65,7 @@ class DFine(TorchModel):
             freeze_backbone_batch_norms=False,
             num_labels=classes,
             encoder_in_channels=list(STAGES[2:]),
-            feat_strides=[16, 32],
+            feat_strides=list(STRIDES),
             num_feature_levels=2,
             encode_proj_layers=[1],
             encoder_hidden_dim=WIDTH,

@@ -60,14 +60,18 @@ class UNet(TorchModel):
 
 def targets(examples: Sequence[Example], count: int, size: Sequence[int]) -> tuple[Tensor, Tensor]:
     """What to learn: the share of each class in every pixel [B, count, h, w], and what of it counts [B, h, w] in
-    [0, 1]. Labels are shrunk by area: a pixel on an edge belongs to both sides."""
+    [0, 1]. Labels are shrunk by area: a pixel on an edge belongs to both sides. What does not count has no part in
+    the pixel it shrinks into."""
     height, width = size
     shares, weights = [], []
     for example in examples:
         whole = np.eye(count, dtype=np.float32)[example.classes]  # [H, W, count]
         if example.share is not None:
             whole[..., 0], whole[..., 1] = 1 - example.share, example.share
-        shares.append(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, count))
-        counted = np.ones(example.classes.shape, np.float32) if example.counted is None else example.counted
-        weights.append(cv2.resize(counted.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
+        if example.counted is not None:
+            whole *= example.counted[..., None]
+        share = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, count)
+        weight = share.sum(2) if example.counted is not None else np.ones((height, width), np.float32)
+        shares.append(share / np.maximum(weight, 1e-6)[..., None])
+        weights.append(weight)
     return torch.from_numpy(np.stack(shares)).permute(0, 3, 1, 2), torch.from_numpy(np.stack(weights))

@@ -15,9 +15,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 
 from neeco.errors import NeecoError
-from neeco.experiments.downstream.model import Boxes, Fitted, Model, Prediction, Task
+from neeco.experiments.downstream.model import Boxes, Fitted, Model, Prediction, Task, lacking
 from neeco.experiments.downstream.samples import Example, Sample
 from neeco.files import write_text
 
@@ -46,7 +47,7 @@ class Yolo(Model):
     def unmet(cls) -> str | None:
         if shutil.which(PROGRAM) is None:
             return f"needs the program `{PROGRAM}` (ultralytics, AGPL) on the PATH; install it, or leave it out"
-        return None
+        return lacking("pycocotools")  # its boxes are scored by it
 
     def fit(self, task: Task) -> Fitted:
         """Train by the program (see `Model.fit`). Raises NeecoError with its last words when it fails."""
@@ -57,8 +58,8 @@ class Yolo(Model):
         lists = {"train": _equal_shares(learned), "val": [path for paths in kept for path in paths]}
         for name, paths in lists.items():
             write_text(work / f"{name}.txt", "".join(f"{path}\n" for path in paths))
-        names = "".join(f"  {k}: {name}\n" for k, name in enumerate(task.classes))
-        write_text(work / "data.yaml", f"train: {work / 'train.txt'}\nval: {work / 'val.txt'}\nnames:\n{names}")
+        described = {name: str(work / f"{name}.txt") for name in lists} | {"names": dict(enumerate(task.classes))}
+        write_text(work / "data.yaml", yaml.safe_dump(described))
         epochs = max(1, round(task.steps * task.batch / len(lists["train"])))
         task.tell(0.0, f"yolo: {epochs} epochs of {len(lists['train'])} images")
         settings = [f"epochs={epochs}", f"batch={task.batch}", f"imgsz={max(task.size)}", f"seed={task.seed}"]
@@ -142,7 +143,8 @@ def _boxes(file: Path, image: np.ndarray) -> Boxes:
     """What the program wrote of one image: no file where it found nothing."""
     lines = file.read_text().splitlines() if file.is_file() else []
     try:
-        rows = np.array([[float(word) for word in line.split()] for line in lines], np.float64).reshape(-1, 6)
+        table = [[float(word) for word in line.split()] for line in lines]
+        rows = np.array(table, np.float64).reshape(len(table), 6)
     except ValueError:
         raise NeecoError(
             f"{file}: not `class x y width height score` lines; this version of {PROGRAM} is unknown"
