@@ -37,7 +37,7 @@ class Downstream:
     """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
     real: tuple[str, ...] = ("0", "20", "all")
     """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
-    folds: int = 3
+    folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds."""
     conditions: tuple[str, ...] | None = None
     """What to teach with, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""

@@ -9,12 +9,14 @@ import torch
 from neeco.errors import NeecoError
 
 
-def device_of(word: str) -> torch.device:
-    """The device behind `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where one can draw, else the CPU.
+def device_of(word: str, drawing: bool = True) -> torch.device:
+    """The device behind `--device`: cpu, cuda, cuda:N, or auto: a CUDA device where there is one, else the CPU.
+
+    drawing: it is to draw, which on CUDA needs gsplat; without, PyTorch is enough.
 
     Raises NeecoError for another word, or a device that is not there.
     """
-    draws = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    draws = torch.cuda.is_available() and (not drawing or importlib.util.find_spec("gsplat") is not None)
     if word == "auto":
         return torch.device("cuda" if draws else "cpu")
     name, colon, number = word.partition(":")

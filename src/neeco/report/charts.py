@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import IdentityTransform
 
 from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
@@ -23,6 +23,8 @@ CHARACTER = 6.9  # units that one takes at most, on average
 COLORS = 7
 DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
+LEVEL_DASHES = (4, 4)
+EDGE, CROWDED = 0.03, 0.06  # of a logarithmic axis: room beyond its ends; how near two ticks may be
 FEW_DECADES = (10.0, 300.0)  # highest over lowest where the ticks of a logarithmic axis are 1, 2 and 5
 
 Point = tuple[float, float]
@@ -39,6 +41,15 @@ class Series:
     dots: tuple[Point, ...] = ()  # faint marks
 
 
+@dataclass(frozen=True)
+class Level:
+    """One value for the whole chart. `order`: the place whose colour it takes."""
+
+    name: str
+    order: int
+    value: float
+
+
 @page_style()
 def line_chart(
     title: str,
@@ -46,18 +57,23 @@ def line_chart(
     series: Sequence[Series],
     *,
     starts: Sequence[tuple[float, str]] = (),
+    levels: Sequence[Level] = (),
     note: str = "",
     logarithmic: bool = False,
+    over_logarithmic: bool = False,
     size: tuple[int, int] = SIZE,
 ) -> str:
     """Lines and marks over a shared frame as inline SVG; "" when nothing has two points.
 
-    starts: (x, what begins there), drawn as dashed vertical lines. note: stands at the right, above the chart.
+    starts: (x, what begins there), drawn as dashed vertical lines. levels: thin dashed lines from side to side; beside
+    them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the axis of x, whose
+    ticks are then the points' own.
     """
     points = [point for item in series for line in (item.main, *item.faint, item.dots) for point in line]
-    if len({x for x, _ in points}) < 2:
+    if len({x for x, _ in points}) < (1 if levels else 2):
         return ""
-    right = 14 + round(CHARACTER * min(LABEL_CHARACTERS, max(len(item.name) for item in series)))
+    longest = max(len(name) for name in (*(item.name for item in series), *(level.name for level in levels)))
+    right = 14 + round(CHARACTER * min(LABEL_CHARACTERS, longest))
     axes = new_axes(size, 46, right, 28, 42)
     axes.set_title(title)
     axes.set_title(note, loc="right", fontsize=11)
@@ -70,9 +86,14 @@ def line_chart(
             _draw_line(axes, item.order, line, {"linewidth": 0.7, "alpha": 0.55})
     for item in series:  # above all that is faint
         _draw_line(axes, item.order, item.main, {"linewidth": 2, **_dashes(item.order)})
+    for level in levels:
+        axes.axhline(level.value, color=_color(level.order), linewidth=1.1, dashes=LEVEL_DASHES, gid="level")
     xs = [x for x, _ in points]
-    axes.set_xlim(min(0.0, *xs), max(xs))
-    round_ticks(axes.xaxis, 5, short)
+    if over_logarithmic:
+        _draw_logarithmic(axes, sorted(set(xs)))
+    else:
+        axes.set_xlim(min(0.0, *xs), max(xs))
+        round_ticks(axes.xaxis, 5, short)
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
         low, high = axes.get_ylim()
@@ -83,7 +104,8 @@ def line_chart(
     falling = any(item.main and item.main[-1][1] < item.main[0][1] for item in series)
     for x, words in starts:
         _draw_start(axes, x, words, falling)
-    _draw_names(axes, [item for item in series if item.main and item.name])
+    ends = [(item.main[-1][1], item.order, item.name) for item in series if item.main and item.name]
+    _draw_names(axes, [*ends, *((level.value, level.order, level.name) for level in levels)])
     return inline_svg(axes, f"{title} over {over}")
 
 
@@ -192,16 +214,31 @@ def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
     )
 
 
-def _draw_names(axes: Axes, series: Sequence[Series]) -> None:
-    """Each method's name at the end of its line, moved apart where they would cover one another."""
+def _draw_logarithmic(axes: Axes, xs: Sequence[float]) -> None:
+    """Make x logarithmic from the first to the last of `xs`, which are its ticks but where they crowd."""
+    span = xs[-1] / xs[0]
+    beyond = span**EDGE if span > 1 else 2.0
+    axes.set_xscale("log")
+    axes.set_xlim(xs[0] / beyond, xs[-1] * beyond)
+    ticks: list[float] = []
+    for x in reversed(xs):
+        if not ticks or ticks[-1] / x > span**CROWDED:
+            ticks.append(x)
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_major_formatter(lambda value, _: short(round(value, 9)))
+
+
+def _draw_names(axes: Axes, ends: Sequence[tuple[float, int, str]]) -> None:
+    """The names of lines, each (y, order, name), where they end; moved apart where they would cover one another."""
     axes.get_ylim()  # the scale is settled only when it is asked for
-    ends = sorted((-axes.transData.transform(item.main[-1])[1], item.order, item) for item in series)
+    wanted = sorted((-axes.transData.transform((axes.get_xlim()[0], y))[1], order, name) for y, order, name in ends)
     places: list[float] = []  # downwards
-    for y, _, _ in ends:
+    for y, _, _ in wanted:
         places.append(max(y, places[-1] + LABEL_STEP) if places else y)
     box = axes.bbox
     beyond = max(0.0, places[-1] + box.y0) if places else 0.0
-    for (_, order, item), y in zip(ends, places, strict=True):
-        name = item.name if len(item.name) <= LABEL_CHARACTERS else item.name[: LABEL_CHARACTERS - 1] + "…"
+    for (_, order, name), y in zip(wanted, places, strict=True):
+        shown = name if len(name) <= LABEL_CHARACTERS else name[: LABEL_CHARACTERS - 1] + "…"
         place: dict[str, Any] = {"transform": IdentityTransform(), "va": "center_baseline"}
-        axes.text(box.x1 + 8, beyond - y, name, color=_color(order), gid="name", **place)
+        axes.text(box.x1 + 8, beyond - y, shown, color=_color(order), gid="name", **place)

@@ -82,7 +82,7 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
     if spec.workers > 1:
         require_ray()
     _check_models(spec)
-    device_of(spec.teaching.device)
+    device_of(spec.teaching.device, drawing=False)
     conditions = _conditions(spec)
     capture = read_checked(spec.teaching.capture, spec.teaching.transforms)
     teaching = replace(spec.teaching, splits=_splits(capture, spec.teaching.splits))
@@ -352,10 +352,10 @@ def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _made_by(path: Path) -> dict[str, Any] | None:
-    """What dataset.json says of how a set was drawn, and its fingerprint."""
+    """What dataset.json says of how a set was drawn, and its fingerprint; None where there is none."""
     file = path / INFO
     if not file.is_file():
         return None
     stated = read_json(file)
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    return {"settings": stated.get("settings"), "scene": stated.get("scene"), "sha256": digest}
+    told = {key: stated.get(key) for key in ("settings", "scene", "scene_sha256", "version", "complete")}
+    return told | {"sha256": hashlib.sha256(file.read_bytes()).hexdigest()}

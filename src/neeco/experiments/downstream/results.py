@@ -29,6 +29,8 @@ TITLES = {
 }
 CONFIDENCE = 0.95  # of intervals
 LEAST_FOLDS = 2  # for an interval
+HELPS, HURTS, NONE_SHOWN = "helps", "hurts", "no difference shown"
+VERDICTS = (HELPS, HURTS, NONE_SHOWN)
 
 Row = Mapping[str, Any]
 
@@ -134,51 +136,92 @@ def _is(key: tuple[str, str, int], model: str, words: set[str], real: int) -> bo
 
 
 def answers_of(document: Row) -> list[str]:
-    """What the numbers say, a sentence each, for every model and split."""
+    """What the numbers say, a sentence each, for every model, split and condition with drawn images.
+
+    Conditions are compared over the folds that both finished.
+    """
     told = []
     for model in document["models"]:
-        metric = MAIN[model["answers"]]
-        rows = [row for row in document["summary"] if row["model"] == model["name"]]
         for split in document["splits"]:
-            of_split = [row for row in rows if row["split"] == split and row.get(metric, {}).get("n")]
-            told += [f"{model['name']}, {split}: {text}" for text in _answers(of_split, document, model, split, metric)]
+            scores = by_fold(document["jobs"], model["name"], split, MAIN[model["answers"]])
+            sentences = (_answer(key, scores, document, model, split) for key in scores)
+            told += [f"{model['name']}, {split}: {sentence}" for sentence in sentences if sentence]
     return told
 
 
-def _answers(rows: Sequence[Row], document: Row, model: Row, split: str, metric: str) -> list[str]:
-    title, sets = TITLES[metric], [entry["name"] for entry in document["sets"]]
-    real = sorted((row["real"], row[metric]["mean"]) for row in rows if row["condition"] == REAL)
-    told = []
-    for row in rows:
-        words = row["condition"].split("+")
-        drawn = [entry for entry in document["sets"] if entry["name"] in words]
-        if not drawn or not real or set(words) - set(sets) - {REAL}:
-            continue
-        value, count = row[metric]["mean"], " and ".join(f"{entry['images']:,} of {entry['name']}" for entry in drawn)
-        if REAL not in words:
-            most, best = real[-1]
-            share = f"{100 * value / best:.1f} % of what" if best else "where"
-            told.append(
-                f"{count} drawn images and no manual label: {title} {value:.3f}, {share} {most} labelled frames alone "
-                f"teach ({best:.3f})"
-            )
-            continue
-        as_many = equivalent(real, value)
-        sure = _sure(row, document, model, split, metric)
-        told.append(f"{row['real']} labelled frames and {count} drawn: {title} {value:.3f}, {as_many}{sure}")
-    return told
+Scores = Mapping[tuple[str, int], Mapping[int, float]]  # by (condition, labelled frames): the score by fold
 
 
-def _sure(row: Row, document: Row, model: Row, split: str, metric: str) -> str:
-    """What the paired difference to the same labelled frames alone allows to say."""
-    for entry in document["paired"]:
-        same = (entry["model"], entry["split"], entry["metric"]) == (model["name"], split, metric)
-        if same and (entry["condition"], entry["real"]) == (row["condition"], row["real"]) and entry["against"] == REAL:
-            if entry["low"] is None:
-                return f" ({entry['difference']:+.3f} against them alone; one fold has no interval)"
-            verdict = "helps" if entry["low"] > 0 else "hurts" if entry["high"] < 0 else "no difference shown"
-            return f": {verdict} ({entry['difference']:+.3f}, {entry['low']:+.3f} to {entry['high']:+.3f})"
-    return ""
+def by_fold(jobs: Sequence[Row], model: str, split: str, metric: str) -> Scores:
+    """One model's scores on one split; folds that failed or lack it are left out."""
+    scores: dict[tuple[str, int], dict[int, float]] = {}
+    for job in jobs:
+        value = job["splits"].get(split, {}).get(metric)
+        if job["model"] == model and value is not None:
+            scores.setdefault((job["condition"], job["real"]), {})[job["fold"]] = value
+    return scores
+
+
+def _answer(key: tuple[str, int], scores: Scores, document: Row, model: Row, split: str) -> str | None:
+    """One condition beside labelled frames alone; None where there is nothing to say."""
+    (condition, real), metric = key, MAIN[model["answers"]]
+    words = condition.split("+")
+    drawn = [entry for entry in document["sets"] if entry["name"] in words]
+    curve = real_curve(scores, key)
+    if not drawn or not curve:
+        return None
+    used = [word for word in words if word not in (REAL, *(entry["name"] for entry in drawn))]
+    count = " and ".join(f"{entry['images']:,} of {entry['name']}" for entry in drawn)
+    count += f" ({', '.join(used)})" if used else ""
+    value = float(np.mean(list(scores[key].values())))
+    if REAL not in words:
+        most, best = curve[-1]
+        share = f"{100 * value / best:.1f} % of what" if best else "where"
+        return (
+            f"{count} drawn images and no manual label: {TITLES[metric]} {value:.3f}, {share} {most} labelled frames "
+            f"alone teach ({best:.3f})"
+        )
+    sentence = f"{real} labelled frames and {count} drawn: {TITLES[metric]} {value:.3f}"
+    verdicts = []
+    for against, title in ((REAL, "them alone"), (f"{REAL}+{AUGMENT}", "them augmented")):
+        entry = _difference(document, (model["name"], split, metric, condition, real, against, real))
+        if entry is not None:
+            verdicts.append((verdict(entry), f"against {title} {_interval(entry)}"))
+    if not verdicts:
+        return None
+    if len(curve) > 1 and verdicts[0][0] != HURTS:
+        sentence += f", {equivalent(curve, value)}"
+    return sentence + "".join("; " + f"{told} {how}".lstrip() for told, how in verdicts)
+
+
+def real_curve(scores: Scores, key: tuple[str, int]) -> list[tuple[int, float]]:
+    """(labelled frames, score) of labelled frames alone, each set off from the score of `key` by their difference over
+    the folds that both finished."""
+    own = scores[key]
+    value, curve = float(np.mean(list(own.values()))), []
+    for (condition, count), others in sorted(scores.items()):
+        folds = own.keys() & others.keys()
+        if condition == REAL and folds:
+            curve.append((count, value - float(np.mean([own[fold] - others[fold] for fold in sorted(folds)]))))
+    return curve
+
+
+def _difference(document: Row, wanted: tuple[Any, ...]) -> Row | None:
+    keys = ("model", "split", "metric", "condition", "real", "against", "against_real")
+    return next((entry for entry in document["paired"] if tuple(entry[key] for key in keys) == wanted), None)
+
+
+def verdict(entry: Row) -> str:
+    """What a paired difference allows to say: one of VERDICTS; "" where there is no interval."""
+    if entry["low"] is None:
+        return ""
+    return HELPS if entry["low"] > 0 else HURTS if entry["high"] < 0 else NONE_SHOWN
+
+
+def _interval(entry: Row) -> str:
+    if entry["low"] is None:
+        return f"({entry['difference']:+.3f}; one fold has no interval)"
+    return f"({entry['difference']:+.3f}, {entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
 def equivalent(real: Sequence[tuple[int, float]], value: float) -> str:

@@ -106,8 +106,9 @@ def _failure(experiment: Experiment, row: Mapping[str, Any]) -> str | None:
 
 
 def _best(column: Column, rows: Sequence[Mapping[str, Any]]) -> str | None:
-    means = [row[column.key]["mean"] for row in rows if row.get(column.key, {}).get("n")]
-    return column.written(max(means)) if len(means) > 1 else None
+    """The best mean as it is written; None where all are alike."""
+    means = [column.written(row[column.key]["mean"]) for row in rows if row.get(column.key, {}).get("n")]
+    return max(means) if len(set(means)) > 1 else None
 
 
 def _cell(column: Column, value: Mapping[str, Any] | None, best: str | None) -> Cell:

@@ -25,9 +25,9 @@ class DFine(TorchModel):
 
     model = "dfine"
     answers = "boxes"
-    side = 192
+    side = 160
     multiple = 32
-    steps = 800
+    steps = 400
     batch = 8
     learning_rate = 8e-4
 

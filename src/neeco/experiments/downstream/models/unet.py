@@ -24,7 +24,7 @@ class UNet(TorchModel):
     answers = "masks"
     side = 160
     multiple = 16
-    steps = 1500
+    steps = 400
     batch = 8
     learning_rate = 3e-3
 

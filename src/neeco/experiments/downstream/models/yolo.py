@@ -37,9 +37,9 @@ class Yolo(Model):
 
     model = "yolo"
     answers = "boxes"
-    side = 192
+    side = 160
     multiple = 32
-    steps = 800
+    steps = 400
     batch = 8
     accepts_weights = False  # they are pickles: for that program alone to open
 
