@@ -55,7 +55,7 @@ def stopped_by(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_it_prints_tables_answers_and_where_all_of_it_lies(words, tmp_path: Path, capsys) -> None:
     assert main(words) == 0
-    shown = capsys.readouterr().out
+    shown = " ".join(capsys.readouterr().out.split())
     output = tmp_path / "out"
     result = json.loads((output / "downstream.json").read_text())
     assert result["complete"]
