@@ -162,10 +162,10 @@ def sentence(*starts: str, of: list[dict]) -> str:
 @pytest.mark.parametrize(
     ("with_set", "verdict"),
     [
-        ((0.80, 0.82, 0.81), ": helps (+0.210, "),
-        ((0.30, 0.32, 0.31), ": hurts (-0.290, "),
-        ((0.55, 0.75, 0.56), ": no difference shown (+0.020, "),
-        ((0.60, 0.61, 0.59), ": no difference shown (+0.000, +0.000 to +0.000)"),
+        ((0.80, 0.82, 0.81), "; helps against them alone (+0.210, "),
+        ((0.30, 0.32, 0.31), "; hurts against them alone (-0.290, "),
+        ((0.55, 0.75, 0.56), "; no difference shown against them alone (+0.020, "),
+        ((0.60, 0.61, 0.59), "; no difference shown against them alone (+0.000, +0.000 to +0.000)"),
     ],
 )
 def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
@@ -177,7 +177,7 @@ def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
 
 def test_one_fold_gives_no_verdict() -> None:
     told = sentence("20 labelled frames and", of=jobs(real_20=(0.6,), kin_real_20=(0.7,)))
-    assert "(+0.100 against them alone; one fold has no interval)" in told
+    assert "; against them alone (+0.100; one fold has no interval)" in told
     assert "helps" not in told
 
 
@@ -189,9 +189,10 @@ def test_sets_alone_are_a_share_of_the_most_labelled_frames() -> None:
     )
 
 
-def test_sentences_are_of_plain_conditions_with_something_to_compare() -> None:
+def test_sentences_are_of_drawn_images_with_something_to_compare() -> None:
     assert documented(jobs(kin=(0.6,)))["answers"] == []
-    assert documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"] == []
+    (told,) = documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"]
+    assert "1,200 of kin (soft) drawn images and no manual label: IoU 0.500" in told
     several = sentence("of kin and 1,200 of other", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
     assert "20 labelled frames and 1,200 of kin and 1,200 of other drawn" in several
 
