@@ -13,10 +13,10 @@ from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture.images import write_labels
 from neeco.experiments.downstream.experiment import job_folder
-from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds
+from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds, verdict
 from neeco.experiments.downstream.samples import CLASSES, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
-from neeco.report.downstream_figures import differences, families, question, score_chart, signed, verdict_of
+from neeco.report.downstream_figures import differences, families, question, score_chart, signed
 from neeco.report.downstream_page import command_of, write_downstream_report
 from neeco.report.downstream_shots import draw_boxes, galleries
 
@@ -299,8 +299,8 @@ def test_differences_go_by_what_they_answer(experiment):
     sets = experiment | {"sets": [{"name": "a"}, {"name": "b"}]}
     assert question({"condition": "a+real", "against": "b+real"}, sets) == "sets"
     assert question({"condition": "a+soft+real", "against": "a+real"}, sets) == "use"
-    assert verdict_of({"low": 0.0, "high": 0.1}) == "no difference shown"
-    assert verdict_of({"low": -0.2, "high": -0.1}) == "hurts"
+    assert verdict({"low": 0.0, "high": 0.1}) == "no difference shown"
+    assert verdict({"low": -0.2, "high": -0.1}) == "hurts"
     assert signed(-0.0001) == "0.000"
     table = differences(experiment, experiment["models"][0], "test")
     assert table is not None

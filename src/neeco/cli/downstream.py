@@ -39,7 +39,7 @@ class Downstream:
     """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds."""
-    conditions: tuple[str, ...] | None = None
+    conditions: tuple[str, ...] = ()
     """What to teach with, such as real, real+augment, SET, SET+real, SET+soft; default: these but the last."""
     labels: Path | None = None
     """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
@@ -126,7 +126,7 @@ def _spec(args: Downstream) -> DownstreamSpec:
         tuple(dict.fromkeys(args.models)),
         tuple(dict.fromkeys(args.real)),
         args.folds,
-        args.conditions,
+        args.conditions or None,
         {name: Path(file) for name, file in weights.items()},
         args.workers,
     )

@@ -12,7 +12,7 @@ from typing import Any
 from neeco.capture.model import Capture
 from neeco.evaluation.difference import PART_COLORS
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.conditions import HELD_BACK_EVERY, REAL, default_conditions
+from neeco.experiments.downstream.conditions import HELD_BACK_EVERY, default_conditions
 from neeco.experiments.downstream.experiment import failed_jobs
 from neeco.experiments.downstream.results import (
     CONFIDENCE,

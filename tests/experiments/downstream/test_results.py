@@ -105,6 +105,10 @@ def test_what_is_compared_with_what() -> None:
     }
 
 
+def test_without_a_set_augmentation_alone_is_compared() -> None:
+    assert pairs(jobs(real_10=(0.5,), real_augment_10=(0.6,)), sets=()) == {("real+augment", 10, "real", 10)}
+
+
 def test_the_order_of_words_does_not_matter_to_comparisons() -> None:
     one = (0.5, 0.6)
     results = jobs(real_10=one, augment_real_10=one, real_kin_10=one, soft_kin=one, kin=one, real_other_10=one)
@@ -192,7 +196,8 @@ def test_sets_alone_are_a_share_of_the_most_labelled_frames() -> None:
 def test_sentences_are_of_drawn_images_with_something_to_compare() -> None:
     assert documented(jobs(kin=(0.6,)))["answers"] == []
     assert documented(jobs(real_20=(0.6,), real_augment_20=(0.7,)))["answers"] == []
-    assert "1,200 of kin (soft) drawn images" in sentence("no manual", of=jobs(real_20=(0.6,), kin_soft=(0.5,)))
+    (told,) = documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"]
+    assert "1,200 of kin (soft) drawn images and no manual label: IoU 0.500" in told
     several = sentence("of kin and 1,200 of other", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
     assert "20 labelled frames and 1,200 of kin and 1,200 of other drawn" in several
 

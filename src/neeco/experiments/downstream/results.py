@@ -124,7 +124,7 @@ def _against(
         wanted += [({REAL}, most)]
     if drawn:  # how the set is used
         wanted += [({word for word in words if word in sets or word == REAL}, real)]
-    if drawn == [sets[0]]:
+    if drawn and drawn == [sets[0]]:
         wanted += [({other if word == sets[0] else word for word in words}, real) for other in sets[1:]]
     found = [key for some, count in wanted for key in keys if _is(key, model, some, count)]
     return [key for key in dict.fromkeys(found) if key != first]
