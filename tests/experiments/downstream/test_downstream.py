@@ -128,7 +128,7 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSpec) -> None:
     assert {"training", "evaluating"} <= {stage for _, stage in stages}
     assert len(result["summary"]) == 5 * 2
     assert result["sets"][0]["images"] == 6
-    assert len(result["sets"][0]["made_by"]["sha256"]) == 64
+    assert len(result["sets"][0]["sha256"]) == 64
     assert result["models"][0]["input"] == [48, 40]
     assert len(result["answers"]) == 3 * 2
     assert any("fewer than three folds" in note for note in result["notes"])

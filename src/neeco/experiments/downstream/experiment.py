@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -165,12 +164,7 @@ def document(plan: DownstreamPlan, results: Sequence[dict[str, Any]]) -> dict[st
         "labelled": plan.labelled,
         "held_back_every": HELD_BACK_EVERY,
         "sets": [
-            {
-                "name": data.name,
-                "path": str(data.path.absolute()),
-                "images": plan.images[data.name],
-                "made_by": _made_by(data.path),
-            }
+            data.described() | {"images": plan.images[data.name], "made_by": _made_by(data.path)}
             for data in teaching.sets
         ],
         "models": models,
@@ -290,7 +284,7 @@ def _check_output(spec: DownstreamSpec) -> None:
     if not output.is_dir() or not any(output.iterdir()):
         return
     if not (output / FILE).exists():
-        if [entry.name for entry in output.iterdir()] == [JOBS]:
+        if [entry.name for entry in output.iterdir() if not entry.name.startswith(".")] == [JOBS]:
             return  # stopped before its first result
         raise NeecoError(f"{output}: not empty, and no downstream experiment; give another --output")
     stored = read_json(output / FILE)
@@ -307,6 +301,8 @@ def _jobs(
     for fold in range(spec.folds):  # the first fold of everything comes first: a look halfway sees all
         for model in spec.models:
             for condition in conditions:
+                if condition.edges != DEFAULT_EDGES and model_class(model).answers == "boxes":
+                    continue  # boxes have no soft edge: it would be the plain condition again
                 for real in [count for count in counts if bool(count) == condition.real]:
                     folder = job_folder(spec.output, model, condition.name, real, fold)
                     jobs.append(DownstreamJob(teaching, model, condition, real, fold, folder, spec.weights.get(model)))
@@ -352,10 +348,9 @@ def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _made_by(path: Path) -> dict[str, Any] | None:
-    """What dataset.json says of how a set was drawn, and its fingerprint; None where there is none."""
+    """What dataset.json says of how a set was drawn; None where there is none."""
     file = path / INFO
     if not file.is_file():
         return None
     stated = read_json(file)
-    told = {key: stated.get(key) for key in ("settings", "scene", "scene_sha256", "version", "complete")}
-    return told | {"sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+    return {key: stated.get(key) for key in ("settings", "scene", "scene_sha256", "version", "complete")}

@@ -17,12 +17,12 @@ class Feed:
     """Draws examples from sources without end. A source's order is shuffled anew when all of it has been seen.
 
     sources: recorded frames, each data set. Each batch takes as many from each, whatever their sizes: a few labelled
-    frames are not drowned by a thousand drawn ones.
+    frames are not drowned by a thousand drawn ones. Augmentation changes nothing of the order.
     """
 
     def __init__(self, sources: Sequence[Sequence[Sample]], seed: int, augment: Augment | None = None) -> None:
         self.sources = [source for source in sources if source]
-        self.rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
+        self.rng, self.augment_rng = (np.random.default_rng(np.random.SeedSequence([seed, k])) for k in (1, 2))
         self.augment = augment
         self._orders = [self._shuffled(len(source)) for source in self.sources]
         self._turn = 0
@@ -37,7 +37,7 @@ class Feed:
         source = self._turn % len(self.sources)
         self._turn += 1
         example = self._load(source, next(self._orders[source]))
-        return example if self.augment is None else self.augment(example, self.rng)
+        return example if self.augment is None else self.augment(example, self.augment_rng)
 
     def _shuffled(self, count: int) -> Iterator[int]:
         while True:

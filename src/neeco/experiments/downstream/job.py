@@ -93,11 +93,7 @@ class DownstreamJob:
     def identity(self) -> dict[str, Any]:
         """What a folder must agree with to be this job's."""
         teaching = self.teaching
-        sets = [
-            {"name": data.name, "path": str(data.path.absolute()), "count": data.count}
-            for data in teaching.sets
-            if data.name in self.condition.sets
-        ]
+        sets = [data.described() for data in teaching.sets if data.name in self.condition.sets]
         return {
             "model": self.model,
             "condition": self.condition.name,
@@ -252,7 +248,5 @@ def as_settings(teaching: Teaching) -> dict[str, Any]:
     values["splits"] = list(teaching.splits)
     values["capture"] = str(teaching.capture.absolute())
     values["labels"] = None if teaching.labels is None else str(teaching.labels.absolute())
-    values["sets"] = [
-        {"name": data.name, "path": str(data.path.absolute()), "count": data.count} for data in teaching.sets
-    ]
+    values["sets"] = [data.described() for data in teaching.sets]
     return values

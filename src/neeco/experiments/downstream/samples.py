@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -137,6 +138,12 @@ class DataSet:
     name: str
     path: Path
     count: int | None = None
+
+    def described(self) -> dict[str, Any]:
+        """What tells it from others, for a file; `sha256` of its description changes when it is drawn anew."""
+        file = self.path / INFO
+        digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+        return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
 
 
 def recorded_samples(

@@ -83,7 +83,9 @@ class TorchModel(Model):
             examples = task.feed.batch(task.batch)
             loss = self.loss(module, to_input([example.image for example in examples], task), examples)
             if not torch.isfinite(loss):
-                raise NeecoError(f"{self.model}: its loss is not finite at step {step}; begin from other --weights")
+                raise NeecoError(
+                    f"{self.model}: its loss is not finite at step {step}; teach it with more images or other --weights"
+                )
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(module.parameters(), CLIP)
