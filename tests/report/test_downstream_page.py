@@ -79,7 +79,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
         "classes": list(CLASSES[classes]), "splits": list(SPLITS), "folds": folds, "labelled": labelled,
         "held_back_every": 5,
         "sets": [{"name": name, "path": f"/sets/{name}", "images": 1000,
-                  "made_by": {"settings": {"states": "inside", "seed": 0}, "scene": "runs/k", "sha256": "ab" * 32}}
+                  "made_by": {"settings": {"states": "inside", "seed": 0}, "scene": "runs/k"}, "sha256": "ab" * 32}
                  for name in sets],
         "models": [{"name": name, "answers": answers[name], "steps": 60, "batch": 4, "input": [48, 32],
                     "weights": None} for name in names],

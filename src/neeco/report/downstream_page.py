@@ -315,7 +315,7 @@ def _set_words(entry: Mapping[str, Any]) -> str:
     settings = made["settings"] or {}
     known = [f"{key} {settings[key]}" for key in ("states", "views", "labels", "seed") if settings.get(key) is not None]
     how = f" ({', '.join(known)})" if known else ""
-    return f"{told}{scene}{how}; dataset.json sha256 {made['sha256'][:12]}"
+    return f"{told}{scene}{how}; dataset.json sha256 {entry['sha256'][:12]}"
 
 
 def _settings(experiment: Experiment) -> list[tuple[str, str]]:
