@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import Instrument
+from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.statefile import read_states, state_to_json
 from neeco.errors import NeecoError
 from neeco.synthesis.samplers import instrument_axes, make_sampler
@@ -22,7 +23,7 @@ from neeco.synthesis.states import (
     turn_about,
     with_poses,
 )
-from neeco.synthesis.views import OrbitViews, PerturbedViews, RecordedViews
+from neeco.synthesis.views import SIMILAR, OrbitViews, PerturbedViews, RecordedViews
 
 
 def rng_of(index: int) -> np.random.Generator:
@@ -166,7 +167,7 @@ def test_an_orbit_keeps_its_centre_at_its_place_and_distance(camera):
     centre = np.array([5.0, -3.0, 100.0])
     views = OrbitViews(RecordedViews((camera,)), centre, degrees=30)
     for k in range(10):
-        moved = views(rng_of(k)).world_from_camera.numpy()
+        moved = views(State(), rng_of(k)).world_from_camera.numpy()
         assert is_rigid(moved)
         assert np.allclose((np.linalg.inv(moved) @ np.append(centre, 1))[:3], centre)
     assert not np.allclose(moved, np.eye(4), atol=1e-3)
@@ -174,9 +175,37 @@ def test_an_orbit_keeps_its_centre_at_its_place_and_distance(camera):
 
 def test_perturbed_views_stay_near_recorded_ones(camera):
     views = PerturbedViews(RecordedViews((camera,)), degrees=2.0, mm=1.0)
-    shifts = [np.linalg.norm(views(rng_of(k)).world_from_camera.numpy()[:3, 3]) for k in range(100)]
+    shifts = [np.linalg.norm(views(State(), rng_of(k)).world_from_camera.numpy()[:3, 3]) for k in range(100)]
     assert 0 < np.mean(shifts) < 3
-    assert views(rng_of(0)).fx == camera.fx
+    assert views(State(), rng_of(0)).fx == camera.fx
+
+
+def standing_at(x: float, turn: float = 0.0, jaw: float = 0.0) -> State:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix())
+    pose[0, 3] = x
+    return State({"tool": InstrumentState(pose, {"jaw": jaw})})
+
+
+def test_a_state_is_seen_by_cameras_that_recorded_like_ones_whatever_its_joints(camera):
+    count = 5 * SIMILAR
+    cameras = [replace(camera, fx=float(k + 1)) for k in range(count)]
+    views = RecordedViews(cameras, [standing_at(float(k), 0.01 * k, jaw=float(k % 2)) for k in range(count)])
+    chosen = {int(views(standing_at(count / 2 + 0.3, 0.005 * count, jaw=9.0), rng_of(k)).fx) - 1 for k in range(200)}
+    assert len(chosen) == SIMILAR
+    assert max(abs(k - count / 2) for k in chosen) <= SIMILAR / 2 + 1
+
+
+def test_without_like_states_any_recorded_camera_may_see_a_state(camera):
+    cameras = [replace(camera, fx=float(k + 1)) for k in range(3 * SIMILAR)]
+    other = State({"other": standing_at(0.0).instruments["tool"]})
+    known = [standing_at(float(k)) for k in range(len(cameras))]
+    for views, state in (
+        (RecordedViews(cameras), standing_at(0.0)),  # no states are known
+        (RecordedViews(cameras, [standing_at(1.0)] * len(cameras)), standing_at(0.0)),  # nothing moved
+        (RecordedViews(cameras, known), other),  # of another instrument
+    ):
+        assert len({views(state, rng_of(k)).fx for k in range(400)}) == len(cameras)
 
 
 @pytest.mark.parametrize("states", ["", "path:", "."])

@@ -8,15 +8,12 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from neeco.capture.model import Capture, Frame
-from neeco.labels.drawing import to_numpy
+from neeco.capture.model import Capture
+from neeco.capture.similarity import RecordedStates
 
 SPLIT_METRICS = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou")
 RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")
 MASK_METRICS = ("iou", "challenge_iou", "challenge_iou_parts", "dice", "boundary_f", "box_ap")
-STILL = 1e-9  # a coordinate that varies less than this in training tells nothing apart
 
 Spread = dict[str, Any]  # {"mean", "std", "n"}
 
@@ -73,32 +70,9 @@ def distances_to_training(capture: Capture) -> dict[str, float]:
     training frames; the distance is the root mean square over the coordinates, so it reads in standard deviations of
     the training states. Coordinates that stand still in training are left out; empty when all do.
     """
-    training = capture.split("train")
     others = [frame for frame in capture.frames if frame.split != "train"]
-    if not training or not others:
+    names = [instrument.name for instrument in capture.instruments]
+    recorded = RecordedStates([frame.state for frame in capture.split("train")], names)
+    if recorded.still:
         return {}
-    names = tuple(instrument.name for instrument in capture.instruments)
-    known, asked = _coordinates(training, names), _coordinates(others, names)
-    spread = known.std(0)
-    moving = spread > STILL
-    if not moving.any():
-        return {}
-    known, asked = known[:, moving] / spread[moving], asked[:, moving] / spread[moving]
-    squared = ((asked[:, None] - known[None]) ** 2).mean(-1)  # [others, training]
-    return {frame.name: float(value) for frame, value in zip(others, np.sqrt(squared.min(1)), strict=True)}
-
-
-def _coordinates(frames: Sequence[Frame], instruments: tuple[str, ...]) -> np.ndarray:
-    """[F, S] float64."""
-    return np.array([_coordinates_of(frame, instruments) for frame in frames], np.float64)
-
-
-def _coordinates_of(frame: Frame, instruments: tuple[str, ...]) -> list[float]:
-    if not instruments:
-        return [frame.state.time]
-    values: list[float] = []
-    for name in instruments:
-        state = frame.state.instruments[name]
-        values += to_numpy(state.pose[:3]).ravel().tolist()
-        values += [state.joints[joint] for joint in sorted(state.joints)]
-    return values
+    return {frame.name: float(recorded.distances(frame.state).min()) for frame in others}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 LABEL_THRESHOLD = 0.65
 # A share below the first is clearly tissue, one above the second clearly instrument. A first guess: between them lie
 # nearly four in five of the wrongly labelled pixels; which limits teach a model best is yet to be measured.
-CLEAR_SHARES = 0.15, 0.95
+CLEAR_SHARES = 0.5, 0.9
 
 
 def composited_parts(rendering: Rendering, threshold: float = LABEL_THRESHOLD) -> Tensor:

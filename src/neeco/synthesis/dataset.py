@@ -27,6 +27,7 @@ from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, 
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import Sampler, make_sampler, states_fingerprint
 from neeco.synthesis.settings import Format, Settings
+from neeco.synthesis.views import SIMILAR
 from neeco.synthesis.writers.coco import write_coco
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
@@ -214,7 +215,8 @@ def _description(run: Run, settings: Settings) -> dict[str, Any]:
         "schema": SCHEMA,
         "version": neeco.__version__,
         "scene_sha256": digest,
-        "settings": settings.identity() | {"states_sha256": states_fingerprint(settings.states)},
+        "settings": settings.identity()
+        | {"states_sha256": states_fingerprint(settings.states), "similar_views": SIMILAR},
         "soft": {"share_per_count": SHARE_PER_COUNT},
         "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
         "scene": str(run.path),

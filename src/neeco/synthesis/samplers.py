@@ -64,17 +64,17 @@ class Sampler:
         given = self.cameras[index % len(self.cameras)]
         if given is not None:
             return state, given
-        camera = self.views(rng)
+        camera = self.views(state, rng)
         for _ in range(AIMS):
             if shows_working_end(self.scene, state, camera):
                 break
-            camera = self.views(rng)
+            camera = self.views(state, rng)
         return state, camera
 
 
 def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: int) -> Sampler:
     """The sampler named by `states` (inside, beyond, grid, path:FILE or FILE) and `views`. Raises NeecoError."""
-    recorded = RecordedViews(scene.recorded.cameras)
+    recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
     view_sampler = _view_sampler(scene, views, recorded)
     if states == "inside":
         return Sampler(scene, Inside(scene.recorded.states), view_sampler)

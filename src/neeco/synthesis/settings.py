@@ -26,7 +26,7 @@ class Settings:
     margin: float = 0.2
     """How far `beyond` goes, as a share of the recorded range at either end."""
     views: Views = "recorded"
-    """Cameras: as recorded, near recorded ones, or in orbit about the tissue."""
+    """Cameras: of a recorded frame with a like state, near such ones, or from there in orbit about the tissue."""
     labels: LabelWay = "composited"
     """composited: what compositing says, occlusion-correct. threshold: the paper's, from what moves."""
     label_threshold: float | None = None

@@ -11,30 +11,41 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.model import State
+from neeco.capture.similarity import RecordedStates
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
 from neeco.synthesis.states import rigid, turn_about
 
+SIMILAR = 10  # recorded frames whose cameras may see a drawn state
+
 
 class ViewSampler(Protocol):
-    """Draws a camera; intrinsics and image size are always those of a recorded camera."""
+    """Draws a camera for a state; intrinsics and image size are always those of a recorded camera."""
 
-    def __call__(self, rng: Generator) -> Camera: ...
+    def __call__(self, state: State, rng: Generator) -> Camera: ...
 
 
-@dataclass(frozen=True)
 class RecordedViews:
-    """A recorded camera, each as likely as any other."""
+    """The camera of a recorded frame, one of the SIMILAR whose instruments stood most like the drawn ones.
 
-    cameras: Sequence[Camera]
+    A camera that follows its instrument saw it there: drawn so, instruments stand in the image as recorded ones do,
+    which is what a detector learns from (docs/benchmarks.md). states: the recorded frames'; empty: any camera.
+    """
 
-    def __post_init__(self) -> None:
-        if not self.cameras:
+    def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:
+        if not cameras:
             raise NeecoError("views: the scene remembers no recorded camera; train it again with this version")
+        self.cameras = cameras
+        common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
+        self.known = RecordedStates(states, sorted(common), joints=False) if common else None
 
-    def __call__(self, rng: Generator) -> Camera:
-        return self.cameras[int(rng.integers(len(self.cameras)))]
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        if self.known is None or self.known.still or not set(self.known.instruments) <= set(state.instruments):
+            return self.cameras[int(rng.integers(len(self.cameras)))]
+        nearest = np.argsort(self.known.distances(state), kind="stable")[:SIMILAR]
+        return self.cameras[int(nearest[rng.integers(len(nearest))])]
 
 
 @dataclass(frozen=True)
@@ -48,8 +59,8 @@ class PerturbedViews:
     degrees: float = 3.0
     mm: float = 3.0
 
-    def __call__(self, rng: Generator) -> Camera:
-        camera = self.recorded(rng)
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        camera = self.recorded(state, rng)
         turn = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
         offset = rigid(turn, self.mm * rng.standard_normal(3))
         return moved_camera(camera, to_numpy(camera.world_from_camera) @ offset)
@@ -66,8 +77,8 @@ class OrbitViews:
     centre: np.ndarray  # [3] mm
     degrees: float = 20.0
 
-    def __call__(self, rng: Generator) -> Camera:
-        camera = self.recorded(rng)
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        camera = self.recorded(state, rng)
         world_from_camera = to_numpy(camera.world_from_camera)
         direction = 2 * np.pi * rng.random()
         # the axis lies in the image plane: the camera moves sideways, it does not roll
