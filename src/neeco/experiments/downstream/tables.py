@@ -20,8 +20,8 @@ from neeco.experiments.tables import (
 )
 from neeco.files import write_text
 
-KEYS = ("taught with", "labelled frames")
-DIFFERENCE_KEYS = ("taught with", "labelled frames", "against")
+KEYS = ("taught with", "labelled")
+DIFFERENCE_KEYS = ("taught with", "labelled", "against")
 DIGITS = 3
 DIFFERENCE_COLUMNS = (
     Column("difference", "difference", DIGITS),
