@@ -174,7 +174,7 @@ def sentence(*starts: str, of: list[dict]) -> str:
 )
 def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
     results = jobs(real_20=(0.60, 0.61, 0.59), kin_real_20=with_set)
-    told = sentence("unet, test: 20 labelled frames and 1,200 of kin drawn", of=results)
+    told = sentence("unet, test: 20 labelled frames and 1,200 drawn (kin)", of=results)
     assert verdict in told
     assert f"IoU {statistics.fmean(with_set):.3f}" in told
 
@@ -188,7 +188,7 @@ def test_one_fold_gives_no_verdict() -> None:
 def test_sets_alone_are_a_share_of_the_most_labelled_frames() -> None:
     told = sentence("no manual label", of=jobs(real_20=(0.5, 0.5), real_80=(0.8, 0.8), kin=(0.6, 0.6)))
     assert told == (
-        "unet, test: 1,200 of kin drawn images and no manual label: IoU 0.600, 75.0 % of what 80 labelled frames alone "
+        "unet, test: 1,200 drawn (kin) and no manual label: IoU 0.600, 75.0 % of what 80 labelled frames alone "
         "teach (0.800)"
     )
 
@@ -197,14 +197,14 @@ def test_sentences_are_of_drawn_images_with_something_to_compare() -> None:
     assert documented(jobs(kin=(0.6,)))["answers"] == []
     assert documented(jobs(real_20=(0.6,), real_augment_20=(0.7,)))["answers"] == []
     (told,) = documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"]
-    assert "1,200 of kin (soft) drawn images and no manual label: IoU 0.500" in told
-    several = sentence("of kin and 1,200 of other", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
-    assert "20 labelled frames and 1,200 of kin and 1,200 of other drawn" in several
+    assert "1,200 drawn (kin, soft) and no manual label: IoU 0.500" in told
+    several = sentence("drawn (kin) and 1,200 drawn (other)", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
+    assert "20 labelled frames and 1,200 drawn (kin) and 1,200 drawn (other)" in several
 
 
 def test_drawn_images_are_judged_against_augmentation_too() -> None:
     results = jobs(real_20=(0.6, 0.61, 0.6), real_augment_20=(0.9, 0.91, 0.9), kin_real_20=(0.7, 0.71, 0.71))
-    told = sentence("20 labelled frames and 1,200 of kin drawn", of=results)
+    told = sentence("20 labelled frames and 1,200 drawn (kin)", of=results)
     assert "; helps against them alone (+0.103, " in told
     assert "; hurts against them augmented (-0.197, " in told
 
@@ -217,7 +217,7 @@ def test_as_good_as_is_over_the_folds_that_both_finished() -> None:
         job("real", 20, 0, 0.6),
         job("real", 20, 1, None),
     ]
-    told = sentence("20 labelled frames and 1,200 of kin drawn", of=results)
+    told = sentence("20 labelled frames and 1,200 drawn (kin)", of=results)
     assert "IoU 0.500, as good as about 32 labelled frames alone" in told  # halfway from 20 to 50 along log frames
 
 

@@ -171,17 +171,16 @@ def _answer(key: tuple[str, int], scores: Scores, document: Row, model: Row, spl
     if not drawn or not curve:
         return None
     used = [word for word in words if word not in (REAL, *(entry["name"] for entry in drawn))]
-    count = " and ".join(f"{entry['images']:,} of {entry['name']}" for entry in drawn)
-    count += f" ({', '.join(used)})" if used else ""
+    count = " and ".join(f"{entry['images']:,} drawn ({', '.join([entry['name'], *used])})" for entry in drawn)
     value = float(np.mean(list(scores[key].values())))
     if REAL not in words:
         most, best = curve[-1]
         share = f"{100 * value / best:.1f} % of what" if best else "where"
         return (
-            f"{count} drawn images and no manual label: {TITLES[metric]} {value:.3f}, {share} {most} labelled frames "
+            f"{count} and no manual label: {TITLES[metric]} {value:.3f}, {share} {most} labelled frames "
             f"alone teach ({best:.3f})"
         )
-    sentence = f"{real} labelled frames and {count} drawn: {TITLES[metric]} {value:.3f}"
+    sentence = f"{real} labelled frames and {count}: {TITLES[metric]} {value:.3f}"
     verdicts = []
     for against, title in ((REAL, "them alone"), (f"{REAL}+{AUGMENT}", "them augmented")):
         entry = _difference(document, (model["name"], split, metric, condition, real, against, real))
