@@ -25,23 +25,22 @@ def augment(example: Example, rng: np.random.Generator) -> Example:
 
     Labels move with the image; what comes from outside of it is black and does not count.
     """
-    labels = {"classes": example.classes, "instruments": example.instruments}
-    labels["counted"] = np.ones(example.classes.shape) if example.counted is None else example.counted
-    data: dict[str, Any] = {name: array[None].astype(np.float32) for name, array in labels.items()}
-    data["share"] = (example.classes > 0 if example.share is None else example.share)[None].astype(np.float32)
-    data["image"] = np.moveaxis(example.image, 2, 0).astype(np.float32) / 255
+    counted = np.ones(example.classes.shape) if example.counted is None else example.counted
+    share = np.zeros(example.classes.shape) if example.share is None else example.share
+    labels = np.stack([example.classes, example.instruments, counted, share]).astype(np.float32)  # [4, H, W]
     transform = _transform(example.classes.shape)
     transform.set_random_state(int(rng.integers(2**31)))
-    made = {name: np.asarray(value) for name, value in transform(data).items()}
+    image = np.moveaxis(example.image, 2, 0).astype(np.float32) / 255
+    made = {name: np.asarray(value) for name, value in transform({"image": image, "labels": labels}).items()}
     gain = 1 + COLOUR * rng.uniform(-1, 1, (3, 1, 1))
-    image = np.moveaxis((made["image"] * gain).clip(0, 1) * 255, 0, 2).round().astype(np.uint8)
-    counted = made["counted"][0] > 0.5
+    pixels = np.moveaxis((made["image"] * gain).clip(0, 1) * 255, 0, 2).round().astype(np.uint8)
+    classes, instruments, counted, share = made["labels"]
     return Example(
-        np.ascontiguousarray(image),
-        made["classes"][0].round().astype(np.uint8),
-        made["instruments"][0].round().astype(np.uint8),
-        counted,
-        None if example.share is None else made["share"][0],
+        np.ascontiguousarray(pixels),
+        classes.round().astype(np.uint8),
+        instruments.round().astype(np.uint8),
+        counted > 0.5,
+        None if example.share is None else share,
     )
 
 
@@ -49,7 +48,7 @@ def augment(example: Example, rng: np.random.Generator) -> Example:
 def _transform(size: tuple[int, int]) -> Any:
     from monai import transforms
 
-    names = ["image", "share", "classes", "instruments", "counted"]
+    names = ["image", "labels"]
     return transforms.Compose(
         [
             transforms.RandFlipd(names, prob=0.5, spatial_axis=1),
@@ -59,7 +58,7 @@ def _transform(size: tuple[int, int]) -> Any:
                 rotate_range=TURN,
                 scale_range=(SCALE, SCALE),
                 translate_range=[SHIFT * side for side in size],
-                mode=["bilinear", "bilinear", "nearest", "nearest", "nearest"],
+                mode=["bilinear", "nearest"],
                 padding_mode="zeros",
             ),
             transforms.RandScaleIntensityd(["image"], factors=BRIGHTNESS, prob=1.0),
