@@ -331,17 +331,19 @@ def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
     if late:
         notes.append(f"still getting better at the last step: {'; '.join(late)}; give more --steps")
     for model in dict.fromkeys(job["model"] for job in done):
+        taught = [job for job in done if job["model"] == model and job["condition"] == REAL]
+        most = max((job["real"] for job in taught), default=0)  # fewer labels alone make it miss what they do not show
         gaps = [
             scores["precision"] - scores["recall"]
-            for job in done
-            if job["model"] == model and job["condition"] == REAL
+            for job in taught
+            if job["real"] == most
             for scores in job["splits"].values()
             if scores.get("precision") is not None and scores.get("recall") is not None
         ]
         if gaps and abs(sum(gaps) / len(gaps)) > 0.02:
             how = "over-segments" if sum(gaps) < 0 else "under-segments"
             notes.append(
-                f"{model}: taught with labelled frames alone it {how} (precision - recall "
+                f"{model}: taught with {most} labelled frames alone it {how} (precision - recall "
                 f"{sum(gaps) / len(gaps):+.3f}); that flatters labels with the opposite fault"
             )
     return notes
