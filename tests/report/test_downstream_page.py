@@ -12,7 +12,7 @@ import torch
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture.images import write_labels
-from neeco.experiments.downstream.experiment import job_folder
+from neeco.experiments.downstream.plan import job_folder
 from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds, verdict
 from neeco.experiments.downstream.samples import CLASSES, recorded_samples
 from neeco.report.charts import Level, Series, line_chart

@@ -13,7 +13,7 @@ from neeco.cli._tables import fitted
 from neeco.settings import Device
 
 if TYPE_CHECKING:
-    from neeco.experiments.downstream.experiment import DownstreamSpec
+    from neeco.experiments.downstream.plan import DownstreamSpec
     from neeco.experiments.downstream.samples import DataSet
 
 
@@ -67,7 +67,8 @@ class Downstream:
 def run(args: Downstream) -> int:
     """Teach and test with progress bars; print tables, answers and where the files lie; 1 when a training failed."""
     from neeco.cli._bars import Bars
-    from neeco.experiments.downstream.experiment import failed_jobs, plan_downstream, run_downstream
+    from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
+    from neeco.experiments.downstream.plan import plan_downstream
     from neeco.experiments.downstream.tables import tables_of, write_tables
     from neeco.report.downstream_page import write_downstream_report
 
@@ -103,8 +104,8 @@ def run(args: Downstream) -> int:
 
 def _spec(args: Downstream) -> DownstreamSpec:
     """What the words mean. Raises NeecoError for sets and weights that cannot be understood."""
-    from neeco.experiments.downstream.experiment import DownstreamSpec
     from neeco.experiments.downstream.job import Teaching
+    from neeco.experiments.downstream.plan import DownstreamSpec
 
     teaching = Teaching(
         capture=args.capture,

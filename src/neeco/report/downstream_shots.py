@@ -15,8 +15,8 @@ from neeco.capture.model import Capture
 from neeco.evaluation.difference import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.evaluation.mask_metrics import box_ious
 from neeco.experiments.downstream.conditions import AUGMENT, REAL
-from neeco.experiments.downstream.experiment import job_folder
 from neeco.experiments.downstream.job import PREDICTIONS
+from neeco.experiments.downstream.plan import job_folder
 from neeco.experiments.downstream.results import MAIN
 from neeco.experiments.downstream.samples import Example, RecordedSample, recorded_samples
 from neeco.experiments.downstream.scores import CONFIDENT

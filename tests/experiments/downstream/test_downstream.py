@@ -22,16 +22,11 @@ from torch import Tensor, nn
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.experiments.downstream import model as models_module
-from neeco.experiments.downstream.experiment import (
-    DownstreamSpec,
-    failed_jobs,
-    job_folder,
-    plan_downstream,
-    run_downstream,
-)
+from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
 from neeco.experiments.downstream.job import Teaching
 from neeco.experiments.downstream.model import Boxes
 from neeco.experiments.downstream.models.unet import UNet
+from neeco.experiments.downstream.plan import DownstreamSpec, job_folder, plan_downstream
 from neeco.experiments.downstream.samples import DataSet
 from neeco.experiments.downstream.tables import tables_of, write_tables
 from neeco.experiments.downstream.torch_training import TorchModel
