@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Mapping
 from typing import Any
 
 from neeco.capture.model import Capture, Instrument
 from neeco.errors import NeecoError
+from neeco.registry import named_classes
 from neeco.scene import deformations, nerfies
 from neeco.scene.deformations.base import Deformation
 from neeco.scene.method import Method
@@ -23,23 +22,8 @@ def find_methods() -> dict[str, type[Method]]:
 
     DEFAULT comes first, the others in the order of their names. Raises NeecoError when two share one.
     """
-    found: dict[str, type[Method]] = {}
-    for folder in (deformations, nerfies):
-        for entry in pkgutil.iter_modules(folder.__path__):
-            if entry.name.startswith("_"):
-                continue
-            module = importlib.import_module(f"{folder.__name__}.{entry.name}")
-            for kind in vars(module).values():
-                named = isinstance(kind, type) and issubclass(kind, Method) and "method" in vars(kind)
-                if not named or kind.__module__ != module.__name__:
-                    continue
-                if kind.method in found:
-                    other = found[kind.method].__module__
-                    raise NeecoError(
-                        f"{module.__name__}: method {kind.method!r} is also in {other}; give it another name"
-                    )
-                found[kind.method] = kind
-    return dict(sorted(found.items(), key=lambda item: (item[0] != DEFAULT, item[0])))
+    found = named_classes(Method, "method", deformations, nerfies)
+    return dict(sorted(found.items(), key=lambda item: item[0] != DEFAULT))
 
 
 METHODS: dict[str, type[Method]] = find_methods()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +17,7 @@ from neeco.errors import NeecoError
 from neeco.experiments.downstream import models
 from neeco.experiments.downstream.feed import Feed
 from neeco.experiments.downstream.samples import Sample
+from neeco.registry import named_classes
 
 Answers = Literal["masks", "boxes"]
 
@@ -99,16 +98,7 @@ def lacking(*packages: str) -> str | None:
 @cache
 def find_models() -> dict[str, type[Model]]:
     """Every class with a `model` name of its own in a public module of `models/`, by that name."""
-    found: dict[str, type[Model]] = {}
-    for entry in pkgutil.iter_modules(models.__path__):
-        if entry.name.startswith("_"):
-            continue
-        module = importlib.import_module(f"{models.__name__}.{entry.name}")
-        for kind in vars(module).values():
-            named = isinstance(kind, type) and issubclass(kind, Model) and "model" in vars(kind)
-            if named and kind.__module__ == module.__name__:
-                found[kind.model] = kind
-    return dict(sorted(found.items()))
+    return named_classes(Model, "model", models)  # type: ignore[type-abstract]
 
 
 def model_class(name: str) -> type[Model]:
