@@ -12,14 +12,12 @@ from neeco.experiments.downstream.conditions import (
     REAL,
 )
 from neeco.experiments.downstream.job import JOB_FILE, as_settings
-from neeco.experiments.downstream.model import input_size, model_class
+from neeco.experiments.downstream.model import model_class
 from neeco.experiments.downstream.plan import FILE, SCHEMA, DownstreamPlan
 from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds
 from neeco.experiments.downstream.samples import (
     CLASSES,
     INFO,
-    frame_size,
-    recorded_samples,
 )
 from neeco.experiments.machine import machine
 from neeco.experiments.running import run_jobs, threads_per_worker
@@ -58,14 +56,13 @@ def document(plan: DownstreamPlan, results: Sequence[dict[str, Any]]) -> dict[st
     spec, teaching = plan.spec, plan.teaching
     kinds = {name: model_class(name) for name in spec.models}
     answers = {name: kind.answers for name, kind in kinds.items()}
-    size = frame_size(recorded_samples(plan.capture, teaching.splits[0], teaching.classes))
     models = [
         {
             "name": name,
             "answers": kind.answers,
-            "steps": teaching.steps or kind.steps,
-            "batch": teaching.batch or kind.batch,
-            "input": list(input_size(size, teaching.side or kind.side, kind.multiple)),
+            "steps": teaching.steps_of(kind),
+            "batch": teaching.batch_of(kind),
+            "input": list(teaching.input_of(kind, plan.size)),
             "weights": str(spec.weights[name].absolute()) if name in spec.weights else None,
         }
         for name, kind in kinds.items()

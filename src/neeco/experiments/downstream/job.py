@@ -19,9 +19,10 @@ from neeco.evaluation.mask_metrics import iou
 from neeco.experiments.downstream.augment import augment
 from neeco.experiments.downstream.conditions import Condition, Pick, held_back, labelled_frames
 from neeco.experiments.downstream.feed import Feed
-from neeco.experiments.downstream.model import Boxes, Fitted, Prediction, Task, input_size, model_class
+from neeco.experiments.downstream.model import Boxes, Fitted, Model, Prediction, Task, input_size, model_class
 from neeco.experiments.downstream.samples import (
     CLASSES,
+    JAWS,
     ClassNames,
     DataSet,
     Example,
@@ -59,6 +60,22 @@ class Teaching:
     batch: int | None = None
     device: str = "auto"
 
+    def steps_of(self, kind: type[Model]) -> int:
+        """How many steps a model is taught in."""
+        return self.steps or kind.steps
+
+    def batch_of(self, kind: type[Model]) -> int:
+        """How many images it sees in each."""
+        return self.batch or kind.batch
+
+    def side_of(self, kind: type[Model]) -> int:
+        """The longer side that its images may have, px."""
+        return self.side or kind.side
+
+    def input_of(self, kind: type[Model], frame: tuple[int, int]) -> tuple[int, int]:
+        """(width, height) it sees of frames of this size."""
+        return input_size(frame, self.side_of(kind), kind.multiple)
+
 
 @dataclass(frozen=True)
 class DownstreamJob:
@@ -82,17 +99,9 @@ class DownstreamJob:
         labelled = f", {self.real} labelled" if self.condition.real else ""
         return f"{self.model}, {self.condition.name}{labelled}, fold {self.fold}"
 
-    @property
-    def steps(self) -> int:
-        return self.teaching.steps or model_class(self.model).steps
-
-    @property
-    def batch(self) -> int:
-        return self.teaching.batch or model_class(self.model).batch
-
     def identity(self) -> dict[str, Any]:
         """What a folder must agree with to be this job's."""
-        teaching = self.teaching
+        teaching, kind = self.teaching, model_class(self.model)
         sets = [data.described() for data in teaching.sets if data.name in self.condition.sets]
         return {
             "model": self.model,
@@ -106,9 +115,9 @@ class DownstreamJob:
             "edges": self.condition.edges if sets else None,
             "classes": teaching.classes,
             "pick": teaching.pick,
-            "steps": self.steps,
-            "side": teaching.side or model_class(self.model).side,
-            "batch": self.batch,
+            "steps": teaching.steps_of(kind),
+            "side": teaching.side_of(kind),
+            "batch": teaching.batch_of(kind),
             "weights": None if self.weights is None else str(self.weights.absolute()),
         }
 
@@ -143,11 +152,11 @@ class DownstreamJob:
         splits = {split: self._test(fitted, capture, split) for split in self.teaching.splits}
         result = {"schema": JOB_SCHEMA} | self.identity()
         result |= {
-            "iterations": self.steps,
+            "iterations": task.steps,
             "best_step": fitted.best_step,
             "validation": list(map(list, fitted.validation)),
         }
-        result |= {"still_learning": fitted.best_step > (1 - ALMOST) * self.steps and _rises(fitted.validation)}
+        result |= {"still_learning": fitted.best_step > (1 - ALMOST) * task.steps and _rises(fitted.validation)}
         result |= {"seconds": round(seconds, 1), "processor_seconds": round(processor, 1), "input": list(task.size)}
         result |= {"splits": splits}
         write_json(file, result)
@@ -173,9 +182,9 @@ class DownstreamJob:
             classes=CLASSES[teaching.classes],
             feed=Feed([learned for learned, _ in parts], self.fold, augment if self.condition.augment else None),
             validation=tuple(validation),
-            size=input_size(size, teaching.side or kind.side, kind.multiple),
-            steps=self.steps,
-            batch=self.batch,
+            size=teaching.input_of(kind, size),
+            steps=teaching.steps_of(kind),
+            batch=teaching.batch_of(kind),
             seed=self.fold,
             device=device,
             folder=self.folder,
@@ -192,14 +201,12 @@ class DownstreamJob:
         boxes = [answer for answer in predictions if isinstance(answer, Boxes)]
         if boxes:
             return {"frames": len(samples)} | box_scores(boxes, truth, names)
-        parts = recorded_samples(capture, split, "parts") if _tells_parts(samples) else ()
-        jaws = [_jaws(sample.load()) for sample in parts]
         frames = []
-        for index, (answer, example) in enumerate(zip(predictions, truth, strict=True)):
+        for sample, answer, example in zip(samples, predictions, truth, strict=True):
             assert isinstance(answer, np.ndarray)
             row = mask_scores(answer, example, names)
-            if jaws:
-                row |= {"iou_jaws": iou(answer > 0, example.classes > 0, jaws[index])}
+            if (jaws := sample.part_pixels(JAWS)) is not None:
+                row |= {"iou_jaws": iou(answer > 0, example.classes > 0, _judged(jaws, example))}
             frames.append(row)
         rows = [{"frame": sample.name} | _plain(row) for sample, row in zip(samples, frames, strict=True)]
         return {"frames": len(samples)} | mean_scores(frames) | {"per_frame": rows}
@@ -228,13 +235,9 @@ def _rises(curve: Sequence[tuple[int, float]]) -> bool:
     return len(curve) >= 2 and curve[-1][1] > max(score for _, score in curve[:-1]) + 0.005
 
 
-def _tells_parts(samples: Sequence[Any]) -> bool:
-    return samples[0].masks.names is not None
-
-
-def _jaws(example: Example) -> np.ndarray:
-    """bool [H, W]: near the true jaws, and to be judged."""
-    close = near(example.classes == CLASSES["parts"].index("jaws") + 1, JAWS_REACH)
+def _judged(jaws: np.ndarray, example: Example) -> np.ndarray:
+    """bool [H, W]: near the true jaws [H, W], and counted."""
+    close = near(jaws, JAWS_REACH)
     return close if example.counted is None else close & example.counted
 
 

@@ -19,9 +19,8 @@ from neeco.experiments.downstream.conditions import (
     parse_condition,
 )
 from neeco.experiments.downstream.job import DownstreamJob, Teaching
-from neeco.experiments.downstream.model import input_size, model_class
+from neeco.experiments.downstream.model import model_class
 from neeco.experiments.downstream.samples import (
-    RecordedSample,
     drawn_samples,
     frame_size,
     has_labels,
@@ -61,6 +60,7 @@ class DownstreamPlan:
     jobs: tuple[DownstreamJob, ...]
     images: Mapping[str, int]  # of each set
     labelled: int  # recorded training frames with a label
+    size: tuple[int, int]  # width, height of the frames
     notes: tuple[str, ...]
 
 
@@ -77,21 +77,22 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
     conditions = _conditions(spec)
     capture = read_checked(spec.teaching.capture, spec.teaching.transforms)
     teaching = replace(spec.teaching, splits=_splits(capture, spec.teaching.splits))
-    tested = recorded_samples(capture, teaching.splits[0], teaching.classes)
+    size = frame_size(recorded_samples(capture, teaching.splits[0], teaching.classes))
     images = {}
     for data in teaching.sets:
         edges = {condition.edges for condition in conditions if data.name in condition.sets}
         for edge in sorted(edges) or [DEFAULT_EDGES]:
-            images[data.name] = len(drawn_samples(data, teaching.classes, edge, frame_size(tested)))
+            images[data.name] = len(drawn_samples(data, teaching.classes, edge, size))
     counts, labelled = _counts(spec, teaching, capture, conditions)
-    _check_models_for(spec, capture, tested)
+    _check_models_for(spec, capture, size)
     _check_output(spec)
     jobs = _jobs(spec, teaching, conditions, counts)
     if not jobs:
         raise NeecoError("--real: leaves nothing to teach; add 0 for sets alone, or a number of labelled frames")
     for job in jobs:
         job.check()
-    return DownstreamPlan(spec, teaching, capture, jobs, images, labelled, tuple(_notes(spec, teaching, counts)))
+    notes = tuple(_notes(spec, teaching, counts))
+    return DownstreamPlan(spec, teaching, capture, jobs, images, labelled, size, notes)
 
 
 def job_folder(output: Path, model: str, condition: str, real: int, fold: int) -> Path:
@@ -169,10 +170,10 @@ def _counts(
     return sorted({labelled_count(word, labelled) for word in spec.real}), labelled
 
 
-def _check_models_for(spec: DownstreamSpec, capture: Capture, tested: Sequence[RecordedSample]) -> None:
+def _check_models_for(spec: DownstreamSpec, capture: Capture, frame: tuple[int, int]) -> None:
     for name in spec.models:
         kind = model_class(name)
-        size = input_size(frame_size(tested), spec.teaching.side or kind.side, kind.multiple)
+        size = spec.teaching.input_of(kind, frame)
         if kind.sees_too_little(size):
             raise NeecoError(
                 f"--models {name}: it would see images of {size[0]}x{size[1]} px, too small for it; give a larger "
@@ -180,7 +181,7 @@ def _check_models_for(spec: DownstreamSpec, capture: Capture, tested: Sequence[R
             )
         if kind.answers == "boxes" and len(capture.instruments) > 1:
             raise NeecoError(
-                f"--models {name}: {tested[0].masks.path}: labels do not tell the {len(capture.instruments)} "
+                f"--models {name}: {capture.root}: labels do not tell the {len(capture.instruments)} "
                 "instruments apart, so there is no box of each; use a model that answers with masks"
             )
 

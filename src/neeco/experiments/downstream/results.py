@@ -71,14 +71,12 @@ def paired(
 ) -> dict[str, Any] | None:
     """How much better `first` (model, condition, labelled frames) does than `second` on the folds that both finished:
     the mean difference, and the interval in which its mean lies with 95 % (Student's t; None for a single fold)."""
-    scores = []
-    for wanted in (first, second):
-        found = [job for job in jobs if (job["model"], job["condition"], job["real"]) == wanted and "error" not in job]
-        scores.append({job["fold"]: job["splits"].get(split, {}).get(metric) for job in found})
-    folds = [fold for fold in scores[0] if scores[0][fold] is not None and scores[1].get(fold) is not None]
+    scores = by_fold(jobs, first[0], split, metric)
+    ours, theirs = (scores.get(key[1:], {}) for key in (first, second))
+    folds = [fold for fold in ours if fold in theirs]
     if not folds:
         return None
-    differences = np.array([scores[0][fold] - scores[1][fold] for fold in folds])
+    differences = np.array([ours[fold] - theirs[fold] for fold in folds])
     row: dict[str, Any] = {"model": first[0], "split": split, "metric": metric, "condition": first[1], "real": first[2]}
     row |= {"against": second[1], "against_real": second[2], "folds": len(folds)}
     row |= {"difference": float(differences.mean()), "low": None, "high": None}
@@ -99,10 +97,11 @@ def comparisons(
     """
     keys = list(dict.fromkeys((job["model"], job["condition"], job["real"]) for job in jobs))
     rows = []
+    metrics = {name: metrics_of([job for job in jobs if job["model"] == name], kind) for name, kind in models.items()}
     for first in keys:
         for second in _against(first, keys, sets):
             for split in splits:
-                for metric in metrics_of([job for job in jobs if job["model"] == first[0]], models[first[0]]):
+                for metric in metrics[first[0]]:
                     row = paired(jobs, first, second, split, metric)
                     rows += [] if row is None else [row]
     return rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -104,6 +104,13 @@ class RecordedSample:
             self.meaning.instruments[ids],
             None if counted is None else counted.numpy(),
         )
+
+    def part_pixels(self, parts: Collection[str]) -> np.ndarray | None:
+        """bool [H, W]: the pixels of these parts; None where the labels tell no parts. Raises NeecoError."""
+        names = self.masks.names
+        if names is None:
+            return None
+        return np.isin(self.masks.load(self.name), [number for number, part in names.items() if part in parts])
 
 
 @dataclass(frozen=True)
