@@ -21,7 +21,7 @@ from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
 from neeco.experiments.jobs import Budget, Job, check_settings, settings_for
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.plans import AblationPlan
-from neeco.experiments.running import require_ray, run_jobs
+from neeco.experiments.running import check_workers, run_jobs
 from neeco.experiments.work import JobNews
 from neeco.files import new_folder, read_json, write_json
 from neeco.raster.devices import device_of
@@ -39,8 +39,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
     for unknown tables and settings, a capture without instruments, or an output that holds other runs.
     """
-    if plan.workers > 1:
-        require_ray()
+    check_workers(plan.workers)
     device = device_of(plan.device)
     chosen = chosen_ablations(plan.tables)
     variants = distinct_variants(chosen)

@@ -24,11 +24,11 @@ from neeco.experiments.jobs import (
 )
 from neeco.experiments.machine import machine
 from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
-from neeco.experiments.running import require_ray, run_jobs, threads_per_worker
+from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
 from neeco.experiments.watching import CURVE_FILE, TOTALS, read_rows
-from neeco.experiments.work import JobNews
+from neeco.experiments.work import JobNews, check_output
 from neeco.files import new_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
@@ -77,10 +77,7 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     device_of(spec.device)
     if spec.seeds < 1:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
-    if spec.workers < 1:
-        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    if spec.workers > 1:
-        require_ray()
+    check_workers(spec.workers)
     configs = _configs(spec)
     capture = _open_capture(spec, configs)
     networks = find_lpips(spec.lpips_weights)
@@ -188,22 +185,11 @@ def _open_capture(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> C
 
 def _check_output(spec: ComparisonSpec) -> None:
     """Raises NeecoError when `output` holds something else, or the comparison of another capture or budget."""
-    output = spec.output
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give another --output")
-    if not output.is_dir() or not any(output.iterdir()):
-        return
-    file = output / COMPARISON_FILE
-    if not file.exists():
-        raise NeecoError(f"{output}: not empty, and no comparison; give another --output")
-    stored = read_json(file)
-    if not isinstance(stored, dict) or stored.get("schema") != COMPARISON_SCHEMA:
-        raise NeecoError(f"{file}: schema: is not {COMPARISON_SCHEMA}; give another --output")
-    if stored["capture"] != str(spec.capture.absolute()):
-        raise NeecoError(f"{file}: capture: compares methods on {stored['capture']}; give another --output")
-    if stored["budget"] != asdict(spec.budget):
-        before = Budget(**stored["budget"])
-        raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; give another --output")
+    noun, about = "comparison", "compares methods on"
+    stored = check_output(spec.output, COMPARISON_FILE, COMPARISON_SCHEMA, spec.capture, noun, about)
+    if stored is not None and stored["budget"] != asdict(spec.budget):
+        told = f"budget: compares after {Budget(**stored['budget'])}, not {spec.budget}"
+        raise NeecoError(f"{spec.output / COMPARISON_FILE}: {told}; give another --output")
 
 
 def _names(plan: ComparisonPlan) -> list[str]:

@@ -35,8 +35,7 @@ def run_jobs(
     written, so that the next start tries again. Raises NeecoError before any work when a job's folder is another job's
     or Ray is not there, and KeyboardInterrupt saying which job was stopped.
     """
-    if workers < 1:
-        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
+    check_workers(workers)
     report = progress or (lambda news: None)
     for job in jobs:
         job.check()
@@ -73,6 +72,14 @@ def threads_per_worker(workers: int, cores: int | None = None) -> int:
     return max(1, (cores or usable_cores()) // workers)
 
 
+def check_workers(workers: int) -> None:
+    """Raises NeecoError for fewer than one, or for several where Ray cannot be had."""
+    if workers < 1:
+        raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
+    if workers > 1:
+        require_ray()
+
+
 def require_ray() -> None:
     """Raises NeecoError when Ray is not installed, or nobody listens at the HOST:PORT that RAY_ADDRESS names."""
     if importlib.util.find_spec("ray") is None:
@@ -95,7 +102,6 @@ def _run_on_cluster(jobs: Sequence[Work], workers: int, report: Callable[[JobNew
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
     device is opened in its worker; jobs that name the same one share it.
     """
-    require_ray()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else it hides them: no job reserves one
     import ray

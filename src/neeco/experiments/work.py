@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.files import write_text
+from neeco.files import read_json, write_text
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
 
@@ -61,6 +61,26 @@ class JobNews:
     share: float = 0.0
     text: str = ""
     result: dict[str, Any] | None = None
+
+
+def check_output(output: Path, file: str, schema: str, capture: Path, noun: str, about: str) -> dict[str, Any] | None:
+    """What an experiment begun earlier in `output` says in its `file`; None where nothing was begun.
+
+    noun, about: what it is called and how it speaks of its capture, in messages. Raises NeecoError when `output` is no
+    folder, holds something else, or the experiment on another capture.
+    """
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give another --output")
+    if not output.is_dir() or not any(output.iterdir()):
+        return None
+    if not (output / file).exists():
+        raise NeecoError(f"{output}: not empty, and no {noun}; give another --output")
+    stored = read_json(output / file)
+    if not isinstance(stored, dict) or stored.get("schema") != schema:
+        raise NeecoError(f"{output / file}: schema: is not {schema}; give another --output")
+    if stored.get("capture") != str(capture.absolute()):
+        raise NeecoError(f"{output / file}: capture: {about} {stored.get('capture')}; give another --output")
+    return stored
 
 
 def ended(index: int, total: int, job: Work, result: dict[str, Any]) -> JobNews:

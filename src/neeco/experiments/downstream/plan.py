@@ -26,8 +26,8 @@ from neeco.experiments.downstream.samples import (
     has_labels,
     recorded_samples,
 )
-from neeco.experiments.running import require_ray
-from neeco.files import read_json
+from neeco.experiments.running import check_workers
+from neeco.experiments.work import check_output
 from neeco.raster.devices import device_of
 
 SCHEMA = "neeco-downstream/1"
@@ -68,10 +68,7 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be taught or tested."""
     if spec.folds < 1:
         raise NeecoError(f"--folds: {spec.folds} is none at all; give at least 1")
-    if spec.workers < 1:
-        raise NeecoError(f"--workers: {spec.workers} is none at all; give at least 1")
-    if spec.workers > 1:
-        require_ray()
+    check_workers(spec.workers)
     _check_models(spec)
     device_of(spec.teaching.device, drawing=False)
     conditions = _conditions(spec)
@@ -189,19 +186,9 @@ def _check_models_for(spec: DownstreamSpec, capture: Capture, frame: tuple[int, 
 def _check_output(spec: DownstreamSpec) -> None:
     """Raises NeecoError when `output` holds something else, or another capture's experiment."""
     output = spec.output
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give another --output")
-    if not output.is_dir() or not any(output.iterdir()):
-        return
-    if not (output / FILE).exists():
-        if [entry.name for entry in output.iterdir() if not entry.name.startswith(".")] == [JOBS]:
-            return  # stopped before its first result
-        raise NeecoError(f"{output}: not empty, and no downstream experiment; give another --output")
-    stored = read_json(output / FILE)
-    if not isinstance(stored, dict) or stored.get("schema") != SCHEMA:
-        raise NeecoError(f"{output / FILE}: schema: is not {SCHEMA}; give another --output")
-    if stored.get("capture") != str(spec.teaching.capture.absolute()):
-        raise NeecoError(f"{output / FILE}: capture: is about {stored.get('capture')}; give another --output")
+    if output.is_dir() and [entry.name for entry in output.iterdir() if not entry.name.startswith(".")] == [JOBS]:
+        return  # stopped before its first result
+    check_output(output, FILE, SCHEMA, spec.teaching.capture, "downstream experiment", "is about")
 
 
 def _jobs(
