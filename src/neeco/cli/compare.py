@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
+from neeco.cli._outcome import tell_outcome
 from neeco.cli._tables import fitted
 from neeco.settings import Device
 
@@ -72,22 +73,8 @@ def run(args: Compare) -> int:
     for table in tables_of(comparison):
         for part in fitted(table, console.width):
             console.print(part)
-    for note in absent_notes(comparison):
-        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for what, name in (("tables", "comparison.md, .csv, .tex"), ("all numbers", "comparison.json, data/")):
-        console.print(f"{what}: {args.output}/: {name}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
-    failed = failures(comparison)
-    if failed:
-        more = f" (and {len(failed) - 1} more, told above)" if len(failed) > 1 else ""
-        Console(stderr=True).print(
-            f"neeco: error: {len(failed)} of {len(comparison['jobs'])} runs failed: {failed[0]}{more}",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-        return 1
-    return 0
+    notes, failed = absent_notes(comparison), failures(comparison)
+    return tell_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison['jobs'])} runs")
 
 
 def _spec(args: Compare) -> ComparisonSpec:

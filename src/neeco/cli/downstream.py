@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
+from neeco.cli._outcome import tell_outcome
 from neeco.cli._tables import fitted
 from neeco.settings import Device
 
@@ -85,21 +86,8 @@ def run(args: Downstream) -> int:
             console.print(part)
     for sentence in experiment["answers"]:
         console.print(sentence, markup=False, highlight=False)
-    for note in experiment["notes"]:
-        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
-    for what, name in (("tables", "downstream.md, .csv, .tex"), ("all numbers", "downstream.json, data/")):
-        console.print(f"{what}: {args.output}/: {name}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
-    if failed := failed_jobs(experiment):
-        more = f" (and {len(failed) - 1} more, told above)" if len(failed) > 1 else ""
-        Console(stderr=True).print(
-            f"neeco: error: {len(failed)} of {len(experiment['jobs'])} trainings failed: {failed[0]}{more}",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-        return 1
-    return 0
+    notes, failed = experiment["notes"], failed_jobs(experiment)
+    return tell_outcome(console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings")
 
 
 def _spec(args: Downstream) -> DownstreamSpec:
