@@ -178,6 +178,18 @@ def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSpec) -> None:
     assert any("3 labelled frames: too few to hold one back" in note for note in plan.notes)
 
 
+def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    conditions = ("real", "kin", "kin+real")
+
+    def mixed() -> list[tuple[int | None, float | None]]:
+        plan = plan_downstream(replace(spec, real=("0", "6"), folds=1, conditions=conditions))
+        return [(job._task(plan.capture).feed.mixed, job.identity()["finish"]) for job in plan.jobs]
+
+    assert mixed() == [(None, None), (None, None), (4 * 2, 0.3)]
+    monkeypatch.setattr(Pixels, "orders_images", False)
+    assert mixed() == [(None, None)] * 3
+
+
 # going on and growing
 
 

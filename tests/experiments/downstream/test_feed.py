@@ -53,6 +53,15 @@ def test_the_seed_decides_the_order_whatever_the_batches() -> None:
     assert names(Feed(SOURCES, 1), 30) != names(Feed(SOURCES, 2), 30)
 
 
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 40), st.lists(st.integers(1, 9), min_size=1, max_size=8))
+def test_after_the_mixed_ones_only_the_first_source_is_seen(mixed: int, sizes: list[int]) -> None:
+    feed = Feed(SOURCES, 2, mixed=mixed)
+    seen = [name for size in sizes for name in names(feed, size)]
+    assert seen[:mixed] == names(Feed(SOURCES, 2), len(seen))[:mixed]
+    assert {source_of(name) for name in seen[mixed:]} <= {0}
+
+
 def test_empty_sources_take_no_share() -> None:
     assert {source_of(name) for name in names(Feed([(), SOURCES[0]], 0), 12)} == {0}
 

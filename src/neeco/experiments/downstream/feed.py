@@ -1,4 +1,4 @@
-"""Batches of examples: every source an equal share of each, in an order that the seed decides."""
+"""Batches of examples: every source an equal share of each, at last the first alone; the seed decides the order."""
 
 from __future__ import annotations
 
@@ -17,11 +17,19 @@ class Feed:
     """Draws examples from sources without end. A source's order is shuffled anew when all of it has been seen.
 
     sources: recorded frames, each data set. Each batch takes as many from each, whatever their sizes: a few labelled
-    frames are not drowned by a thousand drawn ones. Augmentation changes nothing of the order.
+    frames are not drowned by a thousand drawn ones. mixed: how many examples are drawn so; those after them are the
+    first source's. Augmentation changes nothing of the order.
     """
 
-    def __init__(self, sources: Sequence[Sequence[Sample]], seed: int, augment: Augment | None = None) -> None:
+    def __init__(
+        self,
+        sources: Sequence[Sequence[Sample]],
+        seed: int,
+        augment: Augment | None = None,
+        mixed: int | None = None,
+    ) -> None:
         self.sources = [source for source in sources if source]
+        self.mixed = mixed
         self.rng, self.augment_rng = (np.random.default_rng(np.random.SeedSequence([seed, k])) for k in (1, 2))
         self.augment = augment
         self._orders = [self._shuffled(len(source)) for source in self.sources]
@@ -34,7 +42,8 @@ class Feed:
         return [self._next() for _ in range(count)]
 
     def _next(self) -> Example:
-        source = self._turn % len(self.sources)
+        alone = self.mixed is not None and self._turn >= self.mixed
+        source = 0 if alone else self._turn % len(self.sources)
         self._turn += 1
         example = self._load(source, next(self._orders[source]))
         return example if self.augment is None else self.augment(example, self.augment_rng)

@@ -40,6 +40,7 @@ JOB_SCHEMA = "neeco-downstream-job/1"
 JOB_FILE = "job.json"
 PREDICTIONS = "predictions"
 ALMOST = 0.2  # of the steps: weights kept from this last share say that more steps might still have helped
+FINISH = 0.3  # of the steps: recorded frames alone, whose labels and looks are those of the test
 JAWS_REACH = 4.0  # px about the true jaws in which `iou_jaws` judges: thin, and small beside the shaft
 
 
@@ -113,6 +114,7 @@ class DownstreamJob:
             "transforms": teaching.transforms,
             "sets": sets,
             "edges": self.condition.edges if sets else None,
+            "finish": self._finish,
             "classes": teaching.classes,
             "pick": teaching.pick,
             "steps": teaching.steps_of(kind),
@@ -120,6 +122,12 @@ class DownstreamJob:
             "batch": teaching.batch_of(kind),
             "weights": None if self.weights is None else str(self.weights.absolute()),
         }
+
+    @property
+    def _finish(self) -> float | None:
+        """The last share of its steps, which see recorded frames alone; None where there is nothing to leave out."""
+        both = self.condition.real and self.condition.sets
+        return FINISH if both and model_class(self.model).orders_images else None
 
     def check(self) -> None:
         """Raises NeecoError when the folder holds another job's result."""
@@ -178,13 +186,16 @@ class DownstreamJob:
         parts = [held_back(source, self.fold) for source in sources if source]
         validation: Sequence[Sample] = next((kept for _, kept in parts if kept), [])
         device = device_of(teaching.device, drawing=False)
+        steps, batch = teaching.steps_of(kind), teaching.batch_of(kind)
+        mixed = None if self._finish is None else round((1 - self._finish) * steps) * batch
+        augmented = augment if self.condition.augment else None
         return Task(
             classes=CLASSES[teaching.classes],
-            feed=Feed([learned for learned, _ in parts], self.fold, augment if self.condition.augment else None),
+            feed=Feed([learned for learned, _ in parts], self.fold, augmented, mixed),
             validation=tuple(validation),
             size=teaching.input_of(kind, size),
-            steps=teaching.steps_of(kind),
-            batch=teaching.batch_of(kind),
+            steps=steps,
+            batch=batch,
             seed=self.fold,
             device=device,
             folder=self.folder,

@@ -73,6 +73,7 @@ class Model(ABC):
     steps: ClassVar[int]  # until it is taught what a few hundred images teach
     batch: ClassVar[int]
     accepts_weights: ClassVar[bool] = True
+    orders_images: ClassVar[bool] = True  # it sees them in the feed's order
 
     @classmethod
     @abstractmethod

@@ -42,6 +42,7 @@ class Yolo(Model):
     steps = 400
     batch = 8
     accepts_weights = False  # they are pickles: for that program alone to open
+    orders_images = False  # that program shuffles
 
     @classmethod
     def unmet(cls) -> str | None:
