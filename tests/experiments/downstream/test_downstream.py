@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
+from neeco.experiments.downstream import job as job_module
 from neeco.experiments.downstream import model as models_module
 from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
 from neeco.experiments.downstream.job import Teaching
@@ -181,13 +182,16 @@ def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSpec) -> None:
 def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     conditions = ("real", "kin", "kin+real")
 
-    def mixed() -> list[tuple[int | None, float | None]]:
+    def finish() -> list[tuple[int | None, bool]]:
+        """Of each job: how many images are mixed, and whether its identity speaks of it."""
         plan = plan_downstream(replace(spec, real=("0", "6"), folds=1, conditions=conditions))
-        return [(job._task(plan.capture).feed.mixed, job.identity()["finish"]) for job in plan.jobs]
+        return [(job._task(plan.capture).feed.mixed, job.identity()["finish"] is not None) for job in plan.jobs]
 
-    assert mixed() == [(None, None), (None, None), (4 * 2, 0.3)]
+    assert finish() == [(None, False), (None, False), ((6 - 2) * 2, True)]  # of six steps of two
+    monkeypatch.setattr(job_module, "FINISH_ROUNDS", 0.4)  # of five frames: two images
+    assert finish()[2] == ((6 - 1) * 2, True)
     monkeypatch.setattr(Pixels, "orders_images", False)
-    assert mixed() == [(None, None)] * 3
+    assert finish() == [(None, False)] * 3
 
 
 # going on and growing

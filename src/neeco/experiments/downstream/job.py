@@ -40,7 +40,8 @@ JOB_SCHEMA = "neeco-downstream-job/1"
 JOB_FILE = "job.json"
 PREDICTIONS = "predictions"
 ALMOST = 0.2  # of the steps: weights kept from this last share say that more steps might still have helped
-FINISH = 0.3  # of the steps: recorded frames alone, whose labels and looks are those of the test
+FINISH = 0.3  # of the steps at most: recorded frames alone, whose labels and looks are those of the test
+FINISH_ROUNDS = 20  # in which each of them is seen at most so often: a few frames are learned by heart
 JAWS_REACH = 4.0  # px about the true jaws in which `iou_jaws` judges: thin, and small beside the shaft
 
 
@@ -114,7 +115,7 @@ class DownstreamJob:
             "transforms": teaching.transforms,
             "sets": sets,
             "edges": self.condition.edges if sets else None,
-            "finish": self._finish,
+            "finish": f"{FINISH} of the steps, {FINISH_ROUNDS} rounds at most" if self._finishes else None,
             "classes": teaching.classes,
             "pick": teaching.pick,
             "steps": teaching.steps_of(kind),
@@ -124,10 +125,9 @@ class DownstreamJob:
         }
 
     @property
-    def _finish(self) -> float | None:
-        """The last share of its steps, which see recorded frames alone; None where there is nothing to leave out."""
-        both = self.condition.real and self.condition.sets
-        return FINISH if both and model_class(self.model).orders_images else None
+    def _finishes(self) -> bool:
+        """Whether the last steps see recorded frames alone."""
+        return self.condition.real and bool(self.condition.sets) and model_class(self.model).orders_images
 
     def check(self) -> None:
         """Raises NeecoError when the folder holds another job's result."""
@@ -187,11 +187,11 @@ class DownstreamJob:
         validation: Sequence[Sample] = next((kept for _, kept in parts if kept), [])
         device = device_of(teaching.device, drawing=False)
         steps, batch = teaching.steps_of(kind), teaching.batch_of(kind)
-        mixed = None if self._finish is None else round((1 - self._finish) * steps) * batch
+        learned = [samples for samples, _ in parts]
         augmented = augment if self.condition.augment else None
         return Task(
             classes=CLASSES[teaching.classes],
-            feed=Feed([learned for learned, _ in parts], self.fold, augmented, mixed),
+            feed=Feed(learned, self.fold, augmented, self._mixed(len(learned[0]), steps, batch)),
             validation=tuple(validation),
             size=teaching.input_of(kind, size),
             steps=steps,
@@ -201,6 +201,12 @@ class DownstreamJob:
             folder=self.folder,
             weights=self.weights,
         )
+
+    def _mixed(self, recorded: int, steps: int, batch: int) -> int | None:
+        """How many images are of all sources before so many recorded frames come alone; None: all."""
+        if not self._finishes:
+            return None
+        return (steps - min(round(FINISH * steps), FINISH_ROUNDS * recorded // batch)) * batch
 
     def _test(self, fitted: Fitted, capture: Capture, split: str) -> dict[str, Any]:
         """Scores on one split; what was answered is kept for pictures."""

@@ -27,8 +27,8 @@ class DFine(TorchModel):
     answers = "boxes"
     side = 160
     multiple = 32
-    steps = 800
-    batch = 4  # more and smaller steps teach it more of as many images
+    steps = 1600
+    batch = 2  # more and smaller steps teach it more of as many images
     learning_rate = 8e-4
 
     @classmethod
