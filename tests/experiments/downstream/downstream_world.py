@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from torch import nn
 
 from neeco.experiments.downstream.feed import Feed
 from neeco.experiments.downstream.model import Task
+from neeco.experiments.downstream.models.unet import UNet
 from neeco.experiments.downstream.samples import Example
+from neeco.experiments.downstream.torch_training import TorchModel
 
 PARTS = (("bar", "shaft"), ("bar", "wrist"), ("bar", "jaw_left"), ("bar", "jaw_right"))
 
@@ -115,3 +118,21 @@ def task_of(folder: Path, **changes) -> Task:
         "folder": folder,
     }
     return Task(**given | changes)
+
+
+class Pixels(TorchModel):
+    """A class for each pixel from its colour alone: taught in a blink."""
+
+    model = "pixels"
+    answers = "masks"
+    side, multiple, steps, batch, learning_rate = 48, 8, 6, 2, 0.1
+
+    @classmethod
+    def unmet(cls) -> None:
+        return None
+
+    def build(self, classes: int) -> nn.Module:
+        return nn.Conv2d(3, classes + 1, 1)
+
+    loss = UNet.loss
+    answer = UNet.answer

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from downstream_world import bar_parts, read_grey, save_grey, write_set
-from torch import Tensor, nn
+from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
+from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
@@ -26,31 +26,11 @@ from neeco.experiments.downstream import model as models_module
 from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
 from neeco.experiments.downstream.job import Teaching
 from neeco.experiments.downstream.model import Boxes
-from neeco.experiments.downstream.models.unet import UNet
 from neeco.experiments.downstream.plan import DownstreamSpec, job_folder, plan_downstream
 from neeco.experiments.downstream.samples import DataSet
 from neeco.experiments.downstream.tables import tables_of, write_tables
-from neeco.experiments.downstream.torch_training import TorchModel
 
 TIMES = ("seconds", "processor_seconds", "machine")
-
-
-class Pixels(TorchModel):
-    """A class for each pixel from its colour alone: taught in a blink."""
-
-    model = "pixels"
-    answers = "masks"
-    side, multiple, steps, batch, learning_rate = 48, 8, 6, 2, 0.1
-
-    @classmethod
-    def unmet(cls) -> None:
-        return None
-
-    def build(self, classes: int) -> nn.Module:
-        return nn.Conv2d(3, classes + 1, 1)
-
-    loss = UNet.loss
-    answer = UNet.answer
 
 
 class Corners(Pixels):

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from downstream_world import Held, square, squares, task_of
+from downstream_world import Held, Pixels, square, squares, task_of
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
@@ -23,25 +23,7 @@ from neeco.experiments.downstream.models import dfine
 from neeco.experiments.downstream.models.dfine import DFine
 from neeco.experiments.downstream.models.unet import UNet, targets
 from neeco.experiments.downstream.samples import Example
-from neeco.experiments.downstream.torch_training import WEIGHTS_FILE, TorchModel, load_weights
-
-
-class Pixels(TorchModel):
-    """A model small enough to reason about: a class for each pixel from its colour alone."""
-
-    model = "pixels"
-    answers = "masks"
-    side, multiple, steps, batch, learning_rate = 64, 1, 4, 2, 0.05
-
-    @classmethod
-    def unmet(cls) -> None:
-        return None
-
-    def build(self, classes: int) -> nn.Module:
-        return nn.Conv2d(3, classes + 1, 1)
-
-    loss = UNet.loss
-    answer = UNet.answer
+from neeco.experiments.downstream.torch_training import WEIGHTS_FILE, load_weights
 
 
 def needs(model: str) -> None:
