@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from neeco.errors import NeecoError
 from neeco.experiments.downstream.conditions import (
     HELD_BACK_EVERY,
+    HELD_BACK_FROM,
     Condition,
     default_conditions,
     held_back,
@@ -108,12 +109,12 @@ def test_whole_stretches_are_drawn_from() -> None:
 def test_what_is_held_back_is_not_learned_and_nothing_is_lost(count: int, fold: int) -> None:
     learned, kept = held_back(range(count), fold)
     assert sorted([*learned, *kept]) == list(range(count))
-    assert bool(kept) == (count >= HELD_BACK_EVERY)
+    assert bool(kept) == (count >= HELD_BACK_FROM)
     assert len(kept) <= -(-count // HELD_BACK_EVERY)
     assert learned or not count
 
 
 def test_each_fold_holds_back_other_images() -> None:
-    kept = [held_back(range(20), fold)[1] for fold in range(5)]
-    assert sorted(frame for fold in kept for frame in fold) == list(range(20))
-    assert held_back(range(20), 5) == held_back(range(20), 0)
+    kept = [held_back(range(40), fold)[1] for fold in range(5)]
+    assert sorted(frame for fold in kept for frame in fold) == list(range(40))
+    assert held_back(range(40), 5) == held_back(range(40), 0)

@@ -21,8 +21,10 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
+from neeco.experiments.downstream import conditions as conditions_module
 from neeco.experiments.downstream import job as job_module
 from neeco.experiments.downstream import model as models_module
+from neeco.experiments.downstream import plan as plan_module
 from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
 from neeco.experiments.downstream.job import Teaching
 from neeco.experiments.downstream.model import Boxes
@@ -48,6 +50,8 @@ def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.set_num_threads(1)
     known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
     monkeypatch.setattr(models_module, "find_models", lambda: known)
+    for module in (conditions_module, plan_module):
+        monkeypatch.setattr(module, "HELD_BACK_FROM", 5)
 
 
 @pytest.fixture
@@ -156,7 +160,7 @@ def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSpec) -> None:
     assert len(alone.feed.sources[0]) == 3
     assert alone.validation == ()
     assert [sample.name for sample in beside.validation] == ["000004"]  # a drawn image, then
-    assert any("3 labelled frames: too few to hold one back" in note for note in plan.notes)
+    assert any("3 labelled frames: too few to hold some back" in note for note in plan.notes)
 
 
 def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -475,8 +479,9 @@ def test_boxes_are_scored_and_kept(spec: DownstreamSpec) -> None:
     assert kept["006"] == {"boxes": [[0, 0, 24, 20]], "classes": [1], "scores": [0.9]}
 
 
-def test_parts_are_scored_apart(spec: DownstreamSpec) -> None:
+def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSpec) -> None:
     result = taught(changed(replace(spec, conditions=("kin+real",), folds=1), classes="parts"))
+    assert {job["iterations"] for job in result["jobs"]} == {15}  # not six
     assert result["classes"] == ["shaft", "wrist", "jaws"]
     scores = result["jobs"][0]["splits"]["test"]
     assert {"iou", "shaft.iou", "wrist.iou", "jaws.iou", "iou_jaws"} <= set(scores)

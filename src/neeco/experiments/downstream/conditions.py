@@ -20,6 +20,7 @@ EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
 DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 HELD_BACK_EVERY = 5  # of the labelled frames and of a set's images, one in so many is kept for validation
+HELD_BACK_FROM = 40  # images: of fewer all are learned, what is held back would be too little to choose weights by
 ALL = "all"
 
 Pick = Literal["spread", "first"]
@@ -90,8 +91,9 @@ def labelled_frames(frames: int, count: int, fold: int, pick: Pick) -> list[int]
 
 
 def held_back(samples: Sequence[T], fold: int) -> tuple[list[T], list[T]]:
-    """(to learn from, held back for validation): one in HELD_BACK_EVERY, another in each fold; none of fewer."""
-    if len(samples) < HELD_BACK_EVERY:
+    """(to learn from, held back for validation): one in HELD_BACK_EVERY, another in each fold; none of fewer than
+    HELD_BACK_FROM."""
+    if len(samples) < HELD_BACK_FROM:
         return list(samples), []
     last = (HELD_BACK_EVERY - 1 + fold) % HELD_BACK_EVERY
     learned = [sample for index, sample in enumerate(samples) if index % HELD_BACK_EVERY != last]

@@ -42,6 +42,7 @@ PREDICTIONS = "predictions"
 ALMOST = 0.2  # of the steps: weights kept from this last share say that more steps might still have helped
 FINISH = 0.3  # of the steps at most: recorded frames alone, whose labels and looks are those of the test
 FINISH_ROUNDS = 20  # in which each of them is seen at most so often: a few frames are learned by heart
+PARTS_TAKE = 2.5  # times as many steps to learn as the instrument as one, until more of them help no more
 JAWS_REACH = 4.0  # px about the true jaws in which `iou_jaws` judges: thin, and small beside the shaft
 
 
@@ -64,7 +65,7 @@ class Teaching:
 
     def steps_of(self, kind: type[Model]) -> int:
         """How many steps a model is taught in."""
-        return self.steps or kind.steps
+        return self.steps or round(kind.steps * (PARTS_TAKE if self.classes == "parts" else 1))
 
     def batch_of(self, kind: type[Model]) -> int:
         """How many images it sees in each."""

@@ -11,7 +11,7 @@ from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.experiments.downstream.conditions import (
     DEFAULT_EDGES,
-    HELD_BACK_EVERY,
+    HELD_BACK_FROM,
     RESERVED,
     Condition,
     default_conditions,
@@ -210,9 +210,9 @@ def _notes(spec: DownstreamSpec, teaching: Teaching, counts: Sequence[int]) -> l
     notes = []
     if spec.folds < 3:
         notes.append("intervals of fewer than three folds are wide or absent; give --folds 5 before concluding")
-    if few := [count for count in counts if 0 < count < HELD_BACK_EVERY]:
+    if few := [count for count in counts if 0 < count < HELD_BACK_FROM]:
         notes.append(
-            f"{', '.join(map(str, few))} labelled frames: too few to hold one back; taught with them alone the last "
+            f"{', '.join(map(str, few))} labelled frames: too few to hold some back; taught with them alone the last "
             "weights are taken, beside a set those that do best on drawn images"
         )
     if teaching.labels is not None:
