@@ -71,7 +71,7 @@ def test_beyond_leaves_the_recorded_range_by_at_most_the_margin_and_obeys_limits
     assert 0.82 < max(jaws) <= 0.9
     free = Beyond(scene.recorded.states, (Instrument("rod", {"jaw_angle": None}),), margin=0.5)
     jaws = [free(k, rng_of(k)).instruments["rod"].joints["jaw_angle"] for k in range(200)]
-    assert -0.4 <= min(jaws) < -0.2
+    assert 0.0 <= min(jaws) < 0.1  # recorded from 0 on
     assert 1.0 < max(jaws) <= 1.2
 
 
@@ -89,6 +89,22 @@ def test_beyond_moves_poses_farther_from_the_mean(scene):
 def test_a_margin_of_nothing_is_refused(scene):
     with pytest.raises(NeecoError, match="--margin"):
         Beyond(scene.recorded.states, scene.instruments, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "widened"),
+    [
+        ((0.0, 1.0), (0.0, 1.2)),
+        ((0.1, 1.1), (0.0, 1.3)),
+        ((-0.04, 0.96), (-0.04, 1.16)),
+        ((-1.0, 0.02), (-1.204, 0.02)),
+        ((-0.5, 0.5), (-0.7, 0.7)),
+        ((0.3, 0.4), (0.28, 0.42)),
+    ],
+)
+def test_jaws_that_were_recorded_closed_do_not_cross(recorded, widened):
+    found = JointRange(*recorded).widened(0.2, None)
+    assert (found.lower, found.upper) == pytest.approx(widened)
 
 
 def test_limits_narrower_than_the_recording_do_not_cut_into_it():

@@ -6,6 +6,7 @@ set can be made without the others, in any order, and comes out the same.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,6 +20,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 
+AT_ZERO = 0.05  # of a joint's range: what lies beyond 0 by less is noise of its sensor
 JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
 
 
@@ -44,8 +46,14 @@ class JointRange:
         return float(self.lower + share * (self.upper - self.lower))
 
     def widened(self, margin: float, limits: tuple[float, float] | None) -> JointRange:
-        """The range, wider by `margin` of its length at either end, but never outside `limits`."""
-        reach = margin * (self.upper - self.lower)
+        """The range, wider by `margin` of its length at either end, but never outside `limits`. Where the capture
+        states none, a range on one side of 0 stays there: an angle of 0 is a closed jaw."""
+        length = self.upper - self.lower
+        reach = margin * length
+        if limits is None and self.lower >= -AT_ZERO * length:
+            limits = 0.0, math.inf
+        elif limits is None and self.upper <= AT_ZERO * length:
+            limits = -math.inf, 0.0
         lower, upper = self.lower - reach, self.upper + reach
         if limits is not None:
             # limits narrower than what was recorded are the recording's fault: they must not cut into it
