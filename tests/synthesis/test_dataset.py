@@ -86,7 +86,7 @@ def test_the_data_set_says_how_it_was_made(made, run):
     assert info["complete"] is True
     assert info["images"] == COUNT
     assert info["settings"]["seed"] == 3
-    assert info["settings"]["states"] == "beyond"
+    assert info["settings"]["states"] == "inside"
     assert info["scene"] == str(run.path)
     assert [(entry["id"], entry["part"]) for entry in info["ids"]] == [(0, "tissue"), (1, "shaft"), (2, "jaw")]
 
@@ -170,7 +170,7 @@ def test_an_image_depends_on_seed_and_index_only(made, run, tmp_path):
     scene = run.scene
     labeller = make_labeller(scene, SETTINGS)
     acceptance = make_acceptance(scene, labeller, SETTINGS)
-    sampler = make_sampler(scene, "beyond", 0.2, "recorded", COUNT)
+    sampler = make_sampler(scene, "inside", 0.2, "recorded", COUNT)
     for index in (4, 1):  # out of order, the others never drawn
         make_sample(scene, labeller, sampler, acceptance, SETTINGS, tmp_path, index)
         for folder in ("images", "parts", "depth"):
@@ -250,7 +250,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(run, tmp_path):
 
 @pytest.mark.parametrize(
     ("other", "field"),
-    [({"seed": 9}, "seed"), ({"states": "inside"}, "states"), ({"labels": "threshold"}, "labels")],
+    [({"seed": 9}, "seed"), ({"states": "beyond"}, "states"), ({"labels": "threshold"}, "labels")],
 )
 def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, other, field):
     output = tmp_path / "dataset"
@@ -281,7 +281,7 @@ def test_given_states_that_are_refused_are_skipped_and_named(run, tmp_path, stat
     assert sorted(path.name for path in (tmp_path / "dataset/images").iterdir()) == ["000000.png", "000002.png"]
 
 
-@pytest.mark.parametrize("how", [{"states": "inside"}, {"states": "grid"}, {"views": "orbit"}, {"views": "perturbed"}])
+@pytest.mark.parametrize("how", [{"states": "beyond"}, {"states": "grid"}, {"views": "orbit"}, {"views": "perturbed"}])
 def test_every_sampler_makes_a_data_set(run, tmp_path, how):
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2, **how), formats=("coco",))
     assert summary.images + len(summary.skipped) == 2

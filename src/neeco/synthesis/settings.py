@@ -21,7 +21,7 @@ class Settings:
     """How many images."""
     seed: int = 0
     """The same seed gives the same data set."""
-    states: str = "beyond"
+    states: str = "inside"
     """inside or beyond the recorded range, grid, path:FILE.jsonl (between key states), or FILE.jsonl (as given)."""
     margin: float = 0.2
     """How far `beyond` goes, as a share of the recorded range at either end."""
