@@ -27,7 +27,7 @@ class DFine(TorchModel):
     answers = "boxes"
     side = 160
     multiple = 32
-    steps = 1600
+    steps = 3200
     batch = 2  # more and smaller steps teach it more of as many images
     learning_rate = 8e-4
 
