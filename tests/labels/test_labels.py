@@ -53,6 +53,21 @@ def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
     assert label.keypoints["shaft_near"].visibility == 2
 
 
+def test_the_share_of_made_up_tissue_is_told(scene, state, camera):
+    drawing, _ = labelled(scene, state(), camera)
+    assert drawing.made_up == 0
+    marks = torch.zeros(len(scene.canonical))
+    marks[: scene.canonical.counts[0]] = (scene.canonical.means[: scene.canonical.counts[0], 0] > 0).float()
+    plain = scene.canonical
+    scene.canonical = plain.with_extras(made_up=marks)
+    try:
+        halved, _ = labelled(scene, state(), camera)
+    finally:
+        scene.canonical = plain
+    behind = 1 - float((drawing.parts > 0).float().mean())
+    assert halved.made_up == pytest.approx(behind / 2, abs=0.02)
+
+
 def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera):
     _, label = labelled(scene, state(z=130.0), camera)
     assert label.shape is None

@@ -30,9 +30,10 @@ def steep(canonical: CanonicalGaussians, *rows: int) -> GradientStatistics:
     return statistics
 
 
-def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None):
+def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None, lost=None):
     limits = [BodyLimit(count, 1.0) for count in most]
-    return control_density(canonical, adam or Adam(), statistics, limits, threshold, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    return control_density(canonical, adam or Adam(), statistics, limits, threshold, generator, lost)
 
 
 def test_a_small_gaussian_is_cloned_where_it_is() -> None:
@@ -59,6 +60,15 @@ def test_a_transparent_gaussian_goes() -> None:
     after = change(before, steep(before), threshold=math.inf)
     assert after.counts == (10, 4)
     assert 102.0 not in after.means[:, 0]
+
+
+def test_what_is_lost_goes_however_opaque_and_steep() -> None:
+    before = two_bodies(0.5)
+    lost = torch.zeros(15, dtype=torch.bool)
+    lost[[3, 11]] = True
+    after = change(before, steep(before, 3, 5), lost=lost)
+    assert after.counts == (10, 4)  # one lost, one cloned; one lost
+    assert not (after.means == before.means[3]).all(1).any()
 
 
 @pytest.mark.parametrize("size", [0.5, 2.0])

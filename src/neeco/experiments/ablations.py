@@ -237,6 +237,17 @@ OURS = (
         ),
     ),
     Ablation(
+        "rim",
+        "ours",
+        "Rim of the tissue",
+        "What does continuing the tissue beyond what frames saw of it bring?",
+        (
+            Comparison(
+                "rim", "on", (Entry("off", _kinematic("no-rim", "deformation.rim=false")), Entry("on", KINEMATIC))
+            ),
+        ),
+    ),
+    Ablation(
         "labels",
         "ours",
         "Label way",

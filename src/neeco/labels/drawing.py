@@ -53,6 +53,7 @@ class LayeredDrawing(Drawing):
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue drawn alone
     alone: dict[str, Alone]  # by instrument
+    made_up: float  # share of the image that is tissue which no training frame saw
 
     @property
     def ignored(self) -> Tensor:
@@ -98,7 +99,10 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
         if name in state.instruments:
             single = rasterize(select(gaussians, owners == k), learned_camera)
             alone[name] = Alone((single.alpha > LABEL_THRESHOLD).cpu().numpy(), surface_depth(single))
-    tissue = rasterize(select(gaussians, owners < 0), learned_camera)
+    behind = owners < 0
+    tissue = rasterize(select(gaussians, behind), learned_camera, channels=scene.made_up[behind][:, None])
+    assert tissue.channels is not None
+    made_up = (tissue.channels[..., 0].cpu() * (1 - share)).mean()
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
         parts=parts,
@@ -108,6 +112,7 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
         depth=surface_depth(rendering),
         tissue_depth=surface_depth(tissue),
         alone=alone,
+        made_up=round(float(made_up), 4),
     )
 
 

@@ -19,6 +19,7 @@ from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Pert
 from neeco.scene.drawable import Drawable
 from neeco.scene.method import Stored
 from neeco.scene.recorded import Recorded
+from neeco.scene.rim import MADE_UP
 from neeco.scene.rotations import rigid_from_vector
 
 CANONICAL_SHAPES = {  # of one Gaussian
@@ -123,6 +124,11 @@ class Scene(nn.Module):
             headlight=Headlight(falloff, self.vignette),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
+
+    @property
+    def made_up(self) -> Tensor:
+        """[N] 1 for tissue that no frame saw, made up at the end of training (see `neeco.scene.rim`); else 0."""
+        return self.canonical.extras.get(MADE_UP, self.canonical.means.new_zeros(len(self.canonical)))
 
     def registered(self, state: State) -> State:
         """`state` with the learned tracker-to-world correction applied to its poses."""

@@ -50,8 +50,10 @@ def control_density(
     limits: list[BodyLimit],
     threshold: float,
     generator: torch.Generator,
+    lost: Tensor | None = None,
 ) -> CanonicalGaussians:
-    """Prune the transparent, clone small and split large Gaussians whose gradient exceeds `threshold`, strongest first.
+    """Prune the transparent and those `lost` [N] bool, clone small and split large Gaussians whose gradient exceeds
+    `threshold`, strongest first.
 
     `threshold` = inf only prunes. Adam's moments follow their rows; new rows start at zero.
     """
@@ -59,6 +61,8 @@ def control_density(
     size = canonical.log_scales.max(1).values.exp()
     dense = size.new_tensor([limit.dense_size for limit in limits])[bodies]
     keep = torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY
+    if lost is not None:
+        keep &= ~lost
     grow = keep & (gradients > threshold)
     for body, limit in enumerate(limits):
         rows = bodies == body

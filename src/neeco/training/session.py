@@ -191,6 +191,7 @@ class GaussianSession:
                 self._limits(),
                 settings.threshold if grows else math.inf,
                 self.generator,
+                scene.deformation.lost(scene.canonical, scene.recorded.cameras),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()

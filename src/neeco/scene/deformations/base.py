@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.types import Rendering
+from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
 from neeco.scene.learning import Session, Start, Training
@@ -127,6 +127,11 @@ class Deformation(nn.Module, Method):
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
         """Extra channels [N, C] that this step draws for `regularisation`; None: none."""
+        return None
+
+    def lost(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
+        """[N] bool: Gaussians that density control removes whatever their opacity; None: none. `cameras` are the
+        training frames'."""
         return None
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:

@@ -7,7 +7,7 @@ parts about hinges that are learned from the images, with soft part assignment p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.raster.types import Rendering
+from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
     UNPERTURBED,
@@ -30,6 +30,7 @@ from neeco.scene.deformations.base import (
 from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
+from neeco.scene.rim import continue_tissue, views_of
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
 WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
@@ -41,12 +42,14 @@ RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is le
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
     `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it after iteration 1500;
-    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000."""
+    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000; `rim`: whether tissue
+    that no frame saw is continued smoothly (see `neeco.scene.rim`)."""
 
     shaft_roll: float = 0.5
     shaft_roll_start: int = 600
     opacity_penalty: float = 0.002
     label_sharpness: float = 0.02
+    rim: bool = True
 
 
 @dataclass(frozen=True)
@@ -202,6 +205,15 @@ class Kinematic(Deformation):
         """Nothing disturbed but every shaft, by `roll` rad."""
         return Spin(shaft_roll=roll)
 
+    def lost(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
+        """Tissue whose middle no frame sees: what it looks like there, nothing ever checks."""
+        if not self.settings.rim:
+            return None
+        tissue = canonical.body(0)
+        lost = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
+        lost[tissue] = views_of(canonical.means[tissue].detach(), cameras) == 0
+        return lost
+
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
         """The whole instruments' label [N, 1]."""
         if not (self.settings.label_sharpness > 0 and iteration > SHARPENS_FROM and self.label_names):
@@ -225,6 +237,9 @@ class Kinematic(Deformation):
 
     def finish(self, training: Training) -> None:
         training.instruments.conclude(self)
+        if self.settings.rim:
+            scene = training.scene
+            scene.canonical = continue_tissue(scene.canonical, scene.recorded.cameras)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         rates = {

@@ -62,6 +62,7 @@ def write_sample(
         **state_to_json(drawing.state),
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        "made_up": drawing.made_up,
         "labels": [label.to_json() for label in labels],
         "refused": dict(sorted(refused.items())),
         "files": {file: (root / file).stat().st_size for file in _files_of(index)},
