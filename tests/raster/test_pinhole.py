@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neeco.raster.pinhole import project, project_world
+from neeco.raster.pinhole import in_image, pixel_centers, project, project_world, unproject_world
 from neeco.raster.reference import camera_from_world
 from neeco.raster.types import Camera
 
@@ -73,3 +73,23 @@ def test_single_points_and_batches_keep_their_shape_and_type():
     assert pixels.shape == (4, 5, 2)
     assert depths.shape == (4, 5)
     assert pixels.dtype == torch.float32
+
+
+def test_unprojecting_takes_projecting_back():
+    camera = a_camera()
+    pixels = pixel_centers(3, 4).double()
+    depths = 40 + torch.arange(12.0, dtype=torch.float64).reshape(3, 4)
+    points = unproject_world(pixels, depths, camera)
+    again, deep = project_world(points, camera)
+    assert pixels[1, 2].tolist() == [2.5, 1.5]
+    assert torch.allclose(again, pixels, atol=1e-9)
+    assert torch.allclose(deep, depths, atol=1e-9)
+
+
+def test_the_image_holds_what_lies_before_the_camera_and_within_its_edges():
+    camera = a_camera()
+    corners = torch.tensor([[0.5, 0.5], [camera.width - 0.5, camera.height - 0.5], [-0.5, 3.0], [3.0, camera.height]])
+    points = unproject_world(corners.double(), torch.full((4,), 50.0, dtype=torch.float64), camera)
+    assert in_image(points, camera).tolist() == [True, True, False, False]
+    behind = 2 * camera.world_from_camera[:3, 3].double() - points
+    assert not bool(in_image(behind, camera).any())

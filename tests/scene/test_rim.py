@@ -12,7 +12,7 @@ from neeco.raster.types import Camera
 from neeco.scene.canonical import SH_C0, CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP, continue_tissue, views_of
+from neeco.scene.rim import MADE_UP, continue_tissue, never_in_view, views_of
 from neeco.scene.scene import Scene
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
@@ -101,3 +101,4 @@ def test_without_anything_well_seen_nothing_is_made_up() -> None:
 def test_views_are_counted_inside_the_images_alone() -> None:
     points = torch.tensor([[0.0, 0.0, 100.0], [60.0, 0.0, 100.0], [0.0, 0.0, -100.0]])
     assert views_of(points, [CAMERA, moved(x=20.0)]).tolist() == [2, 1, 0]
+    assert never_in_view(points, [CAMERA, moved(x=20.0)]).tolist() == [False, False, True]

@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
 from neeco.labels.composited import composited_parts
-from neeco.raster.pinhole import project
+from neeco.raster.pinhole import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Te
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
         tissue = composited_parts(rendering).cpu() == 0
-    points = _backproject(_filled(rendering), scene.camera(camera))  # [h, w, 3]
+    centers = pixel_centers(camera.height, camera.width)
+    points = unproject_world(centers, _filled(rendering), scene.camera(camera))  # [h, w, 3]
     unseen = torch.zeros_like(tissue)
     unseen[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)
@@ -124,14 +125,6 @@ def _filled(rendering: Rendering) -> Tensor:
         return depth
     rows, columns = distance_transform_edt(hollow, return_distances=False, return_indices=True)
     return depth[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
-
-
-def _backproject(depth: Tensor, camera: Camera) -> Tensor:
-    """World points [h, w, 3] (mm) of a depth map [h, w]."""
-    rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    rays = torch.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, torch.ones_like(rows)], -1)
-    pose = camera.world_from_camera.cpu().float()
-    return (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def _stack(matrices: list[Tensor], shape: tuple[int, int]) -> Tensor:

@@ -42,6 +42,27 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
     return torch.stack(_intrinsic(seen, camera, nearest), dim=-1), seen[..., 2]
 
 
+def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
+    """Points [..., 3] mm of the world seen at pixels [..., 2] in depths [...] mm: what `project_world` takes back."""
+    pose = camera.world_from_camera.to(depths)
+    u, v = pixels.unbind(-1)
+    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], -1)
+    return (rays * depths[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def pixel_centers(rows: int, columns: int) -> Tensor:
+    """[rows, columns, 2] middles of an image's pixels, column before row."""
+    down, across = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
+    return torch.stack([across, down], -1)
+
+
+def in_image(points: Tensor, camera: Camera) -> Tensor:
+    """[P] bool: which points [P, 3] mm of the world fall into the camera's image, whatever stands before them."""
+    pixels, depths = project_world(points, camera)
+    size = pixels.new_tensor([camera.width, camera.height])
+    return ((pixels >= 0) & (pixels < size)).all(1) & (depths > camera.near)
+
+
 def _intrinsic(points: Array, camera: Camera, nearest: float | None) -> tuple[Array, Array]:
     return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
 

@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from neeco.raster.pinhole import project_world
+from neeco.raster.pinhole import in_image, pixel_centers, project_world, unproject_world
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, seed_gaussians
 
@@ -34,10 +34,18 @@ def views_of(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """How many [P] of the cameras' images points [P, 3] mm of the world fall into, whatever stands before them."""
     count = torch.zeros(len(points), dtype=torch.int32, device=points.device)
     for camera in cameras:
-        pixels, depths = project_world(points, camera)
-        size = pixels.new_tensor([camera.width, camera.height])
-        count += ((pixels >= 0) & (pixels < size)).all(1) & (depths > camera.near)
+        count += in_image(points, camera)
     return count
+
+
+def never_in_view(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """[P] bool: which points [P, 3] mm of the world fall into none of the cameras' images."""
+    left = torch.arange(len(points), device=points.device)
+    for camera in cameras:
+        left = left[~in_image(points[left], camera)]
+    never = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    never[left] = True
+    return never
 
 
 @torch.no_grad()
@@ -55,7 +63,7 @@ def continue_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera]) ->
         return canonical
     grid = torch.from_numpy(_continued(known)).to(means)  # [rows, columns, 4] inverse depth, colour
     positions = field.positions(1 / grid[..., 0])  # [rows, columns, 3]
-    unseen = (views_of(positions.reshape(-1, 3), cameras) == 0).reshape(positions.shape[:2]).cpu()
+    unseen = never_in_view(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
     distance = distance_transform_edt(unseen.numpy()) * field.cell
     chosen = unseen & torch.from_numpy(distance < REACH * field.camera.width)
     return _with_tissue(canonical, _made_up(positions[chosen], grid[chosen][:, 1:], field))
@@ -100,11 +108,8 @@ class _Field:
     def positions(self, depths: Tensor) -> Tensor:
         """Points [rows, columns, 3] mm of the world behind the cells' middles, at depths [rows, columns] mm."""
         camera = self.camera
-        down, across = torch.meshgrid(*(torch.arange(size).to(depths) + 0.5 for size in self.shape), indexing="ij")
-        x = (across * self.cell - FIELD * camera.width - camera.cx) / camera.fx
-        y = (down * self.cell - FIELD * camera.height - camera.cy) / camera.fy
-        pose = camera.world_from_camera.to(depths)
-        return BEHIND * depths[..., None] * torch.stack([x, y, torch.ones_like(x)], -1) @ pose[:3, :3].T + pose[:3, 3]
+        low = depths.new_tensor([camera.width, camera.height]) * -FIELD
+        return unproject_world(pixel_centers(*self.shape).to(depths) * self.cell + low, BEHIND * depths, camera)
 
 
 def _middle_camera(cameras: Sequence[Camera]) -> Camera:

@@ -68,7 +68,8 @@ class Deformation(nn.Module, Method):
     `learns_from` it only holds them still.
 
     Training calls the hooks without knowing whose they are: `fit_ranges` and `initial_extras`, then `begin`,
-    in every step `disturbed`, `training_channels` and `regularisation`, between steps `between_steps`, and `finish`.
+    in every step `disturbed`, `training_channels` and `regularisation`, between steps `between_steps`, where density is
+    controlled `lost`, and at the end `finish`.
     """
 
     label_names: tuple[tuple[str, str], ...] = ()

@@ -30,7 +30,7 @@ from neeco.scene.deformations.base import (
 from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
-from neeco.scene.rim import continue_tissue, views_of
+from neeco.scene.rim import continue_tissue, never_in_view
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
 WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
@@ -211,7 +211,7 @@ class Kinematic(Deformation):
             return None
         tissue = canonical.body(0)
         lost = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
-        lost[tissue] = views_of(canonical.means[tissue].detach(), cameras) == 0
+        lost[tissue] = never_in_view(canonical.means[tissue].detach(), cameras)
         return lost
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:

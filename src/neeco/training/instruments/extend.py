@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from neeco.raster.pinhole import project_world
+from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinges
 from neeco.scene.recorded import Recorded
@@ -67,9 +67,7 @@ def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recor
     counts = torch.zeros_like(positions)
     for state, camera in zip(recorded.states, recorded.cameras, strict=True):
         pose = state.instruments[name].pose.to(points)
-        pixels, depths = project_world(points @ pose[:3, :3].T + pose[:3, 3], camera)
-        u, v = pixels.unbind(1)
-        counts += (depths > camera.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
     return counts / max(1, len(recorded.states))
 
 
