@@ -17,6 +17,8 @@ the scenes, `writing.py` writes. A new scene is one more entry in `scenes.SCENES
               when closed; sensor 26 mm behind the wrist, tilted 9 degrees
     stomach   8 mm grey shaft, short fat grasper of which one jaw moves; the reading falls as it opens; sensor 9 mm
               behind the wrist, tilted 16 degrees
+    bowel-grasper, stomach-scissors
+              each with the other's instrument, in other colours, under a single lamp whose shadow falls beside it
 """
 
 from __future__ import annotations

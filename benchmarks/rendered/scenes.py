@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -164,5 +164,56 @@ SCENES = {
         "fat grasper jaws of which only one moves",
         world_turn=(-2.1, 0.3, 1.1),
         world_shift=(60.0, -35.0, -190.0),
+    ),
+}
+
+# The organs again under one lamp, which casts a shadow, each with the other's instrument and its sensor elsewhere.
+SCENES |= {
+    "bowel-grasper": replace(
+        SCENES["bowel"],
+        design=replace(
+            GRASPER,
+            materials=(
+                Material((0.30, 0.31, 0.33), 0.60, 0.50, 24.0),
+                Material((0.36, 0.38, 0.44), 0.45, 0.70, 34.0),
+                Material((0.66, 0.66, 0.68), 0.40, 0.90, 40.0),
+            ),
+        ),
+        lamps=Lamps(((7.0, -5.0, 0.0),), power=1.25, distance=95.0, focus=2.0),
+        path=replace(
+            SCENES["bowel"].path,
+            trocar=(108.0, 64.0, 130.0),
+            opening_train=32 * DEGREE,
+            opening_most=50 * DEGREE,
+            roll_middle=-120 * DEGREE,
+        ),
+        mount=Mount((1.4, 4.6, -17.0), spin=-2.1, tilt=12 * DEGREE, tilt_towards=-1.9),
+        joint=Joint(zero=0.1, sign=1, limits=(0.0, 1.2)),
+        seed=41,
+        words="folded pale small-bowel loops under a single lamp; an 8 mm bright steel shaft with short shining "
+        "grasper jaws of which only one moves",
+        world_turn=(0.4, 1.9, -0.8),
+        world_shift=(130.0, 20.0, -75.0),
+    ),
+    "stomach-scissors": replace(
+        SCENES["stomach"],
+        design=SCISSORS,
+        lamps=Lamps(((-6.0, 4.0, 0.0),), power=1.30, distance=80.0, focus=3.0),
+        path=replace(
+            SCENES["stomach"].path,
+            trocar=(-104.0, 72.0, 128.0),
+            opening_train=48 * DEGREE,
+            opening_most=74 * DEGREE,
+            roll_middle=150 * DEGREE,
+            roll_train=55 * DEGREE,
+            roll_most=95 * DEGREE,
+        ),
+        mount=Mount((-2.4, -3.0, -34.0), spin=0.6, tilt=6 * DEGREE, tilt_towards=-0.4),
+        joint=Joint(zero=-0.15, sign=-1, limits=(-1.7, 0.0)),
+        seed=53,
+        words="smooth reddish stomach wall under a single lamp; a 5 mm black shaft with a gold wrist and long thin "
+        "scissors, curved along the hinge's axis, 64/36 of the opening per blade",
+        world_turn=(-0.7, -2.2, 0.2),
+        world_shift=(-15.0, 88.0, 240.0),
     ),
 }
