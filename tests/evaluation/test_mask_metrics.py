@@ -58,10 +58,10 @@ def rendering(channels):
 
 def test_a_pixel_is_instrument_where_its_columns_together_pass_the_threshold():
     channels = torch.tensor([[[0.3, 0.4], [0.5, 0.1], [0.9, 0.05]]])
-    assert composited_parts(rendering(channels)).tolist() == [[2, 0, 1]]
-    assert composited_parts(rendering(torch.zeros(1, 3, 0))).tolist() == [[0, 0, 0]]
+    assert composited_parts(rendering(channels), 0.65).tolist() == [[2, 0, 1]]
+    assert composited_parts(rendering(torch.zeros(1, 3, 0)), 0.65).tolist() == [[0, 0, 0]]
     with pytest.raises(NeecoError, match="label channels"):
-        composited_parts(rendering(None))
+        composited_parts(rendering(None), 0.65)
 
 
 def test_the_mean_leaves_out_what_is_not_known():

@@ -25,6 +25,7 @@ class TinyScene:
 
     labelled: bool = True
     has_gaussians = True
+    casts_shadow = False
     method: str = "tiny"
     diagnostics: dict[str, Any] = field(default_factory=dict)
 

@@ -5,7 +5,7 @@ import torch
 from neeco.errors import NeecoError
 from neeco.labels.annotation import annotate, place_in_image, visibility
 from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels
-from neeco.labels.drawing import draw, draw_layers, select
+from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
@@ -210,7 +210,7 @@ def test_threshold_labels_share_is_the_alpha_of_what_moved(scene, state, camera)
     labeller = ThresholdLabels(scene)
     drawing, _ = labelled(scene, state(), camera, labeller)
     posed = scene.at(state())
-    alone = rasterize(select(posed, labeller.owners(state(), posed) >= 0), camera)
+    alone = rasterize(posed.select(labeller.owners(state(), posed) >= 0), camera)
     assert (drawing.share == alone.alpha).all()
     assert drawing.share[drawing.parts > 0].mean() > 0.7
     assert (drawing.ignored & (drawing.parts > 0)).any()

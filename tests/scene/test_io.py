@@ -61,7 +61,7 @@ def test_the_file_is_tensors_and_json_alone(kinematic: Scene, tmp_path: Path) ->
     content = path.read_bytes()
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
-    assert json.loads(header["__metadata__"]["neeco"])["schema"] == "neeco-scene/1"
+    assert json.loads(header["__metadata__"]["neeco"])["schema"] == "neeco-scene/2"
     assert b"pickle" not in content
     assert [p.name for p in tmp_path.iterdir()] == ["scene.safetensors"]
 
@@ -75,11 +75,11 @@ def test_a_cut_file_is_refused(kinematic: Scene, tmp_path: Path, kept: int) -> N
         load_scene(path)
 
 
-def rewrite(path: Path, header_change, drop: str | None = None) -> None:
-    """Save the scene at `path` again with another header, perhaps without one tensor."""
+def rewrite(path: Path, header_change, *drop: str) -> None:
+    """Save the scene at `path` again with another header, perhaps without some tensors."""
     with safe_open(path, framework="pt") as stream:
         header = json.loads(stream.metadata()["neeco"])
-        tensors = {name: stream.get_tensor(name) for name in stream.keys() if name != drop}  # noqa: SIM118
+        tensors = {name: stream.get_tensor(name) for name in stream.keys() if name not in drop}  # noqa: SIM118
     header_change(header)
     save_file(tensors, path, {"neeco": json.dumps(header)})
 
@@ -88,7 +88,18 @@ def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> 
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     rewrite(path, lambda header: header.update(schema="neeco-scene/9"))
-    with pytest.raises(NeecoError, match="schema 'neeco-scene/9', this version reads 'neeco-scene/1'"):
+    with pytest.raises(NeecoError, match="schema 'neeco-scene/9', this version reads 'neeco-scene/2'"):
+        load_scene(path)
+
+
+def test_a_scene_from_before_shadows_casts_none(kinematic: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    shadow = [f"module.shadow_{part}" for part in ("offset", "strength", "width")]
+    rewrite(path, lambda header: header.update(schema="neeco-scene/1"), *shadow)
+    assert not load_scene(path).casts_shadow
+    rewrite(path, lambda header: header.update(schema="neeco-scene/2"), *shadow)
+    with pytest.raises(NeecoError, match="damaged scene"):
         load_scene(path)
 
 

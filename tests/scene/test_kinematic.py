@@ -64,6 +64,67 @@ def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic
     assert (open_ - shut).norm(dim=1).max() > 1
 
 
+def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: Scene) -> None:
+    hinges = kinematic.deformation.hinges_of(0)
+    hinges.middle.fill_(0.6)
+    before = [kinematic.at(grasper_state(POSE, jaw)).means for jaw in (0.6, 1.1)]
+    with torch.no_grad():
+        hinges.share.fill_(0.9)
+    after = [kinematic.at(grasper_state(POSE, jaw)).means for jaw in (0.6, 1.1)]
+    assert torch.allclose(before[0], after[0], atol=1e-5)
+    assert not torch.allclose(before[1], after[1], atol=0.1)
+
+
+def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
+    assign(kinematic, 1)
+    hinges = kinematic.deformation.hinges_of(0)
+    hinges.radius.fill_(2.0)
+    origin, direction = (part.detach() for part in hinges.shaft())
+    depth = float(hinges.hinge_depth[0].detach())
+    places = torch.tensor([depth - 9.0, depth + 9.0]).repeat(len(kinematic.canonical) // 2)[TISSUE:]
+    with torch.no_grad():
+        kinematic.canonical.means[TISSUE:] = origin + places[:, None] * direction
+    shut, open_ = (kinematic.at(grasper_state(POSE, jaw)).means[TISSUE:] for jaw in (0.0, 1.5))
+    moved = (open_ - shut).norm(dim=1)
+    assert moved[places < depth].max() < 1e-2
+    assert moved[places > depth].min() > 1
+
+
+def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: Scene) -> None:
+    hinges = kinematic.deformation.hinges_of(0)
+    hinges.radius.fill_(2.0)
+    with torch.no_grad():
+        kinematic.canonical.log_scales[TISSUE:, 0] = 4.0
+        kinematic.canonical.means[TISSUE:] += 50 * hinges.shaft()[1]
+    assign(kinematic, 1)
+    assert kinematic.at(grasper_state(POSE)).scales[TISSUE:].max() < 2.0
+    assign(kinematic, 0)
+    assert kinematic.at(grasper_state(POSE)).scales[TISSUE:].max() > 50
+
+
+def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
+    """It is learned as body, since it moves like it."""
+    assign(kinematic, 0)
+    hinges = kinematic.deformation.hinges_of(0)
+    hinges.radius.fill_(2.0)
+    beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) > hinges.hinge_depth[0] + 1.0
+    assert 0 < int(beyond.sum()) < len(beyond)
+    names = [part for _, part in kinematic.label_names]
+    for share, turns in ((1.0, "first"), (0.0, "second"), (0.5, "both")):
+        with torch.no_grad():
+            hinges.share.fill_(share)
+            labels = kinematic.label_channels()[TISSUE:]
+            turning = int(hinges.gains[0].abs().argmax())
+            still = [names.index("jaw_left"), names.index("jaw_right")][
+                int(hinges.left_first(0).tolist().index(turning)) - 1
+            ]
+        assert torch.allclose(labels.sum(1), torch.ones(len(labels)))
+        jaws = labels[:, 2:].sum(1)
+        assert torch.equal(jaws > 0.5, beyond if turns != "both" else torch.zeros_like(beyond))
+        if turns != "both":
+            assert bool((labels[beyond, still] > 0.5).all())
+
+
 def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
     assign(kinematic, 1)
     pivot, axis = kinematic.deformation.hinges_of(0).hinge(0)

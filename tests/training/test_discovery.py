@@ -13,11 +13,12 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.scene.hinges import Hinges
 from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
 from neeco.training.initial import gaussian_session, initial_scene
 from neeco.training.instruments import discovery
 from neeco.training.instruments.carving import CarvedShape, carve
-from neeco.training.instruments.discovery import tissue_evidence
+from neeco.training.instruments.discovery import at_middle, tissue_evidence
 from neeco.training.instruments.evidence import Evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.options import training_config
@@ -181,3 +182,20 @@ def test_without_instruments_there_is_nothing_to_look_for(tmp_path: Path, monkey
     session = gaussian_session(capture, views, training_config("kinematic", {}), print)
     assert session.scene.canonical.counts == (150,)
     session.step()
+
+
+def test_seeds_stand_at_the_middle_reading_where_offsets_are_nothing() -> None:
+    hinges = Hinges(("jaw_angle",))
+    hinges.middle.fill_(0.4)
+    with torch.no_grad():
+        hinges.hinge_depth.fill_(3.0)
+        hinges.offsets.copy_(0.3 * hinges.gains)
+    seeds = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) * 5
+    logits = torch.zeros(50, 3)
+    logits[:20, 0] = logits[20:35, 1] = logits[35:, 2] = 40.0
+    before = hinges.bend(seeds, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0]
+    moved = at_middle(hinges, seeds, logits)
+    assert not bool(hinges.offsets.any())
+    assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=1e-4)
+    assert torch.allclose(moved[:20], seeds[:20], atol=1e-5)
+    assert (moved[20:] - seeds[20:]).norm(dim=1).max() > 0.1

@@ -109,7 +109,7 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
 
     (run / "config.yaml").write_text(config)
     scene = (run / "scene.safetensors").read_bytes()
-    (run / "scene.safetensors").write_bytes(scene.replace(b"neeco-scene/1", b"neeco-scene/9"))
+    (run / "scene.safetensors").write_bytes(scene.replace(b"neeco-scene/2", b"neeco-scene/9"))
     with pytest.raises(NeecoError, match=r"scene.safetensors: schema 'neeco-scene/9', this version reads"):
         load_run(run)
 

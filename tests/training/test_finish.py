@@ -18,9 +18,12 @@ from neeco.scene.methods import make_deformation
 from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
+from neeco.training.instruments import wrist
+from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.extend import extend_shaft, shaft_coverage
 from neeco.training.instruments.finish import conclude
-from neeco.training.instruments.wrist import place_wrists
+from neeco.training.instruments.solid import measure_radius
+from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
 from neeco.training.views import TrainingViews
 
@@ -49,6 +52,7 @@ def session(tmp_path: Path) -> GaussianSession:
     with torch.no_grad():
         hinges.hinge_depth.fill_(PIVOT_MM)
         hinges.wrist_start.fill_(-20.0)
+        hinges.radius.fill_(3.0)
     session = new_session(scene, TrainingViews.read(frames), TrainConfig(method="kinematic"), print)
     scene.requires_grad_(False)
     return session
@@ -115,6 +119,42 @@ def test_the_wrist_begins_where_the_colour_changes(session: GaussianSession) -> 
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
     conclude(session, session.scene.deformation)
     assert float(hinges_of(session).wrist_start) == pytest.approx(WRIST_MM, abs=2.5)
+
+
+def test_the_colours_border_is_found_to_a_fraction_of_the_radius(session: GaussianSession) -> None:
+    """Photographs are looked at, wherever the Gaussians are said to lie; rings of colour stand 1.5 mm apart."""
+    found = color_boundary(session, session.scene.deformation, 0)
+    assert found == pytest.approx(WRIST_MM + 0.75, abs=1.0)
+
+
+def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
+    session: GaussianSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wrist, "ROLLS", (math.pi / 4, -math.pi / 4))  # the rings have eight Gaussians each
+    hinges = hinges_of(session)
+    hinges.wrist_start.fill_(3.0)
+    replace_wrists(session, session.scene.deformation)
+    assert float(hinges.wrist_start) == pytest.approx(WRIST_MM + 0.75, abs=1.0)
+    with torch.no_grad():  # a shaft that is flat from -10 mm on, but coloured as before: the border is no wrist
+        flat = session.scene.canonical.means[session.scene.canonical.body(1)]
+        flat[flat[:, 2] > -10] *= torch.tensor([3.0, 0.05, 1.0])
+    images = tuple(
+        (rasterize(session.scene.at(frame.state), frame.camera).color * 255).round().to(torch.uint8)
+        for frame in session.views.frames
+    )
+    session.views = replace(session.views, images=images)
+    hinges.wrist_start.fill_(-12.0)
+    replace_wrists(session, session.scene.deformation)
+    assert float(hinges.wrist_start) < -8
+
+
+def test_the_shafts_radius_is_measured_where_there_is_enough_of_it(session: GaussianSession) -> None:
+    hinges = hinges_of(session)
+    measure_radius(session.scene.canonical, 0, hinges)
+    assert float(hinges.radius) == pytest.approx(2.0, abs=0.1)
+    hinges.radius.fill_(100.0)
+    measure_radius(session.scene.canonical, 0, hinges)
+    assert float(hinges.radius) == 100.0
 
 
 def test_on_an_instrument_of_one_colour_the_wrist_begins_where_it_is_no_longer_round(session: GaussianSession) -> None:

@@ -12,6 +12,7 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
+from neeco.scene.deformations import kinematic
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
 from neeco.synthesis.dataset import synthesize
@@ -41,6 +42,8 @@ CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.pla
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
     monkeypatch.setattr(Kinematic, "learns_from", 12)
+    monkeypatch.setattr(kinematic, "SHADOW_AT", 10)
+    monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
     monkeypatch.setattr(module, "ROW_INTERVAL", 1)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
-from neeco.labels.composited import composited_parts
+from neeco.labels.composited import composited_parts, threshold_of
 from neeco.raster.pinhole import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
 
@@ -103,7 +103,7 @@ def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Te
     rendering = scene.draw(frame.state, camera, labels=True)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
-        tissue = composited_parts(rendering).cpu() == 0
+        tissue = composited_parts(rendering, threshold_of(scene)).cpu() == 0
     centers = pixel_centers(camera.height, camera.width)
     points = unproject_world(centers, _filled(rendering), scene.camera(camera))  # [h, w, 3]
     unseen = torch.zeros_like(tissue)

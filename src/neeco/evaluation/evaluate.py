@@ -21,7 +21,7 @@ from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, m
 from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
-from neeco.labels.composited import LABEL_THRESHOLD
+from neeco.labels.composited import threshold_of
 from neeco.labels.drawing import draw
 from neeco.raster.threads import synchronise
 from neeco.raster.types import Camera
@@ -93,7 +93,7 @@ def _evaluate_splits(
     notes = _scene_notes(scene, context.networks)
     result: dict[str, Any] = {kind: {} for kind in kinds}
     labels: dict[str, Any] = {
-        "threshold": LABEL_THRESHOLD,
+        "threshold": threshold_of(scene),
         "names": [list(name) for name in scene.label_names],
         "jaw_assignment": {kind: {} for kind in kinds},
     }

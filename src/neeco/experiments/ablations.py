@@ -237,6 +237,36 @@ OURS = (
         ),
     ),
     Ablation(
+        "parts",
+        "ours",
+        "Decided parts",
+        "What does it bring that Gaussians decide between an instrument's parts, and that wrists are looked for again?",
+        (
+            Comparison(
+                "parts",
+                "both on",
+                (
+                    Entry("mixed parts", _kinematic("no-part-sharpness", "deformation.part_sharpness=0")),
+                    Entry("wrists once", _kinematic("no-wrist-again", "deformation.wrist_again=false")),
+                    Entry("both on", KINEMATIC),
+                ),
+            ),
+        ),
+    ),
+    Ablation(
+        "shadow",
+        "ours",
+        "Shadow of the instruments",
+        "What does drawing the instruments' shadow bring over learning it as a part of them?",
+        (
+            Comparison(
+                "shadow",
+                "on",
+                (Entry("off", _kinematic("no-shadow", "deformation.shadow=false")), Entry("on", KINEMATIC)),
+            ),
+        ),
+    ),
+    Ablation(
         "rim",
         "ours",
         "Rim of the tissue",

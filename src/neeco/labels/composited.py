@@ -16,21 +16,27 @@ from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Drawable, Scene
 
 # Measured: the instrument's moving shadow is learned with labels of .3 to .5, so half is too low; .65 to .7 is best.
 LABEL_THRESHOLD = 0.65
+SHADOWED_THRESHOLD = 0.55  # where that shadow is drawn as one: .65 then loses as much of the rim
 # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
 # beside the band: one from .15 leaves out mostly tissue, so that the model over-segments (IoU .93 instead of .96).
 CLEAR_SHARES = 0.5, 0.9
 
 
-def composited_parts(rendering: Rendering, threshold: float = LABEL_THRESHOLD) -> Tensor:
+def threshold_of(scene: Drawable) -> float:
+    """The share of a pixel from which the scene's labels count it as instrument, unless a user says otherwise."""
+    return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
+
+
+def composited_parts(rendering: Rendering, threshold: float) -> Tensor:
     """uint8 [H, W] part ids of an image drawn with `channels=scene.label_channels()` (see `composited_labels`)."""
     return composited_labels(rendering, threshold)[0]
 
 
-def composited_labels(rendering: Rendering, threshold: float = LABEL_THRESHOLD) -> tuple[Tensor, Tensor]:
+def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, Tensor]:
     """Part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image drawn with the scene's label channels.
 
     The share is the sum of a pixel's label columns, instrument where it exceeds `threshold`; its id is the largest
@@ -58,14 +64,14 @@ def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
 class CompositedLabels:
     """The labeller (see `drawing.Labeller`) that goes by what every Gaussian carries (`scene.label_channels()`)."""
 
-    def __init__(self, scene: Scene, threshold: float = LABEL_THRESHOLD) -> None:
+    def __init__(self, scene: Scene, threshold: float | None = None) -> None:
         self.names = tuple(scene.label_names)
         if not self.names:
             raise NeecoError(
                 f"scene: method {scene.method!r} learns no instrument labels; "
                 "use --labels threshold, or train with --method kinematic"
             )
-        self.threshold = threshold
+        self.threshold = threshold_of(scene) if threshold is None else threshold
         with torch.no_grad():
             self.channels = scene.label_channels()  # [N, L]
         columns = [instruments_of(self.names).index(instrument) for instrument, _ in self.names]

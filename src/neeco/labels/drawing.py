@@ -6,7 +6,7 @@ Two labellers say which pixel is which: composited.py and threshold.py. Whatever
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.labels.composited import LABEL_THRESHOLD, composited_parts, instruments_of
+from neeco.labels.composited import composited_parts, instruments_of, threshold_of
 from neeco.labels.contours import without_speckle
 from neeco.labels.edges import uncertain_edge, without_pieces
 from neeco.raster import rasterize
@@ -79,7 +79,7 @@ class Labeller(Protocol):
 def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
     """Draw `state` as `camera` sees it, with the scene's own labels where it has any."""
     rendering = scene.draw(state, camera, labels=True)
-    parts = None if rendering.channels is None else composited_parts(rendering).cpu()
+    parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
 
 
@@ -97,10 +97,10 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
     alone = {}
     for k, name in enumerate(instruments_of(labeller.names)):
         if name in state.instruments:
-            single = rasterize(select(gaussians, owners == k), learned_camera)
-            alone[name] = Alone((single.alpha > LABEL_THRESHOLD).cpu().numpy(), surface_depth(single))
+            single = rasterize(gaussians.select(owners == k), learned_camera)
+            alone[name] = Alone((single.alpha > threshold_of(scene)).cpu().numpy(), surface_depth(single))
     behind = owners < 0
-    tissue = rasterize(select(gaussians, behind), learned_camera, channels=scene.made_up[behind][:, None])
+    tissue = rasterize(gaussians.select(behind), learned_camera, channels=scene.made_up[behind][:, None])
     assert tissue.channels is not None
     made_up = (tissue.channels[..., 0].cpu() * (1 - share)).mean()
     return LayeredDrawing(
@@ -113,20 +113,6 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
         tissue_depth=surface_depth(tissue),
         alone=alone,
         made_up=round(float(made_up), 4),
-    )
-
-
-def select(gaussians: Gaussians, chosen: Tensor) -> Gaussians:
-    """The chosen Gaussians (bool [N])."""
-    light = gaussians.headlight
-    return Gaussians(
-        means=gaussians.means[chosen],
-        quats=gaussians.quats[chosen],
-        scales=gaussians.scales[chosen],
-        opacities=gaussians.opacities[chosen],
-        sh=gaussians.sh[chosen],
-        sh_frames=None if gaussians.sh_frames is None else gaussians.sh_frames[chosen],
-        headlight=None if light is None else replace(light, falloff=light.falloff[chosen]),
     )
 
 

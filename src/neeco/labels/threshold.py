@@ -15,7 +15,6 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
-from neeco.labels.drawing import select
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
 from neeco.scene.deformations._moving import otsu
@@ -78,7 +77,7 @@ class ThresholdLabels:
         """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
-        alone = rasterize(select(gaussians, moved), camera, channels=shares)
+        alone = rasterize(gaussians.select(moved), camera, channels=shares)
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
         lit = alone.color.norm(dim=2) > self.black

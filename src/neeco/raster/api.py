@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.raster.native import goes_native
+from neeco.raster.shadow import shadowed
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
@@ -48,6 +50,7 @@ def rasterize(
     if background is None:
         background = gaussians.background
     _check(gaussians, camera, channels, background)
+    gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if goes_native(gaussians.means) else "reference"
         backend = "cuda" if gaussians.means.is_cuda else on_cpu

@@ -8,6 +8,8 @@ from torch import Tensor
 from neeco.raster.pinhole import field_slopes
 from neeco.raster.types import Camera, Headlight
 
+SH_C0 = 0.28209479177387814  # the constant harmonic
+
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, taken as unit."""
@@ -23,7 +25,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def sh_basis(directions: Tensor, count: int) -> Tensor:
     """Real spherical harmonics [N, count] at unit directions [N, 3], constants and signs of 3D Gaussian Splatting."""
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, 0.28209479177387814)]
+    basis = [torch.full_like(x, SH_C0)]
     if count > 1:
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     xx, yy, zz = x * x, y * y, z * z

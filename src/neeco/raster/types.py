@@ -9,6 +9,20 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class Shadow:
+    """What the light misses behind some of the Gaussians, since it sits beside the lens (see `shadow.shadowed`)."""
+
+    casters: Tensor  # [N] bool: these cast it, all others receive it
+    offset: Tensor  # [3] mm, the light in the camera's frame (OpenCV axes)
+    strength: Tensor  # [] in [0, 1]: share of the light that is missing in the deepest shadow
+    width: Tensor  # [] slope: standard deviation of the shadow's edge, as seen from the light
+
+    def to(self, device: torch.device | str) -> Shadow:
+        """The same shadow on `device`."""
+        return Shadow(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True)
 class Headlight:
     """A light that sits at the camera, as an endoscope's does: it dims with distance and off the optical axis.
 
@@ -21,10 +35,12 @@ class Headlight:
 
     falloff: Tensor  # [N] exponent
     vignette: Tensor  # [2]
+    shadow: Shadow | None = None
 
     def to(self, device: torch.device | str) -> Headlight:
         """The same light on `device`."""
-        return Headlight(self.falloff.to(device), self.vignette.to(device))
+        shadow = None if self.shadow is None else self.shadow.to(device)
+        return Headlight(self.falloff.to(device), self.vignette.to(device), shadow)
 
 
 @dataclass(frozen=True)
@@ -48,6 +64,23 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def select(self, chosen: Tensor) -> Gaussians:
+        """The chosen ones (bool [N])."""
+        light = self.headlight
+        if light is not None:
+            shadow = None if light.shadow is None else replace(light.shadow, casters=light.shadow.casters[chosen])
+            light = replace(light, falloff=light.falloff[chosen], shadow=shadow)
+        return Gaussians(
+            means=self.means[chosen],
+            quats=self.quats[chosen],
+            scales=self.scales[chosen],
+            opacities=self.opacities[chosen],
+            sh=self.sh[chosen],
+            sh_frames=None if self.sh_frames is None else self.sh_frames[chosen],
+            headlight=light,
+            background=self.background,
+        )
 
     def to(self, device: torch.device | str) -> Gaussians:
         """The same Gaussians on `device`."""

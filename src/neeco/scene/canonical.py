@@ -11,7 +11,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814
+from neeco.raster.sh import SH_C0
+
 SH_COEFFICIENTS = 16  # degree 3
 
 

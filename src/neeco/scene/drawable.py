@@ -24,6 +24,10 @@ class Drawable(Protocol):
     has_gaussians: bool  # False: nothing to rasterise, pose or label; a drawing takes seconds
 
     @property
+    def casts_shadow(self) -> bool:
+        """Is the instruments' shadow drawn as one, so that none is learned as a faint part of them?"""
+
+    @property
     def label_names(self) -> Sequence[tuple[str, str]]:
         """(instrument, part) of each label column; empty where the scene learns no labels."""
 

@@ -12,6 +12,11 @@ from torch import Tensor, nn
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.rotations import axis_angle_quat, quat_multiply, rotate_about
 
+BEHIND_HINGE = 1.0  # radii of the shaft: how far behind its hinge a jaw may reach
+LONGEST = 0.6  # radii: standard deviation of what turns, or its far end would swing out behind the hinge
+BEHIND_SOFT = 0.25  # radii
+STILL = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
+STILL_BEYOND = 0.75  # radii of the shaft beyond the hinge, where nothing but jaws is
 PART_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that part weights are the softmax of
 
 
@@ -21,7 +26,8 @@ class Hinges(nn.Module):
     The shaft is the line `shaft_origin + s * shaft_direction`, kept near a start (`base`, a buffer,
     instrument_from_shaft with z along the shaft) by two learned tilts (rad) and two shifts (mm). Joint j turns two
     parts about the axis at `hinge_angle[j]` (rad, around the shaft) and `hinge_depth[j]` (mm, along it); part k turns
-    by `offsets[j, k] + gains[j, k] * reading`. The reading is the angle between the two parts, so the gains are
+    by `offsets[j, k] + gains[j, k] * (reading - middle[j])`, `middle` being the mean of the recorded readings, or a
+    change of the gains would turn everything. The reading is the angle between the two parts, so the gains are
     `scale * (share, share - 1)`: `share` is learned freely, `scale` stays near 1.
     Parts are soft: a Gaussian turns by its part weights times the parts' angles.
     """
@@ -29,6 +35,8 @@ class Hinges(nn.Module):
     base: Tensor
     wrist_start: Tensor
     extent: Tensor
+    middle: Tensor
+    radius: Tensor
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         super().__init__()
@@ -39,6 +47,8 @@ class Hinges(nn.Module):
             "wrist_start", torch.tensor(-math.inf)
         )  # mm along the shaft; rotational symmetry ends here
         self.register_buffer("extent", torch.zeros(2))  # mm along the shaft, first and last solid Gaussian
+        self.register_buffer("middle", torch.zeros(count))  # rad or mm, as the readings
+        self.register_buffer("radius", torch.tensor(math.inf))  # mm, of the shaft as carved
         self.shaft_tilt = nn.Parameter(torch.zeros(2))
         self.shaft_shift = nn.Parameter(torch.zeros(2))
         self.hinge_angle = nn.Parameter(torch.zeros(count))
@@ -96,12 +106,50 @@ class Hinges(nn.Module):
         turn = None
         for index, name in enumerate(self.joint_names):
             pivot, axis = self.hinge(index)
-            part_angles = self.offsets[index] + self.gains[index] * joints[name]
+            part_angles = self.turns(index, joints[name])
             angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ part_angles
             points = rotate_about(points, axis, pivot, angle)
             quat = axis_angle_quat(axis, angle)
             turn = quat if turn is None else quat_multiply(quat, turn)
         return points, turn
+
+    def turns(self, joint: int, reading: float) -> Tensor:
+        """[2] rad by which a joint's two parts are turned."""
+        return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
+
+    def beyond_hinge(self, points: Tensor) -> Tensor:
+        """[M] in [0, 1]: which points [M, 3] mm lie so that a joint may move them: what is far behind the first hinge
+        never turns about it."""
+        if not self.joint_names:
+            return points.new_ones(len(points))
+        behind = self.hinge_depth.detach().min() - self.along_shaft(points)  # [M] mm
+        reach = torch.sigmoid((BEHIND_HINGE - behind / self.radius) / BEHIND_SOFT)
+        return torch.where(self.radius.isfinite(), reach, torch.ones_like(reach))
+
+    def longest(self, weights: Tensor) -> Tensor:
+        """[M, 1] mm: how long the Gaussians may be (standard deviation), by their part weights [M, part_count]: what
+        does not turn as long as it likes."""
+        turning = 1 - weights[:, :1]
+        return LONGEST * self.radius / turning.clamp_min(1e-6)
+
+    def parts(self, points: Tensor, weights: Tensor) -> Tensor:
+        """[M, 2 + 2 J] shares of shaft, wrist, and every joint's left and right part in Gaussians at points [M, 3] mm
+        of part weights [M, part_count].
+
+        A jaw that stands still is learned as body, since it moves like it: beyond the hinge nothing but jaws is.
+        """
+        along, body = self.along_shaft(points), weights[:, 0]
+        jaws: list[Tensor] = []
+        for joint in range(len(self.joint_names)):
+            gains = self.gains[joint].detach().abs()
+            still = (gains < STILL) & (gains == gains.min())  # [2]
+            beyond = along > self.hinge_depth[joint] + STILL_BEYOND * self.radius  # [M]
+            kept = body[:, None] * (beyond[:, None] & still)
+            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + kept
+            body = body - kept.sum(1)
+            jaws += pair.index_select(1, self.left_first(joint)).unbind(1)
+        wrist = (along >= self.wrist_start).to(weights.dtype)
+        return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)
 
     def left_first(self, joint: int) -> Tensor:
         """A joint's two parts (0 and 1) as indices [2], the left one first.

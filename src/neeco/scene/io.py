@@ -22,7 +22,9 @@ from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.settings import plain
 
-SCHEMA = "neeco-scene/1"
+SCHEMA = "neeco-scene/2"
+BEFORE_SHADOWS = "neeco-scene/1"  # read as scenes that cast none, with readings counted from zero
+SINCE = {"shadow_offset", "shadow_strength", "shadow_width", "middle", "radius"}  # modules' tensors that it lacks
 
 
 def save_scene(scene: Learned, path: Path) -> None:
@@ -54,7 +56,7 @@ def load_scene(path: Path) -> Learned:
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise NeecoError(f"{path}: not a readable neeco scene ({error}); train again") from None
-    if header.get("schema") != SCHEMA:
+    if header.get("schema") not in (SCHEMA, BEFORE_SHADOWS):
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
     try:
         return unpack_scene(tensors, header)
@@ -110,6 +112,8 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     scene = method_class(method).load(Stored(settings, instruments, recorded, tensors, header, Scene.load))
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
+    if header.get("schema") == BEFORE_SHADOWS:
+        module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in SINCE} | module
     scene.load_state_dict(module)
     scene.requires_grad_(False)
     return scene

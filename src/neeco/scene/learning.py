@@ -102,6 +102,12 @@ class InstrumentSearch(Protocol):
     def place_wrists(self, hinged: Hinged) -> None:
         """Find where each shaft ends and the wrist begins."""
 
+    def replace_wrists(self, hinged: Hinged) -> None:
+        """Look again, and move a wrist where spinning the shaft up to there costs no more than it did."""
+
+    def find_shadow(self) -> None:
+        """Find where the light is that casts the instruments' shadow; leave it off where none explains anything."""
+
     def conclude(self, hinged: Hinged) -> None:
         """Set each instrument's extent, prolong its shaft, and judge whether its joints were found."""
 

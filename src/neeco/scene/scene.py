@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
-from neeco.raster.types import Gaussians, Headlight, Rendering
+from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.drawable import Drawable
@@ -22,6 +22,7 @@ from neeco.scene.recorded import Recorded
 from neeco.scene.rim import MADE_UP
 from neeco.scene.rotations import rigid_from_vector
 
+SHADOW_WIDTH = 0.01  # slope, at the start
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
     "quats": (4,),
@@ -37,7 +38,8 @@ class Scene(nn.Module):
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
-    instruments) and `vignette` are the headlight (see `Headlight`). `background` in [0, 1] is the grey behind
+    instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offset`, `shadow_strength` (0: none) and
+    `shadow_width` the instruments' shadow on the tissue (see `Shadow`). `background` in [0, 1] is the grey behind
     everything.
     """
 
@@ -68,6 +70,9 @@ class Scene(nn.Module):
         self.registration = nn.Parameter(torch.zeros(7))
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
+        self.shadow_offset = nn.Parameter(torch.zeros(3))
+        self.shadow_strength = nn.Parameter(torch.zeros(()))
+        self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
 
     @property
     def settings(self) -> Any:
@@ -121,7 +126,7 @@ class Scene(nn.Module):
             opacities=torch.sigmoid(canonical.opacity_logits),
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
-            headlight=Headlight(falloff, self.vignette),
+            headlight=Headlight(falloff, self.vignette, self._shadow()),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
@@ -129,6 +134,18 @@ class Scene(nn.Module):
     def made_up(self) -> Tensor:
         """[N] 1 for tissue that no frame saw, made up at the end of training (see `neeco.scene.rim`); else 0."""
         return self.canonical.extras.get(MADE_UP, self.canonical.means.new_zeros(len(self.canonical)))
+
+    @property
+    def casts_shadow(self) -> bool:
+        """Was a light beside the lens found, and is there anything that casts its shadow?"""
+        found = not self.shadow_strength.is_meta and float(self.shadow_strength.detach()) > 0
+        return found and len(self.canonical) > self.canonical.counts[0]
+
+    def _shadow(self) -> Shadow | None:
+        if not self.casts_shadow:
+            return None
+        strength = self.shadow_strength.clamp(0.0, 1.0)
+        return Shadow(self.canonical.bodies > 0, self.shadow_offset, strength, self.shadow_width)
 
     def registered(self, state: State) -> State:
         """`state` with the learned tracker-to-world correction applied to its poses."""

@@ -18,7 +18,7 @@ import neeco
 from neeco.errors import NeecoError
 from neeco.files import new_folder, read_json, write_json
 from neeco.labels.annotation import KEYPOINTS, annotate
-from neeco.labels.composited import CLEAR_SHARES, LABEL_THRESHOLD, CompositedLabels, instruments_of
+from neeco.labels.composited import CLEAR_SHARES, CompositedLabels, instruments_of
 from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers
 from neeco.labels.edges import REACH
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels
@@ -152,7 +152,7 @@ def _forget(output: Path) -> None:
 def make_labeller(scene: Scene, settings: Settings) -> Labeller:
     """The way of labelling that the settings ask for."""
     if settings.labels == "composited":
-        return CompositedLabels(scene, settings.label_threshold or LABEL_THRESHOLD)
+        return CompositedLabels(scene, settings.label_threshold)
     given = settings.delta_thresholds
     return ThresholdLabels(scene, None if given is None else DeltaThresholds(*given))
 

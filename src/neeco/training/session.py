@@ -33,6 +33,7 @@ GAUSSIAN_RATES = {
     "sh_rest": 1.25e-4,
 }
 LIGHT_RATE = 3e-3
+SHADOW_RATES = {"shadow_offset": 3e-2, "shadow_strength": 2e-3, "shadow_width": 2e-5}  # mm, share, slope
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
 
@@ -159,8 +160,16 @@ class GaussianSession:
             parameter.grad = None
         self.adam.step("falloff", scene.falloff, LIGHT_RATE)
         self.adam.step("vignette", scene.vignette, LIGHT_RATE)
+        self._learn_shadow(progress)
         self._learn_registration(progress)
         self.refinement.step(index, progress)
+
+    def _learn_shadow(self, progress: float) -> None:
+        """Nothing until a shadow was found: without one there is no gradient."""
+        for name, rate in SHADOW_RATES.items():
+            parameter = getattr(self.scene, name)
+            if parameter.grad is not None:
+                self.adam.step(name, parameter, rate * floored_decay(progress))
 
     def _learn_registration(self, progress: float) -> None:
         """Adam on unit-free coordinates, so that radians and millimetres each move at their own rate."""

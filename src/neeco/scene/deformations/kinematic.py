@@ -33,8 +33,9 @@ from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
-WRIST_FRACTION = 0.4  # of the run: the shaft has shape, and time is left to spin all of it
+WRIST_FRACTIONS = (0.4, 0.6, 0.8)  # of the run: the shaft has shape, and time is left to spin all of it
 SHARPENS_FROM = 1000  # iteration
+SHADOW_AT = 1000  # iteration: instruments have shape
 RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is left
 
 
@@ -42,13 +43,18 @@ RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is le
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
     `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it after iteration 1500;
-    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000; `rim`: whether tissue
-    that no frame saw is continued smoothly (see `neeco.scene.rim`)."""
+    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000; `part_sharpness`: weight
+    of how mixed Gaussians are of parts, from iteration 600 on; `wrist_again`: whether wrists are looked for again at 60
+    and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is looked for and drawn (see
+    `neeco.raster.shadow`); `rim`: whether tissue that no frame saw is continued smoothly (see `neeco.scene.rim`)."""
 
     shaft_roll: float = 0.5
     shaft_roll_start: int = 600
     opacity_penalty: float = 0.002
     label_sharpness: float = 0.02
+    part_sharpness: float = 0.01
+    wrist_again: bool = True
+    shadow: bool = True
     rim: bool = True
 
 
@@ -101,11 +107,12 @@ class Kinematic(Deformation):
         tissue = canonical.body(0)
         means, quats = [canonical.means[tissue]], [canonical.quats[tissue]]
         frames = [_no_turn(canonical.means).expand(canonical.counts[0], 4)]
+        scales = [canonical.log_scales[tissue].exp()]
         for index, instrument in enumerate(self.instruments):
             moved = self._pose_instrument(canonical, index, instrument, state, perturbation)
-            for collected, part in zip((means, quats, frames), moved, strict=True):
+            for collected, part in zip((means, quats, frames, scales), moved, strict=True):
                 collected.append(part)
-        return Posed(torch.cat(means), torch.cat(quats), canonical.log_scales.exp(), torch.cat(frames))
+        return Posed(torch.cat(means), torch.cat(quats), torch.cat(scales), torch.cat(frames))
 
     def _pose_instrument(
         self,
@@ -114,28 +121,36 @@ class Kinematic(Deformation):
         instrument: Instrument,
         state: State,
         perturbation: Perturbation,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """World means [M, 3], quats [M, 4] and SH frames [M, 4] of one instrument's Gaussians."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """World means [M, 3], quats [M, 4], SH frames [M, 4] and scales [M, 3] of one instrument's Gaussians."""
         given = state_of(instrument, state)
         hinges, rows = self.hinges_of(index), canonical.body(index + 1)
         points, quats = canonical.means[rows], nn.functional.normalize(canonical.quats[rows], dim=-1)
         turned = _no_turn(points).expand(points.shape[0], 4)  # [M, 4] instrument_from_sh
+        scales = canonical.log_scales[rows].exp()
         if isinstance(perturbation, Spin):
             points, quats = hinges.spin(points, quats, perturbation.shaft_roll)
             _, turned = hinges.spin(points.detach(), turned, perturbation.shaft_roll)
         if hinges.joint_names:
-            points, turn = hinges.bend(points, self.part_weights(canonical, index), given.joints)
+            weights = self.part_weights(canonical, index)
+            scales = torch.minimum(scales, hinges.longest(weights.detach()))
+            points, turn = hinges.bend(points, weights, given.joints)
             assert turn is not None
             quats, turned = quat_multiply(turn, quats), quat_multiply(turn, turned)
         pose = given.pose.to(points)
         world_quat = matrix_to_quat(pose[:3, :3])
         means = points @ pose[:3, :3].T + pose[:3, 3]
-        return means, quat_multiply(world_quat, quats), quat_multiply(world_quat, turned).detach()
+        return means, quat_multiply(world_quat, quats), quat_multiply(world_quat, turned).detach(), scales
 
     def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """Part weights [M, part_count] of one instrument's Gaussians."""
-        logits = canonical.extras[PART_LOGITS][canonical.body(index + 1)]
-        return torch.softmax(logits[:, : self.hinges_of(index).part_count], -1)
+        hinges, rows = self.hinges_of(index), canonical.body(index + 1)
+        logits = canonical.extras[PART_LOGITS][rows]
+        weights = torch.softmax(logits[:, : hinges.part_count], -1)
+        if not hinges.joint_names:
+            return weights
+        moving = weights[:, 1:] * hinges.beyond_hinge(canonical.means[rows].detach())[:, None].detach()
+        return torch.cat([1 - moving.sum(1, keepdim=True), moving], 1)
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
@@ -146,14 +161,9 @@ class Kinematic(Deformation):
                 labels[rows, column] = 1.0
                 column += 1
                 continue
-            weights = self.part_weights(canonical, index)
-            wrist = (hinges.along_shaft(canonical.means[rows]) >= hinges.wrist_start).to(weights.dtype)
-            parts = [weights[:, 0] * (1 - wrist), weights[:, 0] * wrist]
-            for joint in range(len(hinges.joint_names)):
-                pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
-                parts += pair.index_select(1, hinges.left_first(joint)).unbind(1)
-            labels[rows, column : column + len(parts)] = torch.stack(parts, -1)
-            column += len(parts)
+            parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            labels[rows, column : column + parts.shape[1]] = parts
+            column += parts.shape[1]
         return labels
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
@@ -176,7 +186,7 @@ class Kinematic(Deformation):
                 points["shaft_near"] = origin + torch.maximum(hinges.wrist_start, hinges.extent[0]) * direction
                 pivot, axis = hinges.hinge(0)
                 points["hinge"] = pivot
-                angles = hinges.offsets[0] + hinges.gains[0] * given.joints[hinges.joint_names[0]]
+                angles = hinges.turns(0, given.joints[hinges.joint_names[0]])
                 tip = (origin + end * direction)[None]  # [1, 3]
                 ordered = angles.index_select(0, hinges.left_first(0))
                 for name, angle in zip(("tip_left", "tip_right"), ordered.split(1), strict=True):
@@ -215,25 +225,38 @@ class Kinematic(Deformation):
         return lost
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
-        """The whole instruments' label [N, 1]."""
+        """The whole instruments' label [N, 1]: parts share it out, so all of them together have 1."""
         if not (self.settings.label_sharpness > 0 and iteration > SHARPENS_FROM and self.label_names):
             return None
-        return self.label_channels(canonical).sum(1, keepdim=True)
+        return (canonical.bodies > 0).to(canonical.means.dtype)[:, None]
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
-        """Sparse instruments and sharp labels."""
+        """Sparse instruments with sharp labels and decided parts."""
         settings, terms = self.settings, []
         if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
             weight = settings.opacity_penalty * (1.0 if iteration < RELAXES_FROM else 0.1)
             terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
-        if rendering.channels is not None:
+        if settings.part_sharpness > 0 and iteration > self.learns_from:
+            terms += [settings.part_sharpness * self._undecided(canonical, k) for k in range(len(self.instruments))]
+        if rendering.channels is not None and settings.label_sharpness > 0:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
+    def _undecided(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+        """How mixed one instrument's Gaussians are of its parts, a scalar in [0, 1)."""
+        weights = self.part_weights(canonical, index)
+        opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
+        return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
+
     def between_steps(self, training: Training, before: float) -> None:
-        if before < WRIST_FRACTION <= training.progress:
+        if self.settings.shadow and training.iteration == SHADOW_AT:
+            training.instruments.find_shadow()
+        passed = [mark for mark in WRIST_FRACTIONS if before < mark <= training.progress]
+        if WRIST_FRACTIONS[0] in passed:
             training.instruments.place_wrists(self)
+        elif passed and self.settings.wrist_again:
+            training.instruments.replace_wrists(self)
 
     def finish(self, training: Training) -> None:
         training.instruments.conclude(self)

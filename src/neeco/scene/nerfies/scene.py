@@ -77,6 +77,7 @@ class NerfScene(nn.Module):
     label_names: tuple[tuple[str, str], ...] = ()
     num_gaussians = None
     has_gaussians = False
+    casts_shadow = False
 
     def __init__(
         self, method: str, settings: NerfiesSettings, instruments: tuple[Instrument, ...], recorded: Recorded

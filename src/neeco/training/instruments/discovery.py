@@ -55,8 +55,9 @@ def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
         hinges = hinged.hinges_of(index)
         start_hinges(hinges, evidence, instrument.name, shape, report)
         seeds = shape.seeds.to(scene.center.device)
-        body = seed_gaussians(seeds, seeds.new_full((SEEDS, 3), 0.4), seeds.new_full((SEEDS,), 0.4 * shape.radius))
         logits = seed_logits(hinges, seeds, hinged.logit_count, generator)
+        seeds = at_middle(hinges, seeds, logits)
+        body = seed_gaussians(seeds, seeds.new_full((SEEDS, 3), 0.4), seeds.new_full((SEEDS,), 0.4 * shape.radius))
         bodies.append(body.with_extras(**{PART_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
@@ -141,10 +142,23 @@ def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedSha
             hinges.hinge_angle[index] = dominant_angle(guesses)
             hinges.hinge_depth[index] = balanced_depth(guesses)
             hinges.share[index] = 1.0 if guesses[0].gains[1] == 0 else 0.5
-            lowest = min(frame.state.instruments[name].joints[joint] for frame in evidence.frames)
-            hinges.offsets[index] = -lowest * hinges.gains[index]
+            readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
+            hinges.middle[index] = sum(readings) / len(readings)
+            hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.gains[index]
+    hinges.radius.fill_(shape.radius)
     if hinges.joint_names:
         hinges.wrist_start.fill_(float(hinges.hinge_depth[0].detach()) - 5 * shape.radius)
+
+
+@torch.no_grad()
+def at_middle(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
+    """Seeds [M, 3] mm, carved with the joints at their offsets, as they are where every part's offset is zero, which
+    they are set to: there a change of hinge or gains moves nothing."""
+    weights = torch.softmax(logits[:, : hinges.part_count], -1)
+    middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.joint_names)}
+    turned, _ = hinges.bend(seeds, weights, middle)
+    hinges.offsets.zero_()
+    return turned
 
 
 def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:

@@ -12,8 +12,9 @@ from neeco.capture.model import InstrumentState, State
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinged
+from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.extend import extend_shaft
-from neeco.training.instruments.wrist import ENOUGH, color_boundary, solid, solid_extent
+from neeco.training.instruments.solid import ENOUGH, solid, solid_extent
 from neeco.training.session import GaussianSession
 
 FOUND = 0.35  # share of the moving parts' error that the readings must explain: .5-.9 where found, .27 half-way off
@@ -28,7 +29,7 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = hinged.hinges_of(index)
-        boundary = color_boundary(session.scene.canonical, hinged, index) if hinges.joint_names else None
+        boundary = color_boundary(session, hinged, index) if hinges.joint_names else None
         if boundary is not None:
             hinges.wrist_start.fill_(boundary)
         for joint, name in enumerate(hinges.joint_names):
@@ -88,7 +89,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
         "axis": [round(float(v), 5) for v in axis],
         "pivot_mm": [round(float(v), 3) for v in pivot],
         "gains": [round(float(v), 4) for v in hinges.gains[joint]],
-        "offsets_rad": [round(float(v), 4) for v in hinges.offsets[joint]],
+        "offsets_rad": [round(float(v), 4) for v in hinges.turns(joint, 0.0)],
         "verdict": (
             f"found: the reading explains {explained:.0%} of the moving parts' error"
             if found

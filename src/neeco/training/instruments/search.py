@@ -9,7 +9,8 @@ from neeco.scene.swept import SweptVolume
 from neeco.training.instruments.discovery import find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.gate import close_gate
-from neeco.training.instruments.wrist import place_wrists
+from neeco.training.instruments.light import find_shadow
+from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession
 
 
@@ -30,6 +31,14 @@ class SessionSearch:
     def place_wrists(self, hinged: Hinged) -> None:
         """See `neeco.training.instruments.wrist`."""
         place_wrists(self.session, hinged)
+
+    def replace_wrists(self, hinged: Hinged) -> None:
+        """See `neeco.training.instruments.wrist`."""
+        replace_wrists(self.session, hinged)
+
+    def find_shadow(self) -> None:
+        """See `neeco.training.instruments.light`."""
+        find_shadow(self.session)
 
     def conclude(self, hinged: Hinged) -> None:
         """See `neeco.training.instruments.finish`."""

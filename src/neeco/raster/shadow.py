@@ -1,0 +1,135 @@
+"""The shadow that what moves casts on what stands still, under a light that sits beside the lens.
+
+The casters are drawn once more, from the light: how opaque they are there, blurred by the light's width, is how much of
+its light a Gaussian behind them misses. Only brightness changes; nothing is added to the image, and labels know nothing
+of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from neeco.raster.sh import SH_C0
+from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
+
+RESOLUTION = 0.5  # of the image's
+MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
+TAPS = 6  # map pixels to each side of the blur's middle, which is cut off there
+NEAR = 1e-6
+HALF = 0.5 / SH_C0
+
+Draw = Callable[[Gaussians, Camera], Rendering]
+
+
+def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
+    """The same Gaussians, the colours of those that cast nothing dimmed by the headlight's shadow; `draw` rasterizes.
+
+    Gradients reach the shadow's offset, strength and width, and the colours; the casters' shapes are taken as they are.
+    """
+    light = gaussians.headlight
+    if light is None or light.shadow is None or not bool(light.shadow.casters.any()):
+        return gaussians
+    lit = torch.ones_like(gaussians.opacities)
+    receivers = ~light.shadow.casters
+    lit = lit.masked_scatter(receivers, 1 - _missing(gaussians, light.shadow, receivers, camera, draw))
+    sh = _Dimmed.apply(gaussians.sh, lit)
+    return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
+
+
+class _Dimmed(torch.autograd.Function):
+    """Harmonics [N, K, 3] whose colour, half a unit more than they say, is multiplied by `lit` [N].
+
+    Written out since torch's own steps would fill and add up several tensors of this size.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, lit: Tensor) -> Tensor:
+        ctx.save_for_backward(sh, lit)
+        dimmed = sh * lit[:, None, None]
+        dimmed[:, 0] += (HALF * (lit - 1))[:, None]
+        return dimmed
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        sh, lit = ctx.saved_tensors
+        (grad,) = grads
+        to_lit = (grad.flatten(1) * sh.flatten(1)).sum(1) + HALF * grad[:, 0].sum(1)
+        return grad * lit[:, None, None], to_lit
+
+
+def _missing(gaussians: Gaussians, shadow: Shadow, receivers: Tensor, camera: Camera, draw: Draw) -> Tensor:
+    """Share [R] of its light that each receiver misses."""
+    at_light = _light_camera(camera, shadow.offset.detach())
+    with torch.no_grad():
+        casters = gaussians.select(shadow.casters)
+        seen = draw(replace(casters, sh=casters.sh[:, :1], headlight=None, background=None), at_light)
+    sigma = shadow.width * at_light.fx
+    down, across = (_blur(size, sigma) for size in seen.alpha.shape)
+    alpha = down @ seen.alpha @ across  # [h, w]
+    with torch.no_grad():
+        summed = torch.stack([alpha, down @ (seen.alpha * seen.depth) @ across], -1)  # [h, w, 2]
+    pose = camera.world_from_camera.to(gaussians.means)
+    points = (gaussians.means[receivers].detach() - pose[:3, 3]) @ pose[:3, :3] - shadow.offset  # [R, 3] light frame
+    pixels = _pixels(points, at_light)
+    weight, weighted = _look_up(summed, pixels.detach(), at_light).unbind(1)
+    before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [R] mm, depth of what casts there
+    pixels = pixels + _parallax(shadow.offset, pixels.detach(), before, at_light)
+    share = _look_up(alpha[..., None], pixels, at_light)[:, 0]
+    return shadow.strength * torch.where(points[:, 2].detach() > before, share, torch.zeros_like(share))
+
+
+def _light_camera(camera: Camera, offset: Tensor) -> Camera:
+    """A small camera at the light, turned as `camera` is, that sees a little more."""
+    pose = camera.world_from_camera.detach().clone()
+    pose[:3, 3] += pose[:3, :3] @ offset.to(pose)
+    width, height = (max(1, round(RESOLUTION * (1 + 2 * MARGIN) * size)) for size in (camera.width, camera.height))
+    wide, high = MARGIN * camera.width, MARGIN * camera.height
+    return Camera(
+        pose,
+        camera.fx * RESOLUTION,
+        camera.fy * RESOLUTION,
+        (camera.cx + wide) * RESOLUTION,
+        (camera.cy + high) * RESOLUTION,
+        width,
+        height,
+        camera.near,
+    )
+
+
+def _pixels(points: Tensor, camera: Camera) -> Tensor:
+    """[R, 2] px of points [R, 3] mm in the camera's frame; those behind it fall far outside."""
+    depth = points[:, 2].clamp_min(1e-3)
+    u = points[:, 0] / depth * camera.fx + camera.cx
+    v = points[:, 1] / depth * camera.fy + camera.cy
+    return torch.stack([u, v], 1)
+
+
+def _parallax(offset: Tensor, pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
+    """[R, 2] px, all zero, by whose gradient the map moves as its casters at `depth` [R] mm do when the light moves.
+
+    The map was drawn without a gradient; to first order it moves as a whole.
+    """
+    moved = offset - offset.detach()  # [3]
+    focal = pixels.new_tensor([camera.fx, camera.fy])
+    middle = pixels.new_tensor([camera.cx, camera.cy])
+    return (focal * moved[:2] - (pixels - middle) * moved[2]) / depth[:, None]
+
+
+def _blur(size: int, sigma: Tensor) -> Tensor:
+    """[size, size] that blurs a line of map pixels by a Gaussian of `sigma` of them; nothing comes from beyond it."""
+    steps = (torch.arange(size).to(sigma)[:, None] - torch.arange(size).to(sigma)).abs()
+    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(0.3)).square()) * (steps <= TAPS)
+    return weights / weights[size // 2].sum()
+
+
+def _look_up(image: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
+    """Values [R, C] of an image [h, w, C] at pixels [R, 2], linear between their centres, 0 outside."""
+    size = pixels.new_tensor([camera.width, camera.height])
+    place = (2 * pixels / size - 1)[None, None]  # [1, 1, R, 2]
+    return grid_sample(image.permute(2, 0, 1)[None], place, align_corners=False)[0, :, 0].T

@@ -1,0 +1,129 @@
+"""The shadow falls where geometry says, softly, and its gradients are those of what is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.raster import Camera, Gaussians, Headlight, rasterize
+from neeco.raster.types import Shadow
+
+CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
+WALL, ROD = 100.0, 60.0  # mm, depths
+
+
+def scene(
+    offset: Tensor | None = None, strength: Tensor | float = 0.5, width: Tensor | float = 0.005, sh_count: int = 1
+) -> Gaussians:
+    """A white wall and, before its middle, a black vertical rod that casts."""
+    x, y = torch.meshgrid(torch.arange(-60.0, 61.0, 1.5), torch.arange(-50.0, 51.0, 1.5), indexing="ij")
+    wall = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), WALL)], 1)
+    wall = wall[torch.randperm(len(wall), generator=torch.Generator().manual_seed(0))]  # equal depths: order by index
+    steps = torch.arange(-40.0, 41.0, 0.5)
+    rod = torch.stack([torch.zeros_like(steps), steps, torch.full_like(steps, ROD)], 1)
+    count = len(wall) + len(rod)
+    casters = torch.arange(count) >= len(wall)
+    sh = torch.zeros(count, sh_count, 3)
+    sh[:, 0] = torch.where(casters, -0.5, 0.5)[:, None] / 0.28209479177387814
+    shadow = None
+    if offset is not None:
+        shadow = Shadow(casters, offset, torch.as_tensor(strength), torch.as_tensor(width))
+    return Gaussians(
+        torch.cat([wall, rod]),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        torch.where(casters, 1.0, 1.2)[:, None].repeat(1, 3),
+        torch.full((count,), 0.99),
+        sh,
+        headlight=Headlight(torch.zeros(count), torch.zeros(2), shadow),
+    )
+
+
+def image(gaussians: Gaussians, backend: str = "auto") -> Tensor:
+    return rasterize(gaussians, CAMERA, backend=backend).color
+
+
+def test_the_shadow_falls_on_the_side_away_from_the_light() -> None:
+    offset = torch.tensor([30.0, 0.0, 0.0])
+    darkened = (image(scene()) - image(scene(offset)))[32, :, 0]  # [W]
+    # the rod's shadow on the wall: from the light at x = 30 through (0, 60) to x = 30 - 30 * 100 / 60 = -20 mm
+    expected = CAMERA.cx + CAMERA.fx * -20.0 / WALL
+    middle = float((darkened * (torch.arange(80) + 0.5)).sum() / darkened.sum())
+    assert middle == pytest.approx(expected, abs=0.5)
+    assert float(darkened.max()) == pytest.approx(0.5, abs=0.05)
+    assert float(darkened[45:].abs().max()) < 1e-3
+
+
+def test_a_light_at_the_lens_hides_its_shadow_behind_what_casts_it() -> None:
+    beside = image(scene()) - image(scene(torch.tensor([30.0, 0.0, 0.0])))
+    behind = image(scene()) - image(scene(torch.zeros(3)))
+    assert 0 <= float(behind.sum()) < 0.35 * float(beside.sum())  # the map has half the image's resolution
+
+
+def test_what_casts_keeps_its_colour_and_nothing_else_changes() -> None:
+    plain, shaded = scene(), scene(torch.tensor([30.0, 0.0, 0.0]))
+    a, b = rasterize(plain, CAMERA), rasterize(shaded, CAMERA)
+    assert torch.equal(a.alpha, b.alpha)
+    assert torch.equal(a.depth, b.depth)
+    assert torch.allclose(a.color[:, 39:41], b.color[:, 39:41], atol=1e-3)
+
+
+def test_a_shadow_falls_on_nothing_before_what_casts_it() -> None:
+    gaussians = scene(torch.tensor([30.0, 0.0, 0.0]))
+    nearer = gaussians.means.clone()
+    nearer[: int((~gaussians.headlight.shadow.casters).sum()), 2] = 40.0
+    shaded = replace(gaussians, means=nearer)
+    plain = replace(shaded, headlight=replace(shaded.headlight, shadow=None))
+    assert torch.allclose(image(shaded), image(plain), atol=1e-4)
+
+
+def test_a_wider_light_makes_a_softer_shadow() -> None:
+    offset = torch.tensor([30.0, 0.0, 0.0])
+    sharp, soft = (image(scene()) - image(scene(offset, width=width)) for width in (0.002, 0.04))
+    assert float(soft.max()) < 0.8 * float(sharp.max())
+    assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=0.05)
+
+
+def test_without_strength_or_casters_the_bits_are_the_same() -> None:
+    offset = torch.tensor([30.0, 0.0, 0.0])
+    plain = image(scene())
+    assert torch.equal(image(scene(offset, strength=0.0)), plain)
+    none = scene(offset)
+    shadow = replace(none.headlight.shadow, casters=torch.zeros(len(none), dtype=torch.bool))
+    assert torch.equal(image(replace(none, headlight=replace(none.headlight, shadow=shadow))), plain)
+
+
+def test_kernels_and_reference_cast_the_same_shadow() -> None:
+    gaussians = scene(torch.tensor([12.0, 5.0, 1.0]), sh_count=4)
+    with torch.no_grad():
+        assert float((image(gaussians, "cpu") - image(gaussians, "reference")).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("name", ["x", "y", "z", "strength", "width"])
+def test_gradients_are_those_of_the_picture(name: str) -> None:
+    start = {"x": 12.0, "y": 4.0, "z": 2.0, "strength": 0.6, "width": 0.02}
+    weights = torch.linspace(-1, 1, 80)[None, :, None] * torch.linspace(-1, 1.5, 64)[:, None, None]
+
+    def value(changed: Tensor) -> Tensor:
+        numbers = {key: changed if key == name else torch.tensor(number) for key, number in start.items()}
+        offset = torch.stack([numbers[axis] for axis in "xyz"])
+        return (image(scene(offset, numbers["strength"], numbers["width"])) * weights).sum()
+
+    # wide steps: the map is read between its pixels
+    step, tolerance = {"strength": (0.05, 0.02), "width": (0.002, 0.05), "z": (5.0, 0.3)}.get(name, (1.5, 0.1))
+    assert gradient(value, start[name]) == pytest.approx(slope(value, start[name], step), rel=tolerance, abs=0.05)
+
+
+def gradient(value: Callable[[Tensor], Tensor], at: float) -> float:
+    number = torch.tensor(at, requires_grad=True)
+    value(number).backward()
+    assert number.grad is not None
+    return float(number.grad)
+
+
+def slope(value: Callable[[Tensor], Tensor], at: float, step: float) -> float:
+    with torch.no_grad():
+        return float((value(torch.tensor(at + step)) - value(torch.tensor(at - step))) / (2 * step))
