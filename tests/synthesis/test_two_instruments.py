@@ -87,6 +87,31 @@ def test_where_one_instrument_meets_another_all_is_instrument_and_no_edge(bars, 
         assert (drawing.ignored & (drawing.parts == part)).any()
 
 
+def test_both_cast_a_shadow_on_the_tissue_and_none_on_each_other_or_in_the_labels(bars, camera):
+    state = at(60, 70)
+    bright = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
+    with torch.no_grad():
+        bars.shadow_offset.copy_(torch.tensor([15.0, 15.0, 0.0]))
+        bars.shadow_strength.fill_(0.8)
+    try:
+        shaded = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
+    finally:
+        with torch.no_grad():
+            bars.shadow_strength.zero_()
+    assert torch.equal(shaded.parts, bright.parts)
+    assert torch.equal(shaded.share, bright.share)
+    darker = (bright.image - shaded.image).mean(-1)
+    assert darker[bright.share > 0.99].abs().max() < 0.02
+    tissue = bright.share < 0.01
+    assert darker[tissue].max() > 0.2
+    dark = (darker > 0.1) & tissue  # a cross of two bars, up and to the left of theirs: the light is on the other side
+    across, down = torch.nonzero(dark.any(0))[:, 0], torch.nonzero(dark.any(1))[:, 0]
+    assert int(across.max() - across.min()) > 10
+    assert int(down.max() - down.min()) > 10
+    assert float(across.float().mean()) < camera.cx
+    assert float(down.float().mean()) < camera.cy
+
+
 def test_threshold_labels_tell_instruments_apart_by_nearness(bars, camera):
     state = at(50, 80)
     labeller = ThresholdLabels(bars)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -73,6 +75,31 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
     evaluation = evaluate_run(run, run.capture(), ("test",), align=True)
     assert evaluation["given"]["test"]["frames"] == 4
     synthesize(run, tmp_path / "dataset", Settings(count=4, tissue_check=False, min_share=1e-4))
+
+
+def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capture: Path, tmp_path: Path) -> None:
+    """The second is the first's shaft under another name: rigid, without a hinge."""
+    both = shutil.copytree(capture, tmp_path / "both")
+    transforms = json.loads((both / "transforms.json").read_text())
+    transforms["instruments"].append({"name": "rod", "joints": {}})
+    for frame in transforms["frames"]:
+        frame["instruments"].append({"name": "rod", "pose": frame["instruments"][0]["pose"], "joints": {}})
+    (both / "transforms.json").write_text(json.dumps(transforms))
+
+    first, second = (train(both, tmp_path / name, CONFIG) for name in ("first", "second"))
+    assert (first / "scene.safetensors").read_bytes() == (second / "scene.safetensors").read_bytes()
+    scene = load_scene(first / "scene.safetensors")
+    assert [name for name, _ in scene.label_names].count("rod") == 1
+    assert "shadow" in scene.diagnostics
+    with torch.no_grad():
+        scene.shadow_strength.fill_(0.5)
+        gaussians = scene.at(scene.recorded.states[0])
+        labels = scene.label_channels()
+    assert gaussians.headlight is not None
+    assert gaussians.headlight.shadow is not None
+    casters = gaussians.headlight.shadow.casters
+    assert torch.equal(casters, scene.canonical.bodies > 0)
+    assert torch.allclose(labels.sum(1), casters.float())
 
 
 def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) -> None:
