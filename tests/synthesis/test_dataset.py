@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
 from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.synthesis import dataset
+from neeco.synthesis import indexes
 from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
 from neeco.synthesis.render import render, split_views, state_views
 from neeco.synthesis.samplers import make_sampler
@@ -227,7 +227,7 @@ def test_a_data_set_from_before_soft_and_ignore_gets_them_for_every_image(made, 
 def test_a_data_set_with_another_band_is_not_continued(made, run, tmp_path, monkeypatch):
     output = tmp_path / "dataset"
     shutil.copytree(made, output)
-    monkeypatch.setattr(dataset, "CLEAR_SHARES", (0.3, 0.8))
+    monkeypatch.setattr(indexes, "CLEAR_SHARES", (0.3, 0.8))
     with pytest.raises(NeecoError, match=r"ignore: begun with .*0\.5.* now .*0\.3.*; use a new folder"):
         synthesize(run, output, SETTINGS, resume=True)
     assert contents(output) == contents(made)
