@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
 from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.synthesis import indexes
+from neeco.synthesis import dataset, indexes
 from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
 from neeco.synthesis.render import render, split_views, state_views
 from neeco.synthesis.samplers import make_sampler

@@ -28,6 +28,7 @@ VERBS = {
     "compare": "Train and score several methods under the same budget; tables and a report.",
     "score-masks": "Score a folder of masks, whoever made them, against the truth.",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
+    "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }

@@ -91,23 +91,46 @@ class _Problem:
         return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
 
 
+@dataclass(frozen=True)
+class Fit:
+    """A frame's fitted poses, drawable like the given ones, and the increments that led to them."""
+
+    state: State
+    camera: Camera
+    increments: Tensor  # [6 * (instruments + 1)] float64: rotation vector rad, translation mm, the camera's last
+
+
 @torch.no_grad()
 def align_frame(scene: Scene, frame: Frame, config: AlignConfig | None = None) -> tuple[State, Camera]:
     """Fit the poses of `frame` to its photograph and return the fitted state and camera, drawable like the given ones.
 
+    See `fit_frame`. Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the photograph cannot
+    be read.
+    """
+    fit = fit_frame(scene, frame, frame.load_image(), config=config)
+    return fit.state, fit.camera
+
+
+@torch.no_grad()
+def fit_frame(
+    scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
+) -> Fit:
+    """Fit the poses of `frame` to its photograph `image` [H, W, 3].
+
     One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), with
     weak Gaussian priors at zero; joints and intrinsics stay. Pixels outside the frame's loss mask do not count.
-    Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the photograph cannot be read.
+    `start`: a neighbouring frame's increments, begun from where they explain the image better than none.
     """
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)
-    problem = _Problem(scene, frame.state, names, config)
-    image, mask = frame.load_image(), frame.load_mask()
-    parameters = torch.zeros(6 * (len(names) + 1), dtype=torch.float64)
-    for factor, steps in zip(config.levels, config.steps, strict=True):
-        parameters = _fit_level(problem, _level(frame.camera, image, mask, factor, config), parameters, steps)
-    state = problem.moved_state(parameters)
-    return state, problem.moved_camera(frame.camera, parameters)
+    problem, mask = _Problem(scene, frame.state, names, config), frame.load_mask()
+    levels = [_level(frame.camera, image, mask, factor, config) for factor in config.levels]
+    increments = torch.zeros(6 * (len(names) + 1), dtype=torch.float64)
+    if start is not None and len(start) == len(increments):
+        increments = min((increments, start), key=lambda tried: _cost_at(problem, levels[0], tried))
+    for level, steps in zip(levels, config.steps, strict=True):
+        increments = _fit_level(problem, level, increments, steps)
+    return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
 
 
 def _level(camera: Camera, image: Tensor, mask: Tensor | None, factor: float, config: AlignConfig) -> _Level:
@@ -164,6 +187,10 @@ def _normal_equations(
     normal = (weighted @ jacobian.T).double() + torch.diag(precision)
     gradient = (weighted @ residual.flatten()).double() + precision * parameters
     return normal, gradient
+
+
+def _cost_at(problem: _Problem, level: _Level, parameters: Tensor) -> float:
+    return _cost(problem, level, problem.draw(problem.gaussians(parameters), level, parameters), parameters)
 
 
 def _cost(problem: _Problem, level: _Level, image: Tensor, parameters: Tensor) -> float:

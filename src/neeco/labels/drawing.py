@@ -52,6 +52,7 @@ class LayeredDrawing(Drawing):
     camera: Camera
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue drawn alone
+    tissue_image: Tensor  # [H, W, 3] in [0, 1], the same
     alone: dict[str, Alone]  # by instrument
     made_up: float  # share of the image that is tissue which no training frame saw
 
@@ -111,6 +112,7 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
         camera=camera,
         depth=surface_depth(rendering),
         tissue_depth=surface_depth(tissue),
+        tissue_image=tissue.color.clamp(0, 1).cpu(),
         alone=alone,
         made_up=round(float(made_up), 4),
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,15 @@ def split_of(index: int) -> str:
 
 
 def write_sample(
-    root: Path, index: int, drawing: LayeredDrawing, labels: list[InstrumentLabel], refused: Mapping[str, int]
+    root: Path,
+    index: int,
+    drawing: LayeredDrawing,
+    labels: list[InstrumentLabel],
+    refused: Mapping[str, int],
+    facts: Mapping[str, Any] = MappingProxyType({}),
 ) -> Record:
-    """Write one image with all that its pixels say, then its record; returns the record. Raises NeecoError."""
+    """Write one image with all that its pixels say, then its record, to which `facts` are added; returns the record.
+    Raises NeecoError."""
     name = f"{stem(index)}.png"
     write_image(root / "images" / name, drawing.image)
     write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
@@ -64,6 +71,7 @@ def write_sample(
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
         "made_up": drawing.made_up,
         "labels": [label.to_json() for label in labels],
+        **facts,
         "refused": dict(sorted(refused.items())),
         "files": {file: (root / file).stat().st_size for file in _files_of(index)},
     }
@@ -71,9 +79,11 @@ def write_sample(
     return record
 
 
-def write_skipped(root: Path, index: int, refused: Mapping[str, int]) -> Record:
-    """Record that the prescribed state of `index` could not be drawn acceptably."""
-    record: Record = {"index": index, "skipped": True, "refused": dict(sorted(refused.items())), "files": {}}
+def write_skipped(
+    root: Path, index: int, refused: Mapping[str, int], facts: Mapping[str, Any] = MappingProxyType({})
+) -> Record:
+    """Record that `index` has no image, and why; `facts` are added."""
+    record: Record = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
     write_json(record_path(root, index), record)
     return record
 

@@ -1,0 +1,60 @@
+"""`neeco annotate`: the recorded frames, labelled by the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from neeco.settings import Device
+from neeco.synthesis.settings import Format
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Label the frames of a recording by the scene, poses fitted to each; writes those that can be trusted as a data
+    set, and annotate.html: all of them, worst first."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder that `neeco train` wrote."""
+    output: Path
+    """Data set folder to write; must be empty or absent unless --resume."""
+    capture: Path | None = None
+    """Another recording of the same instruments over the same tissue; the run's own when not given."""
+    min_trust: float = 0.8
+    """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the photograph speaks for."""
+    formats: tuple[Format, ...] = ("coco", "yolo")
+    """Index files beside the plain images, masks, parts and depth."""
+    resume: bool = False
+    """Continue a data set begun with the same settings."""
+    device: Device = "auto"
+
+
+def run(arguments: Arguments) -> int:
+    """Annotate, write the page, and say where both lie."""
+    from neeco.capture.check import read_checked
+    from neeco.cli._bars import counting
+    from neeco.raster.devices import device_of
+    from neeco.report.annotated_page import write_annotated_page
+    from neeco.synthesis.annotated import annotate_capture
+    from neeco.training.run import open_run
+
+    with open_run(arguments.run, device_of(arguments.device)) as trained:
+        capture = trained.capture() if arguments.capture is None else read_checked(arguments.capture)
+        with counting("annotate", len(capture.frames)) as advance:
+            try:
+                annotated = annotate_capture(
+                    trained,
+                    capture,
+                    arguments.output,
+                    min_trust=arguments.min_trust,
+                    formats=arguments.formats,
+                    resume=arguments.resume,
+                    on_progress=advance,
+                )
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt("what was done is kept; run the same command again with --resume") from None
+        page = write_annotated_page(annotated.output, annotated.records, capture, arguments.min_trust)
+    print(f"{annotated.written} of {len(annotated.records)} frames in {annotated.output}; worst first: {page}")
+    return 0

@@ -1,0 +1,183 @@
+"""`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import Capture, Frame
+from neeco.errors import NeecoError
+from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moved_by
+from neeco.files import new_folder, write_json
+from neeco.labels.annotation import annotate
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.indexes import INFO, check_output, description, drawn, forget, write_indexes
+from neeco.synthesis.settings import Format
+from neeco.synthesis.trust import Usual, judge, usual_errors
+from neeco.synthesis.writers.folder import Record, load_record, remove_leftovers, write_sample, write_skipped
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+    from neeco.training.run import Run
+
+MIN_TRUST = 0.8
+LOOKED_AT = 16  # frames trained on that say how well pixels are usually explained
+STEPS = (2, 2, 1)  # of the fit at its three resolutions: a neighbour's fit is the start
+NOT_TRUSTED = "not trusted"
+SPECKLE = 0.01
+
+
+@dataclass(frozen=True)
+class Annotated:
+    """What was made: the records of all frames, those of frames that are not trusted without an image."""
+
+    output: Path
+    records: list[Record]
+
+    @property
+    def written(self) -> int:
+        """How many frames were trusted."""
+        return len(drawn(self.records))
+
+
+def annotate_capture(
+    run: Run,
+    capture: Capture,
+    output: Path,
+    *,
+    min_trust: float = MIN_TRUST,
+    formats: tuple[Format, ...] = ("coco", "yolo"),
+    resume: bool = False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Annotated:
+    """Label every frame of `capture`, a recording of the run's instruments over its tissue, and write those that can be
+    trusted as a data set: the photographs with the labels that the scene draws at poses fitted to them.
+
+    Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
+    what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
+    a scene without labels, a capture of other instruments, a share that is none, and an `output` that is not empty
+    (without `resume`) or was made otherwise.
+    """
+    if not 0 <= min_trust <= 1:
+        raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
+    scene = gaussian_scene(run.scene, "annotate")
+    labeller = CompositedLabels(scene)
+    _check_instruments(scene, capture)
+    settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
+    output = Path(output)
+    info = description(run, settings)
+    begun = check_output(output, info, resume)
+    records: list[Record | None] = [None] * len(capture.frames)
+    with new_folder(output):
+        if begun:
+            remove_leftovers(output)
+        try:
+            write_json(output / INFO, info | {"complete": False})
+            usual = _usual(scene, labeller, run.capture())
+            info["usual_errors"] = usual.to_json()
+            worker = _Annotator(scene, labeller, usual, min_trust, output)
+            for done, (index, record) in enumerate(worker.frames(capture.frames, begun)):
+                records[index] = record
+                on_progress(done + 1)
+            known = [record for record in records if record is not None]
+            if not drawn(known):
+                best = max(record["trust"]["value"] for record in known)
+                raise NeecoError(
+                    f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
+                )
+        except (KeyboardInterrupt, NeecoError):
+            known = [record for record in records if record is not None]
+            if begun or drawn(known):
+                with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
+                    write_indexes(output, known, info, scene, labeller, formats, complete=False)
+            else:
+                forget(output)
+            raise
+        write_indexes(output, known, info, scene, labeller, formats, complete=True)
+        return Annotated(output, known)
+
+
+@dataclass(frozen=True)
+class _Annotator:
+    """Fits, draws, judges and writes frames, one after the other in time."""
+
+    scene: Scene
+    labeller: CompositedLabels
+    usual: Usual
+    min_trust: float
+    output: Path
+
+    def frames(self, frames: Sequence[Frame], begun: bool) -> Iterator[tuple[int, Record]]:
+        """(index, record) of every frame, in the order of time: each fit starts from its neighbour's."""
+        start: Tensor | None = None
+        for index in sorted(range(len(frames)), key=lambda k: frames[k].state.time):
+            record = load_record(self.output, index) if begun else None
+            if record is None:
+                record = self._one(index, frames[index], start)
+            start = torch.tensor(record["increments"], dtype=torch.float64)
+            yield index, record
+
+    def _one(self, index: int, frame: Frame, start: Tensor | None) -> Record:
+        photograph, mask = frame.load_image(), frame.load_mask()
+        fit, drawing = _fitted(self.scene, self.labeller, frame, photograph, start)
+        trust = judge(drawing, photograph, mask, self.usual)
+        facts: dict[str, Any] = {
+            "frame": frame.name,
+            "recorded_split": frame.split,
+            "trust": trust.to_json(),
+            "moved": _moved(frame, fit),
+            "increments": fit.increments.tolist(),
+        }
+        labels = annotate(self.scene, drawing, self.labeller.names)
+        if trust.value < self.min_trust:
+            facts["labels"] = [label.to_json() for label in labels]
+            return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
+        return write_sample(self.output, index, replace(drawing, image=photograph), labels, {}, facts)
+
+
+def _fitted(
+    scene: Scene, labeller: CompositedLabels, frame: Frame, photograph: Tensor, start: Tensor | None
+) -> tuple[Fit, LayeredDrawing]:
+    fit = fit_frame(scene, frame, photograph, start, AlignConfig(steps=STEPS))
+    return fit, draw_layers(scene, labeller, fit.state, fit.camera, SPECKLE)
+
+
+def _usual(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:
+    """What the frames that the scene was trained on say of its errors."""
+    frames = trained_on.split("train")
+    chosen = [frames[round(k * (len(frames) - 1) / max(1, LOOKED_AT - 1))] for k in range(min(LOOKED_AT, len(frames)))]
+    drawings = []
+    for frame in chosen:
+        photograph = frame.load_image()
+        drawing = _fitted(scene, labeller, frame, photograph, None)[1]
+        drawings.append((drawing, photograph, frame.load_mask()))
+    return usual_errors(drawings)
+
+
+def _moved(frame: Frame, fit: Fit) -> dict[str, dict[str, float]]:
+    """How far the fit moved the camera and every instrument."""
+    moved = {name: moved_by(given, fit.state.instruments[name]) for name, given in frame.state.instruments.items()}
+    return moved | {"camera": moved_by(frame.camera, fit.camera)}
+
+
+def _check_instruments(scene: Scene, capture: Capture) -> None:
+    """Raises NeecoError unless every frame states the poses and joints of the scene's instruments."""
+    known = {item.name: set(item.joints) for item in capture.instruments}
+    for instrument in scene.instruments:
+        if instrument.name not in known:
+            names = ", ".join(known) or "none"
+            raise NeecoError(f"{capture.root}: instruments: the scene learned {instrument.name!r}, here are: {names}")
+        missing = set(instrument.joints) - known[instrument.name]
+        if missing:
+            raise NeecoError(
+                f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"
+            )

@@ -1,0 +1,211 @@
+"""Recorded frames labelled by the scene: fitted, judged by their photographs, written or listed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rod_world import CAMERA, rod_state
+
+from neeco.capture.images import write_image
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.cli import main
+from neeco.errors import NeecoError
+from neeco.labels.composited import CompositedLabels
+from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.report.annotated_page import write_annotated_page
+from neeco.scene import Scene
+from neeco.scene.rotations import rigid_from_vector
+from neeco.synthesis import trust
+from neeco.synthesis.annotated import annotate_capture
+from neeco.synthesis.trust import Usual, judge, usual_errors
+
+USUAL = Usual(0.05, 0.05)
+HIDDEN = 5  # the frame whose instrument something is held before
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """As much of a run as annotation uses."""
+
+    path: Path
+    scene: Scene
+    recording: Capture
+
+    def capture(self) -> Capture:
+        return self.recording
+
+
+def tracked(state: State, index: int) -> State:
+    """What a tracker says of `state`: half a millimetre off."""
+    off = torch.tensor([0.0, 0.004, 0.0, 0.4, -0.3, 0.2], dtype=torch.float64) * (1 if index % 2 else -1)
+    given = state.instruments["rod"]
+    return State({"rod": InstrumentState(given.pose @ rigid_from_vector(off), given.joints)}, time=index / 10)
+
+
+@pytest.fixture(scope="module")
+def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+    """Eight photographs of the scene, one of them with a board held before the instrument."""
+    root = tmp_path_factory.mktemp("recorded")
+    frames = []
+    for index in range(8):
+        state = rod_state(x=2.0 * index - 7, y=3.0, jaw=0.1 * index)
+        with torch.no_grad():
+            image = scene.draw(state, CAMERA).color.clamp(0, 1)
+        if index == HIDDEN:
+            image[5:45, 20:60] = torch.tensor([0.1, 0.3, 0.9])
+        path = root / "images" / f"{index:03d}.png"
+        write_image(path, image)
+        frames.append(Frame(path, CAMERA, tracked(state, index), "test" if index in (2, HIDDEN) else "train"))
+    points = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.float32))
+    return RecordedRun(run.path, scene, Capture(root, tuple(frames), scene.instruments, points))
+
+
+@pytest.fixture(scope="module")
+def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("made") / "annotated"
+    annotated = annotate_capture(recorded, recorded.capture(), output)
+    assert annotated.written == 7
+    write_annotated_page(output, annotated.records, recorded.capture(), 0.8)
+    return output
+
+
+def layers(scene: Scene, state: State) -> LayeredDrawing:
+    return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_photograph_speaks_for_a_right_label_and_against_a_wrong_one(scene: Scene) -> None:
+    right, wrong = layers(scene, rod_state()), layers(scene, rod_state(x=12.0))
+    assert judge(right, right.image, None, USUAL).value == 1.0
+    judged = judge(wrong, right.image, None, USUAL)
+    assert judged.value < 0.3
+    assert judged.against > 0.7
+
+
+def test_what_something_hides_is_no_label(scene: Scene) -> None:
+    drawing = layers(scene, rod_state())
+    photograph, label = drawing.image.clone(), drawing.parts > 0
+    photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
+    hidden = float((label[:20]).sum() / label.sum())
+    judged = judge(drawing, photograph, None, USUAL)
+    assert judged.against == pytest.approx(hidden, abs=0.1)
+    assert judged.value < 1 - hidden + 0.1
+
+
+def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trust, "BESIDE", 0.2)  # of a very small image
+    drawing = layers(scene, rod_state())
+    label = drawing.parts.clone()
+    half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
+    label[:, half:] = 0
+    cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
+    judged = judge(cut, drawing.image, None, USUAL)
+    assert judged.missed > 0.2
+    assert judged.value < 0.9
+
+
+def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: Scene) -> None:
+    drawing = layers(scene, rod_state())
+    photograph = drawing.image.clone()
+    photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
+    mask = torch.ones(48, 64, dtype=torch.bool)
+    mask[:23] = False  # and what the blur of the errors reaches
+    assert judge(drawing, photograph, mask, USUAL).value == 1.0
+
+
+def test_without_a_label_there_is_nothing_to_trust(scene: Scene) -> None:
+    drawing = layers(scene, rod_state())
+    empty = replace(drawing, parts=torch.zeros_like(drawing.parts))
+    assert judge(empty, drawing.image, None, USUAL).value == 0.0
+
+
+def test_usual_errors_are_those_of_all_but_a_hundredth_of_the_pixels(scene: Scene) -> None:
+    drawing = layers(scene, rod_state())
+    off = 0.04 * torch.rand(drawing.parts.shape, generator=torch.Generator().manual_seed(0))
+    brighter = (drawing.image + off[..., None]).clamp(0, 1)
+    usual = usual_errors([(drawing, brighter, None)])
+    assert 0.02 < usual.inside < 0.04
+    assert judge(drawing, brighter, None, usual).value > 0.95
+
+
+def test_photographs_get_the_labels_that_the_scene_draws_at_fitted_poses(made: Path, recorded: RecordedRun) -> None:
+    lines = [json.loads(line) for line in (made / "states.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == ["000", "001", "002", "003", "004", "006", "007"]
+    for index, line in zip((0, 1, 2, 3, 4, 6, 7), lines, strict=True):
+        with (
+            Image.open(made / line["image"]) as image,
+            Image.open(recorded.capture().frames[index].image_path) as photo,
+        ):
+            assert np.array_equal(np.asarray(image), np.asarray(photo))
+        with Image.open(made / line["image"].replace("images", "masks", 1)) as stored:
+            mask = np.asarray(stored) > 0
+        true = layers(recorded.scene, rod_state(x=2.0 * index - 7, y=3.0, jaw=0.1 * index)).parts.numpy() > 0
+        assert (mask & true).sum() / (mask | true).sum() > 0.97
+        assert line["trust"]["value"] > 0.9
+        assert line["moved"]["rod"]["mm"] + line["moved"]["camera"]["mm"] > 0.2
+    assert {line["recorded_split"] for line in lines} == {"train", "test"}
+
+
+def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> None:
+    assert not (made / "images" / "000005.png").exists()
+    info = json.loads((made / "dataset.json").read_text())
+    assert info["complete"]
+    assert info["skipped"] == [HIDDEN]
+    assert info["refused"] == {"not trusted": 1}
+    page = (made / "annotate.html").read_text()
+    assert page.index("</b> 005") < page.index("</b> 000")  # worst first
+    assert ": not written" in page
+    assert "http" not in page.replace("http://www.w3.org/", "")
+
+
+def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(
+    made: Path, recorded: RecordedRun, tmp_path: Path
+) -> None:
+    def stop(done: int) -> None:
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        annotate_capture(recorded, recorded.capture(), tmp_path / "cut", on_progress=stop)
+    assert not json.loads((tmp_path / "cut" / "dataset.json").read_text())["complete"]
+    annotate_capture(recorded, recorded.capture(), tmp_path / "cut", resume=True)
+    before = contents(made)
+    del before["annotate.html"]
+    assert contents(tmp_path / "cut") == before
+
+
+def test_bad_input_is_told_in_one_line_and_leaves_nothing(made: Path, recorded: RecordedRun, tmp_path: Path) -> None:
+    capture, output = recorded.capture(), tmp_path / "output"
+    with pytest.raises(NeecoError, match=r"--min-trust: 1.5 is not a share"):
+        annotate_capture(recorded, capture, output, min_trust=1.5)
+    other = replace(capture, instruments=(Instrument("hook"),))
+    with pytest.raises(NeecoError, match=r"instruments: the scene learned 'rod', here are: hook"):
+        annotate_capture(recorded, other, output)
+    still = replace(capture, instruments=(Instrument("rod"),))
+    with pytest.raises(NeecoError, match=r"instruments: rod: no joint 'jaw_angle'"):
+        annotate_capture(recorded, still, output)
+    hidden = replace(capture, frames=(capture.frames[HIDDEN],))
+    with pytest.raises(NeecoError, match=r"--min-trust: no frame of .* is trusted by 0.8; the best is by 0\.\d+"):
+        annotate_capture(recorded, hidden, output)
+    assert not output.exists()
+    with pytest.raises(NeecoError, match=r"not empty"):
+        annotate_capture(recorded, capture, made)
+    begun = shutil.copytree(made, tmp_path / "begun")
+    with pytest.raises(NeecoError, match=r"settings.min_trust: begun with 0.8, now 0.5"):
+        annotate_capture(recorded, capture, begun, min_trust=0.5, resume=True)
+
+
+def test_a_wrong_run_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["annotate", str(tmp_path / "nothing"), "--output", str(tmp_path / "output")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "output").exists()
