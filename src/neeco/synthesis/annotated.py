@@ -82,7 +82,7 @@ def annotate_capture(
             remove_leftovers(output)
         try:
             write_json(output / INFO, info | {"complete": False})
-            usual = _usual(scene, labeller, run.capture())
+            usual = usual_of(scene, labeller, run.capture())
             info["usual_errors"] = usual.to_json()
             worker = _Annotator(scene, labeller, usual, min_trust, output)
             for done, (index, record) in enumerate(worker.frames(capture.frames, begun)):
@@ -128,7 +128,7 @@ class _Annotator:
 
     def _one(self, index: int, frame: Frame, start: Tensor | None) -> Record:
         photograph, mask = frame.load_image(), frame.load_mask()
-        fit, drawing = _fitted(self.scene, self.labeller, frame, photograph, start)
+        fit, drawing = fitted(self.scene, self.labeller, frame, photograph, start)
         trust = judge(drawing, photograph, mask, self.usual)
         facts: dict[str, Any] = {
             "frame": frame.name,
@@ -144,21 +144,23 @@ class _Annotator:
         return write_sample(self.output, index, replace(drawing, image=photograph), labels, {}, facts)
 
 
-def _fitted(
+def fitted(
     scene: Scene, labeller: CompositedLabels, frame: Frame, photograph: Tensor, start: Tensor | None
 ) -> tuple[Fit, LayeredDrawing]:
+    """The poses of `frame` fitted to its photograph [H, W, 3], and what the scene draws there; `start`: a neighbour's
+    increments."""
     fit = fit_frame(scene, frame, photograph, start, AlignConfig(steps=STEPS))
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, SPECKLE)
 
 
-def _usual(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:
+def usual_of(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:
     """What the frames that the scene was trained on say of its errors."""
     frames = trained_on.split("train")
     chosen = [frames[round(k * (len(frames) - 1) / max(1, LOOKED_AT - 1))] for k in range(min(LOOKED_AT, len(frames)))]
     drawings = []
     for frame in chosen:
         photograph = frame.load_image()
-        drawing = _fitted(scene, labeller, frame, photograph, None)[1]
+        drawing = fitted(scene, labeller, frame, photograph, None)[1]
         drawings.append((drawing, photograph, frame.load_mask()))
     return usual_errors(drawings)
 

@@ -18,6 +18,7 @@ from neeco.labels.drawing import LayeredDrawing
 
 BESIDE = 0.03  # of the image's diagonal: how far from the label what it misses is looked for
 USUAL = 0.99  # share of the pixels of frames trained on that are explained as well
+HALF = 0.5  # of the error that the tissue alone would have: an instrument that explains more is there, if blurred
 SMOOTH = 3  # px, side of the square over which a pixel's error is averaged
 
 
@@ -71,7 +72,8 @@ def judge(drawing: LayeredDrawing, photograph: Tensor, mask: Tensor | None, usua
     Pixels that the frame's loss mask leaves out do not vote.
     """
     errors = _errors(drawing, photograph, mask)
-    against = errors.label & ((errors.drawn > errors.tissue) | (errors.drawn > usual.inside))
+    unexplained = (errors.drawn > usual.inside) & (errors.drawn > HALF * errors.tissue)
+    against = errors.label & ((errors.drawn > errors.tissue) | unexplained)
     missed = errors.beside & (errors.drawn > usual.beside)
     size = max(1, int(errors.label.sum()))
     left_out, added = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels

@@ -52,7 +52,7 @@ class KinematicSettings:
     shaft_roll_start: int = 600
     opacity_penalty: float = 0.002
     label_sharpness: float = 0.02
-    part_sharpness: float = 0.01
+    part_sharpness: float = 0.003
     wrist_again: bool = True
     shadow: bool = True
     rim: bool = True
