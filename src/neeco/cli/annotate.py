@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from neeco.settings import Device
-from neeco.synthesis.settings import Format
+from neeco.synthesis.settings import MIN_TRUST, Format
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Arguments:
     """Data set folder to write; must be empty or absent unless --resume."""
     capture: Path | None = None
     """Another recording of the same instruments over the same tissue; the run's own when not given."""
-    min_trust: float = 0.8
+    min_trust: float = MIN_TRUST
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the photograph speaks for."""
     formats: tuple[Format, ...] = ("coco", "yolo")
     """Index files beside the plain images, masks, parts and depth."""

@@ -21,7 +21,7 @@ from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.indexes import INFO, check_output, description, drawn, forget, write_indexes
-from neeco.synthesis.settings import Format
+from neeco.synthesis.settings import MIN_TRUST, Format, Settings
 from neeco.synthesis.trust import Usual, judge, usual_errors
 from neeco.synthesis.writers.folder import Record, load_record, remove_leftovers, write_sample, write_skipped
 
@@ -29,11 +29,9 @@ if TYPE_CHECKING:
     from neeco.scene import Scene
     from neeco.training.run import Run
 
-MIN_TRUST = 0.8
 LOOKED_AT = 16  # frames trained on that say how well pixels are usually explained
 STEPS = (2, 2, 1)  # of the fit at its three resolutions: a neighbour's fit is the start
 NOT_TRUSTED = "not trusted"
-SPECKLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,7 @@ def fitted(
     """The poses of `frame` fitted to its photograph [H, W, 3], and what the scene draws there; `start`: a neighbour's
     increments."""
     fit = fit_frame(scene, frame, photograph, start, AlignConfig(steps=STEPS))
-    return fit, draw_layers(scene, labeller, fit.state, fit.camera, SPECKLE)
+    return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.speckle)
 
 
 def usual_of(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:

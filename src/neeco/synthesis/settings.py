@@ -12,6 +12,8 @@ Format = Literal["coco", "yolo"]
 Views = Literal["recorded", "perturbed", "orbit"]
 PATH_PREFIX = "path:"
 
+MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
+
 
 @dataclass(frozen=True)
 class Settings:
