@@ -36,6 +36,7 @@ class Hinges(nn.Module):
     wrist_start: Tensor
     extent: Tensor
     middle: Tensor
+    closed: Tensor
     radius: Tensor
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
@@ -48,6 +49,7 @@ class Hinges(nn.Module):
         )  # mm along the shaft; rotational symmetry ends here
         self.register_buffer("extent", torch.zeros(2))  # mm along the shaft, first and last solid Gaussian
         self.register_buffer("middle", torch.zeros(count))  # rad or mm, as the readings
+        self.register_buffer("closed", torch.full((count,), math.nan))  # the lowest recorded reading; nan: not known
         self.register_buffer("radius", torch.tensor(math.inf))  # mm, of the shaft as carved
         self.shaft_tilt = nn.Parameter(torch.zeros(2))
         self.shaft_shift = nn.Parameter(torch.zeros(2))
@@ -116,6 +118,11 @@ class Hinges(nn.Module):
     def turns(self, joint: int, reading: float) -> Tensor:
         """[2] rad by which a joint's two parts are turned."""
         return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
+
+    def opened(self, joint: int, reading: float) -> Tensor:
+        """[2] rad by which a joint's two parts stand off the shaft, which they lie along where it is closed."""
+        opened = self.gains[joint] * (reading - self.closed[joint])
+        return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), opened)
 
     def beyond_hinge(self, points: Tensor) -> Tensor:
         """[M] in [0, 1]: which points [M, 3] mm lie so that a joint may move them: what is far behind the first hinge

@@ -24,7 +24,14 @@ from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
 BEFORE_SHADOWS = "neeco-scene/1"  # read as scenes that cast none, with readings counted from zero
-SINCE = {"shadow_offset", "shadow_strength", "shadow_width", "middle", "radius"}  # modules' tensors that it lacks
+SINCE = {
+    "shadow_offset",
+    "shadow_strength",
+    "shadow_width",
+    "middle",
+    "closed",
+    "radius",
+}  # modules' tensors that it lacks
 
 
 def save_scene(scene: Learned, path: Path) -> None:

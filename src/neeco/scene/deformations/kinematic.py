@@ -186,7 +186,7 @@ class Kinematic(Deformation):
                 points["shaft_near"] = origin + torch.maximum(hinges.wrist_start, hinges.extent[0]) * direction
                 pivot, axis = hinges.hinge(0)
                 points["hinge"] = pivot
-                angles = hinges.turns(0, given.joints[hinges.joint_names[0]])
+                angles = hinges.opened(0, given.joints[hinges.joint_names[0]])
                 tip = (origin + end * direction)[None]  # [1, 3]
                 ordered = angles.index_select(0, hinges.left_first(0))
                 for name, angle in zip(("tip_left", "tip_right"), ordered.split(1), strict=True):

@@ -144,6 +144,7 @@ def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedSha
             hinges.share[index] = 1.0 if guesses[0].gains[1] == 0 else 0.5
             readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
             hinges.middle[index] = sum(readings) / len(readings)
+            hinges.closed[index] = min(readings)
             hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.gains[index]
     hinges.radius.fill_(shape.radius)
     if hinges.joint_names:
