@@ -80,8 +80,8 @@ def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
     hinges.middle.fill_(0.6)
     hinges.closed.fill_(0.1)
     shut, open_ = (kinematic.keypoints(grasper_state(POSE, jaw))["grasper"] for jaw in (0.1, 0.6))
-    assert float((shut["tip_left"] - shut["tip_right"]).norm()) < 1e-3
-    assert float((open_["tip_left"] - open_["tip_right"]).norm()) > 1
+    assert (shut["tip_left"] - shut["tip_right"]).norm().item() < 1e-3
+    assert (open_["tip_left"] - open_["tip_right"]).norm().item() > 1
 
 
 def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from rod_world import CAMERA, rod_state
+from rod_world import CAMERA, FakeRun, rod_state
 
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
@@ -31,11 +31,9 @@ HIDDEN = 5  # the frame whose instrument something is held before
 
 
 @dataclass(frozen=True)
-class RecordedRun:
-    """As much of a run as annotation uses."""
+class RecordedRun(FakeRun):
+    """And what annotation uses."""
 
-    path: Path
-    scene: Scene
     recording: Capture
 
     def capture(self) -> Capture:
@@ -70,7 +68,7 @@ def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Rec
 @pytest.fixture(scope="module")
 def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("made") / "annotated"
-    annotated = annotate_capture(recorded, recorded.capture(), output)
+    annotated = annotate_capture(recorded, output)
     assert annotated.written == 7
     write_annotated_page(output, annotated.records, recorded.capture(), 0.8)
     return output
@@ -171,14 +169,14 @@ def test_a_frame_that_is_not_trusted_is_listed_and_not_written(made: Path) -> No
 def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(
     made: Path, recorded: RecordedRun, tmp_path: Path
 ) -> None:
-    def stop(done: int) -> None:
+    def stop(done: int, total: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        annotate_capture(recorded, recorded.capture(), tmp_path / "cut", on_progress=stop)
+        annotate_capture(recorded, tmp_path / "cut", on_progress=stop)
     assert not json.loads((tmp_path / "cut" / "dataset.json").read_text())["complete"]
-    annotate_capture(recorded, recorded.capture(), tmp_path / "cut", resume=True)
+    annotate_capture(recorded, tmp_path / "cut", resume=True)
     before = contents(made)
     del before["annotate.html"]
     assert contents(tmp_path / "cut") == before
@@ -187,22 +185,22 @@ def test_the_same_again_gives_the_same_bytes_and_so_does_going_on(
 def test_bad_input_is_told_in_one_line_and_leaves_nothing(made: Path, recorded: RecordedRun, tmp_path: Path) -> None:
     capture, output = recorded.capture(), tmp_path / "output"
     with pytest.raises(NeecoError, match=r"--min-trust: 1.5 is not a share"):
-        annotate_capture(recorded, capture, output, min_trust=1.5)
+        annotate_capture(recorded, output, min_trust=1.5)
     other = replace(capture, instruments=(Instrument("hook"),))
     with pytest.raises(NeecoError, match=r"instruments: the scene learned 'rod', here are: hook"):
-        annotate_capture(recorded, other, output)
+        annotate_capture(recorded, output, capture=other)
     still = replace(capture, instruments=(Instrument("rod"),))
     with pytest.raises(NeecoError, match=r"instruments: rod: no joint 'jaw_angle'"):
-        annotate_capture(recorded, still, output)
+        annotate_capture(recorded, output, capture=still)
     hidden = replace(capture, frames=(capture.frames[HIDDEN],))
     with pytest.raises(NeecoError, match=r"--min-trust: no frame of .* is trusted by 0.8; the best is by 0\.\d+"):
-        annotate_capture(recorded, hidden, output)
+        annotate_capture(recorded, output, capture=hidden)
     assert not output.exists()
     with pytest.raises(NeecoError, match=r"not empty"):
-        annotate_capture(recorded, capture, made)
+        annotate_capture(recorded, made)
     begun = shutil.copytree(made, tmp_path / "begun")
     with pytest.raises(NeecoError, match=r"settings.min_trust: begun with 0.8, now 0.5"):
-        annotate_capture(recorded, capture, begun, min_trust=0.5, resume=True)
+        annotate_capture(recorded, begun, min_trust=0.5, resume=True)
 
 
 def test_a_wrong_run_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

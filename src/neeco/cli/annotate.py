@@ -41,13 +41,13 @@ def run(arguments: Arguments) -> int:
     from neeco.training.run import open_run
 
     with open_run(arguments.run, device_of(arguments.device)) as trained:
-        capture = trained.capture() if arguments.capture is None else read_checked(arguments.capture)
-        with counting("annotate", len(capture.frames)) as advance:
+        capture = None if arguments.capture is None else read_checked(arguments.capture)
+        with counting("annotate") as advance:
             try:
                 annotated = annotate_capture(
                     trained,
-                    capture,
                     arguments.output,
+                    capture=capture,
                     min_trust=arguments.min_trust,
                     formats=arguments.formats,
                     resume=arguments.resume,
@@ -55,6 +55,6 @@ def run(arguments: Arguments) -> int:
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("what was done is kept; run the same command again with --resume") from None
-        page = write_annotated_page(annotated.output, annotated.records, capture, arguments.min_trust)
+        page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
     print(f"{annotated.written} of {len(annotated.records)} frames in {annotated.output}; worst first: {page}")
     return 0

@@ -215,6 +215,12 @@ def _smooth(difference: Tensor, weight: Tensor) -> Tensor:
     return conv2d(planes, kernel, padding=1)[:, 0].permute(1, 2, 0)
 
 
+def moves(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:
+    """How far a fit moved every instrument, by name, and the `camera`; each as `moved_by` says it."""
+    moved = {name: moved_by(given, state.instruments[name]) for name, given in frame.state.instruments.items()}
+    return moved | {"camera": moved_by(frame.camera, camera)}
+
+
 def moved_by(given: InstrumentState | Camera, fitted: InstrumentState | Camera) -> dict[str, float]:
     """How far a fit moved a pose: {"mm": distance of the origins, "deg": angle of the rotation}."""
     before, after = _pose(given), _pose(fitted)

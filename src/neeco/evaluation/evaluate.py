@@ -14,7 +14,7 @@ import torch
 
 from neeco.capture.model import Capture, Frame, State
 from neeco.errors import NeecoError
-from neeco.evaluation.align import align_frame, moved_by
+from neeco.evaluation.align import align_frame, moves
 from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips
 from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
@@ -151,9 +151,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) ->
 
 def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
     """The fitted poses, and how far they moved."""
-    moved = {name: moved_by(given, state.instruments[name]) for name, given in frame.state.instruments.items()}
     return {
-        "moved": moved | {"camera": moved_by(frame.camera, camera)},
+        "moved": moves(frame, state, camera),
         "world_from_camera": camera.world_from_camera.tolist(),
         "world_from_instrument": {name: item.pose.tolist() for name, item in state.instruments.items()},
     }

@@ -198,13 +198,16 @@ PAPER = (
 _HALF, _QUARTER = Derived("frames-half", 0.5), Derived("frames-quarter", 0.25)
 _NOISE = tuple(Derived(f"noise-{level:g}mm", noise_mm=level) for level in (0.5, 1.0, 2.0))
 
+
+def _switch(name: str, title: str, question: str, off: str) -> Ablation:
+    """Something of `kinematic` that `off` turns off."""
+    entries = (Entry("off", _kinematic(f"no-{name}", off)), Entry("on", KINEMATIC))
+    return Ablation(name, "ours", title, question, (Comparison(name.replace("-", " "), "on", entries),))
+
+
 OURS = (
-    Ablation(
-        "joints",
-        "ours",
-        "Joints",
-        "What do learned hinges bring over an instrument that moves as one piece?",
-        (Comparison("joints", "on", (Entry("off", _kinematic("no-joints", "joints=[]")), Entry("on", KINEMATIC))),),
+    _switch(
+        "joints", "Joints", "What do learned hinges bring over an instrument that moves as one piece?", "joints=[]"
     ),
     Ablation(
         "refinement",
@@ -223,18 +226,11 @@ OURS = (
             ),
         ),
     ),
-    Ablation(
+    _switch(
         "shaft-roll",
-        "ours",
         "Shaft roll",
         "What does spinning the shaft about its axis while training bring?",
-        (
-            Comparison(
-                "shaft roll",
-                "on",
-                (Entry("off", _kinematic("no-shaft-roll", "deformation.shaft_roll=0")), Entry("on", KINEMATIC)),
-            ),
-        ),
+        "deformation.shaft_roll=0",
     ),
     Ablation(
         "parts",
@@ -253,29 +249,17 @@ OURS = (
             ),
         ),
     ),
-    Ablation(
+    _switch(
         "shadow",
-        "ours",
         "Shadow of the instruments",
         "What does drawing the instruments' shadow bring over learning it as a part of them?",
-        (
-            Comparison(
-                "shadow",
-                "on",
-                (Entry("off", _kinematic("no-shadow", "deformation.shadow=false")), Entry("on", KINEMATIC)),
-            ),
-        ),
+        "deformation.shadow=false",
     ),
-    Ablation(
+    _switch(
         "rim",
-        "ours",
         "Rim of the tissue",
         "What does continuing the tissue beyond what frames saw of it bring?",
-        (
-            Comparison(
-                "rim", "on", (Entry("off", _kinematic("no-rim", "deformation.rim=false")), Entry("on", KINEMATIC))
-            ),
-        ),
+        "deformation.rim=false",
     ),
     Ablation(
         "labels",

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from neeco.raster.pinhole import project
 from neeco.raster.sh import SH_C0
 from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
 
@@ -22,6 +23,7 @@ RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
 TAPS = 6  # map pixels to each side of the blur's middle, which is cut off there
 NEAR = 1e-6
+NEAREST = 1e-3  # mm
 HALF = 0.5 / SH_C0
 
 Draw = Callable[[Gaussians, Camera], Rendering]
@@ -76,7 +78,8 @@ def _missing(gaussians: Gaussians, shadow: Shadow, receivers: Tensor, camera: Ca
         summed = torch.stack([alpha, down @ (seen.alpha * seen.depth) @ across], -1)  # [h, w, 2]
     pose = camera.world_from_camera.to(gaussians.means)
     points = (gaussians.means[receivers].detach() - pose[:3, 3]) @ pose[:3, :3] - shadow.offset  # [R, 3] light frame
-    pixels = _pixels(points, at_light)
+    focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
+    pixels = torch.stack(project(points, *focus, nearest=NEAREST), 1)  # [R, 2]; those behind fall far outside
     weight, weighted = _look_up(summed, pixels.detach(), at_light).unbind(1)
     before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [R] mm, depth of what casts there
     pixels = pixels + _parallax(shadow.offset, pixels.detach(), before, at_light)
@@ -100,14 +103,6 @@ def _light_camera(camera: Camera, offset: Tensor) -> Camera:
         height,
         camera.near,
     )
-
-
-def _pixels(points: Tensor, camera: Camera) -> Tensor:
-    """[R, 2] px of points [R, 3] mm in the camera's frame; those behind it fall far outside."""
-    depth = points[:, 2].clamp_min(1e-3)
-    u = points[:, 0] / depth * camera.fx + camera.cx
-    v = points[:, 1] / depth * camera.fy + camera.cy
-    return torch.stack([u, v], 1)
 
 
 def _parallax(offset: Tensor, pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:

@@ -124,12 +124,13 @@ class Hinges(nn.Module):
         opened = self.gains[joint] * (reading - self.closed[joint])
         return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), opened)
 
+    @torch.no_grad()
     def beyond_hinge(self, points: Tensor) -> Tensor:
         """[M] in [0, 1]: which points [M, 3] mm lie so that a joint may move them: what is far behind the first hinge
         never turns about it."""
         if not self.joint_names:
             return points.new_ones(len(points))
-        behind = self.hinge_depth.detach().min() - self.along_shaft(points)  # [M] mm
+        behind = self.hinge_depth.min() - self.along_shaft(points)  # [M] mm
         reach = torch.sigmoid((BEHIND_HINGE - behind / self.radius) / BEHIND_SOFT)
         return torch.where(self.radius.isfinite(), reach, torch.ones_like(reach))
 

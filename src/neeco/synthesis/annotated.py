@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,13 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moved_by
+from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
 from neeco.files import new_folder, write_json
 from neeco.labels.annotation import annotate
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.indexes import INFO, check_output, description, drawn, forget, write_indexes
+from neeco.synthesis.indexes import INFO, check_output, description, drawn, keeping, write_indexes
 from neeco.synthesis.settings import MIN_TRUST, Format, Settings
 from neeco.synthesis.trust import Usual, judge, usual_errors
 from neeco.synthesis.writers.folder import Record, load_record, remove_leftovers, write_sample, write_skipped
@@ -39,7 +39,8 @@ class Annotated:
     """What was made: the records of all frames, those of frames that are not trusted without an image."""
 
     output: Path
-    records: list[Record]
+    capture: Capture
+    records: list[Record]  # in the order of its frames
 
     @property
     def written(self) -> int:
@@ -49,16 +50,17 @@ class Annotated:
 
 def annotate_capture(
     run: Run,
-    capture: Capture,
     output: Path,
     *,
+    capture: Capture | None = None,
     min_trust: float = MIN_TRUST,
     formats: tuple[Format, ...] = ("coco", "yolo"),
     resume: bool = False,
-    on_progress: Callable[[int], None] = lambda done: None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
-    """Label every frame of `capture`, a recording of the run's instruments over its tissue, and write those that can be
-    trusted as a data set: the photographs with the labels that the scene draws at poses fitted to them.
+    """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
+    write those that can be trusted as a data set: the photographs with the labels that the scene draws at poses fitted
+    to them.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
     what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
@@ -69,39 +71,33 @@ def annotate_capture(
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
     scene = gaussian_scene(run.scene, "annotate")
     labeller = CompositedLabels(scene)
+    trained_on = run.capture()
+    capture = trained_on if capture is None else capture
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
-    records: list[Record | None] = [None] * len(capture.frames)
+    write = partial(write_indexes, output, info=info, scene=scene, labeller=labeller, formats=formats)
     with new_folder(output):
         if begun:
             remove_leftovers(output)
-        try:
+        with keeping(output, len(capture.frames), begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
-            usual = usual_of(scene, labeller, run.capture())
+            usual = usual_of(scene, labeller, trained_on)
             info["usual_errors"] = usual.to_json()
-            worker = _Annotator(scene, labeller, usual, min_trust, output)
-            for done, (index, record) in enumerate(worker.frames(capture.frames, begun)):
-                records[index] = record
-                on_progress(done + 1)
-            known = [record for record in records if record is not None]
-            if not drawn(known):
-                best = max(record["trust"]["value"] for record in known)
+            made: dict[int, Record] = {}
+            for index, record in _Annotator(scene, labeller, usual, min_trust, output).frames(capture.frames, begun):
+                made[index] = record
+                on_progress(len(made), len(capture.frames))
+            records = [made[index] for index in sorted(made)]
+            if not drawn(records):
+                best = max(record["trust"]["value"] for record in records)
                 raise NeecoError(
                     f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
                 )
-        except (KeyboardInterrupt, NeecoError):
-            known = [record for record in records if record is not None]
-            if begun or drawn(known):
-                with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
-                    write_indexes(output, known, info, scene, labeller, formats, complete=False)
-            else:
-                forget(output)
-            raise
-        write_indexes(output, known, info, scene, labeller, formats, complete=True)
-        return Annotated(output, known)
+        write(records, complete=True)
+        return Annotated(output, capture, records)
 
 
 @dataclass(frozen=True)
@@ -132,7 +128,7 @@ class _Annotator:
             "frame": frame.name,
             "recorded_split": frame.split,
             "trust": trust.to_json(),
-            "moved": _moved(frame, fit),
+            "moved": moves(frame, fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
         labels = annotate(self.scene, drawing, self.labeller.names)
@@ -161,12 +157,6 @@ def usual_of(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> U
         drawing = fitted(scene, labeller, frame, photograph, None)[1]
         drawings.append((drawing, photograph, frame.load_mask()))
     return usual_errors(drawings)
-
-
-def _moved(frame: Frame, fit: Fit) -> dict[str, dict[str, float]]:
-    """How far the fit moved the camera and every instrument."""
-    moved = {name: moved_by(given, fit.state.instruments[name]) for name, given in frame.state.instruments.items()}
-    return moved | {"camera": moved_by(frame.camera, fit.camera)}
 
 
 def _check_instruments(scene: Scene, capture: Capture) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from neeco.synthesis.indexes import (
     counted,
     description,
     drawn,
-    forget,
+    keeping,
     refusals,
     skipped,
     write_indexes,
@@ -93,12 +93,13 @@ def synthesize(
     sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
     acceptance = make_acceptance(scene, labeller, settings)
     info["tissue_tolerance_mm"] = acceptance.tolerance_mm
+    write = partial(write_indexes, output, info=info, scene=scene, labeller=labeller, formats=formats)
     records: list[Record] = []
     made = 0
     with new_folder(output):
         if begun:
             remove_leftovers(output)
-        try:
+        with keeping(output, settings.count, begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
             for index in range(settings.count):
                 record = load_record(output, index) if begun else None
@@ -111,16 +112,7 @@ def synthesize(
                 refused = refusals(records)
                 remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
                 raise NeecoError(f"{settings.states}: every state was refused ({counted(refused)}); {remedies}")
-        except (KeyboardInterrupt, NeecoError):
-            if begun or drawn(records):
-                with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
-                    further = (load_record(output, index) for index in range(len(records), settings.count))
-                    records += [record for record in further if record is not None]
-                    write_indexes(output, records, info, scene, labeller, formats, complete=False)
-            else:
-                forget(output)
-            raise
-        write_indexes(output, records, info, scene, labeller, formats, complete=True)
+        write(records, complete=True)
         return Synthesized(output, len(drawn(records)), made, refusals(records), skipped(records))
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,7 @@ from neeco.synthesis.writers.folder import (
     IGNORED,
     SHARE_PER_COUNT,
     Record,
+    load_record,
     write_states,
 )
 from neeco.synthesis.writers.yolo import write_yolo
@@ -88,6 +90,22 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
         if before != value:
             raise NeecoError(f"{output / INFO}: settings.{key}: begun with {before!r}, now {value!r}; use a new folder")
     return True
+
+
+@contextlib.contextmanager
+def keeping(output: Path, count: int, begun: bool, write: Callable[[list[Record]], None]) -> Iterator[None]:
+    """For a block that makes images 0 to `count` - 1 of a data set. Interrupted (Ctrl-C) or failing, what is done stays
+    and is indexed by `write`, to be gone on from; where nothing was `begun` and no image made, nothing stays."""
+    try:
+        yield
+    except (KeyboardInterrupt, NeecoError):
+        records = [record for index in range(count) if (record := load_record(output, index)) is not None]
+        if begun or drawn(records):
+            with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to go on from
+                write(records)
+        else:
+            forget(output)
+        raise
 
 
 def write_indexes(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Frame
+from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
@@ -119,6 +119,11 @@ class GaussianSession:
         self.schedule.observe(self.iteration, result.loss, result.psnr, progress)
         self._control_density(progress)
         return result
+
+    def corrected(self, index: int) -> tuple[State, Camera]:
+        """The state and camera of training frame `index` as refined so far."""
+        frame = self.views.frames[index]
+        return self.refinement.apply(index, frame.state, frame.camera, self.iteration)[:2]
 
     def _next_frame(self) -> int:
         phase = self.schedule.phase

@@ -149,7 +149,7 @@ class Kinematic(Deformation):
         weights = torch.softmax(logits[:, : hinges.part_count], -1)
         if not hinges.joint_names:
             return weights
-        moving = weights[:, 1:] * hinges.beyond_hinge(canonical.means[rows].detach())[:, None].detach()
+        moving = weights[:, 1:] * hinges.beyond_hinge(canonical.means[rows])[:, None]
         return torch.cat([1 - moving.sum(1, keepdim=True), moving], 1)
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:

@@ -68,8 +68,8 @@ def _profile(
 ) -> tuple[Tensor, Tensor]:
     """A photograph's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and two
     log ratios, which the light's colour and distance change alike everywhere."""
-    scene, frame = session.scene, session.views.frames[frame_index]
-    state, camera, _ = session.refinement.apply(frame_index, frame.state, frame.camera, session.iteration)
+    scene = session.scene
+    state, camera = session.corrected(frame_index)
     body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
     body[scene.canonical.body(index + 1), 0] = hinged.part_weights(scene.canonical, index)[:, 0]
     drawn = rasterize(scene.at(state), camera, channels=body).channels

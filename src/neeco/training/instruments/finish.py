@@ -67,8 +67,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
     moving = _moving_weight(scene.canonical, hinged, index, joint)
     given = middle = 0.0
     for frame_index in extremes:
-        frame = session.views.frames[frame_index]
-        state, camera, _ = session.refinement.apply(frame_index, frame.state, frame.camera, session.iteration)
+        state, camera = session.corrected(frame_index)
         target = session.views.target(frame_index)
         drawings = [
             rasterize(scene.at(variant), camera, channels=moving)

@@ -11,14 +11,12 @@ from torch.nn.functional import max_pool2d
 
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians, Rendering
+from neeco.training.instruments.solid import SOLID, spread
 from neeco.training.session import GaussianSession
 
 DIRECTIONS = 8
 RADII = (0.04, 0.02, 0.08)  # of the tissue's distance; the first is tried all around, the others where that was best
 TRIED_FRAMES = 12
-SOLID = (
-    0.3  # opacity of what is surely instrument: the rest may be the shadow, learned as a faint part that moves along
-)
 COVERED = 0.05  # of a pixel, by solid instrument: the tissue is not judged by more
 BESIDE = 7  # px, side of the square about a pixel that must be as little covered
 AGREE = 0.75  # share of the frames that a shadow must make better
@@ -41,8 +39,7 @@ def find_shadow(session: GaussianSession) -> None:
     """Set the scene's shadow to the light that best explains what the tissue and the solid part of the instruments do
     not; leave it off where none explains enough."""
     scene, views = session.scene, session.views
-    order = session.pose_order
-    frames = [int(order[int(place)]) for place in torch.linspace(0, len(order) - 1, min(TRIED_FRAMES, len(order)))]
+    frames = spread(session, TRIED_FRAMES)
     plain = [_drawn(session, index) for index in frames]
     beside = [_beside(views.masks[index], drawing) for index, drawing in zip(frames, plain, strict=True)]
     residuals = [
@@ -82,9 +79,11 @@ def find_shadow(session: GaussianSession) -> None:
 
 
 def _drawn(session: GaussianSession, index: int) -> Rendering:
-    """Frame `index` without what is faint of the instruments, with one channel: how much of a pixel is instrument."""
-    frame = session.views.frames[index]
-    state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
+    """Frame `index` without what is faint of the instruments, with one channel: how much of a pixel is instrument.
+
+    What is faint may be the shadow, learned as a part that moves along.
+    """
+    state, camera = session.corrected(index)
     posed: Gaussians = session.scene.at(state)
     instrument = session.scene.canonical.bodies > 0
     kept = ~instrument | (posed.opacities > SOLID)

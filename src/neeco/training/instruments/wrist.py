@@ -69,8 +69,7 @@ def _spun_error(session: GaussianSession, hinged: Hinged, index: int, start: flo
 
 
 def _image_error(session: GaussianSession, index: int, perturbation: Perturbation) -> float:
-    frame = session.views.frames[index]
-    state, camera, _ = session.refinement.apply(index, frame.state, frame.camera, session.iteration)
+    state, camera = session.corrected(index)
     rendering = rasterize(session.scene.at(state, perturbation), camera)
     error = (rendering.color - session.views.target(index)).abs()
     mask = session.views.masks[index]
