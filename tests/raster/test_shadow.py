@@ -31,7 +31,9 @@ def scene(
     sh[:, 0] = torch.where(casters, -0.5, 0.5)[:, None] / 0.28209479177387814
     shadow = None
     if offset is not None:
-        shadow = Shadow(casters, offset, torch.as_tensor(strength), torch.as_tensor(width))
+        offsets = offset if offset.dim() == 2 else offset[None]
+        strengths = torch.as_tensor(strength).expand(len(offsets))
+        shadow = Shadow(casters, offsets, strengths, torch.as_tensor(width))
     return Gaussians(
         torch.cat([wall, rod]),
         torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
@@ -85,6 +87,14 @@ def test_a_wider_light_makes_a_softer_shadow() -> None:
     sharp, soft = (image(scene()) - image(scene(offset, width=width)) for width in (0.002, 0.04))
     assert float(soft.max()) < 0.8 * float(sharp.max())
     assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=0.05)
+
+
+def test_two_lamps_cast_a_shadow_each() -> None:
+    left, right = torch.tensor([-30.0, 0.0, 0.0]), torch.tensor([30.0, 0.0, 0.0])
+    both, *each = (image(scene()) - image(scene(offsets)) for offsets in (torch.stack([left, right]), left, right))
+    assert torch.allclose(both, each[0] + each[1], atol=1e-5)
+    deep = image(scene()) - image(scene(torch.stack([right, right]), strength=0.8))
+    assert float(deep.max()) <= 1.0 + 1e-5  # no light is taken twice
 
 
 def test_without_strength_or_casters_the_bits_are_the_same() -> None:

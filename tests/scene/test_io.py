@@ -95,7 +95,7 @@ def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> 
 def test_a_scene_from_before_shadows_casts_none(kinematic: Scene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
-    shadow = [f"module.shadow_{part}" for part in ("offset", "strength", "width")]
+    shadow = [f"module.shadow_{part}" for part in ("offsets", "strengths", "width")]
     rewrite(path, lambda header: header.update(schema="neeco-scene/1"), *shadow)
     assert not load_scene(path).casts_shadow
     rewrite(path, lambda header: header.update(schema="neeco-scene/2"), *shadow)

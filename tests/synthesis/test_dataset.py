@@ -12,10 +12,11 @@ from pycocotools.coco import COCO
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
 from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.synthesis import dataset, indexes
-from neeco.synthesis.dataset import make_acceptance, make_labeller, make_sample, synthesize
+from neeco.synthesis import indexes
+from neeco.synthesis.acceptance import Acceptance
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.making import Maker
 from neeco.synthesis.render import render, split_views, state_views
-from neeco.synthesis.samplers import make_sampler
 from neeco.synthesis.settings import Settings
 
 COUNT = 6
@@ -167,16 +168,13 @@ def test_states_jsonl_draws_the_same_images_again(made, run, tmp_path):
 
 
 def test_an_image_depends_on_seed_and_index_only(made, run, tmp_path):
-    scene = run.scene
-    labeller = make_labeller(scene, SETTINGS)
-    acceptance = make_acceptance(scene, labeller, SETTINGS)
-    sampler = make_sampler(scene, "inside", 0.2, "recorded", COUNT)
+    maker = Maker.of(run.scene, SETTINGS)
     for index in (4, 1):  # out of order, the others never drawn
-        make_sample(scene, labeller, sampler, acceptance, SETTINGS, tmp_path, index)
+        maker.make(tmp_path, index)
         for folder in ("images", "parts", "depth"):
             name = f"{folder}/{index:06d}.png"
             assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
-    make_sample(scene, labeller, sampler, acceptance, replace(SETTINGS, seed=4), tmp_path, 1)
+    replace(maker, settings=replace(SETTINGS, seed=4)).make(tmp_path, 1)
     assert (tmp_path / "images/000001.png").read_bytes() != (made / "images/000001.png").read_bytes()
 
 
@@ -263,7 +261,7 @@ def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, ot
 
 def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
     refusals = iter(["leaves the image", "enters the tissue", None, None])
-    monkeypatch.setattr(dataset.Acceptance, "why_refused", lambda self, scene, drawing: next(refusals))
+    monkeypatch.setattr(Acceptance, "why_refused", lambda self, scene, drawing: next(refusals))
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
     assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
     assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused

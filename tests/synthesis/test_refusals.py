@@ -12,8 +12,9 @@ import neeco.files
 from neeco.capture.statefile import state_to_json
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.synthesis import dataset
+from neeco.synthesis.acceptance import Acceptance
 from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.making import Maker
 from neeco.synthesis.settings import Settings
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, tries=3)
@@ -26,7 +27,7 @@ def contents(folder) -> dict[str, bytes]:
 def refusing(reasons, monkeypatch) -> None:
     """Judge drawn states by `reasons` in turn; None accepts."""
     given = iter(reasons)
-    monkeypatch.setattr(dataset.Acceptance, "why_refused", lambda self, scene, drawing: next(given))
+    monkeypatch.setattr(Acceptance, "why_refused", lambda self, scene, drawing: next(given))
 
 
 def behind_the_camera(state, path) -> str:
@@ -78,7 +79,7 @@ def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tm
 
 def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
-    real, left = dataset.make_sample, iter(range(2))
+    real, left = Maker.make, iter(range(2))
 
     def stopped(*arguments):
         if next(left, None) is None:
@@ -87,7 +88,7 @@ def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys
 
     words = ["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "4", "--tries", "50"]
     with monkeypatch.context() as patched:
-        patched.setattr(dataset, "make_sample", stopped)
+        patched.setattr(Maker, "make", stopped)
         assert main(words) == 130
     assert capsys.readouterr().err.splitlines()[-1].endswith("run the same command again with --resume")
     assert main([*words, "--resume"]) == 0

@@ -91,13 +91,13 @@ def test_both_cast_a_shadow_on_the_tissue_and_none_on_each_other_or_in_the_label
     state = at(60, 70)
     bright = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
     with torch.no_grad():
-        bars.shadow_offset.copy_(torch.tensor([15.0, 15.0, 0.0]))
-        bars.shadow_strength.fill_(0.8)
+        bars.shadow_offsets[0] = torch.tensor([15.0, 15.0, 0.0])
+        bars.shadow_strengths[0] = 0.8
     try:
         shaded = draw_layers(bars, CompositedLabels(bars, LABEL_THRESHOLD), state, camera, 0.01)
     finally:
         with torch.no_grad():
-            bars.shadow_strength.zero_()
+            bars.shadow_strengths.zero_()
     assert torch.equal(shaded.parts, bright.parts)
     assert torch.equal(shaded.share, bright.share)
     darker = (bright.image - shaded.image).mean(-1)

@@ -92,7 +92,7 @@ def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capt
     assert [name for name, _ in scene.label_names].count("rod") == 1
     assert "shadow" in scene.diagnostics
     with torch.no_grad():
-        scene.shadow_strength.fill_(0.5)
+        scene.shadow_strengths[0] = 0.5
         gaussians = scene.at(scene.recorded.states[0])
         labels = scene.label_channels()
     assert gaussians.headlight is not None

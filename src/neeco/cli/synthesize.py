@@ -24,6 +24,8 @@ class Arguments:
     """Index files beside the plain images, masks, parts and depth."""
     resume: bool = False
     """Continue a data set begun with the same settings, or make it larger."""
+    workers: int = 1
+    """Processes that share the work; the files are the same for any number."""
     device: Device = "auto"
 
 
@@ -39,7 +41,9 @@ def run(arguments: Arguments) -> int:
     opened = open_run(arguments.run, device_of(arguments.device))
     with opened as trained, counting("synthesize", settings.count) as advance:
         try:
-            summary = synthesize(trained, arguments.output, settings, arguments.formats, arguments.resume, advance)
+            summary = synthesize(
+                trained, arguments.output, settings, arguments.formats, arguments.resume, advance, arguments.workers
+            )
         except KeyboardInterrupt:
             raise KeyboardInterrupt("what was drawn is kept; run the same command again with --resume") from None
     print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")

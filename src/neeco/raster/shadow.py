@@ -1,6 +1,6 @@
-"""The shadow that what moves casts on what stands still, under a light that sits beside the lens.
+"""The shadows that what moves casts on what stands still, under lamps that sit beside the lens.
 
-The casters are drawn once more, from the light: how opaque they are there, blurred by the light's width, is how much of
+The casters are drawn once more, from every lamp: how opaque they are there, blurred by the lamp's width, is how much of
 its light a Gaussian behind them misses. Only brightness changes; nothing is added to the image, and labels know nothing
 of it.
 """
@@ -30,17 +30,19 @@ Draw = Callable[[Gaussians, Camera], Rendering]
 
 
 def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
-    """The same Gaussians, the colours of those that cast nothing dimmed by the headlight's shadow; `draw` rasterizes.
+    """The same Gaussians, the colours of those that cast nothing dimmed by the headlight's shadows; `draw` rasterizes.
 
-    Gradients reach the shadow's offset, strength and width, and the colours; the casters' shapes are taken as they are.
+    Gradients reach the lamps' offsets, strengths and width, and the colours; the casters' shapes are taken as they are.
     """
     light = gaussians.headlight
     if light is None or light.shadow is None or not bool(light.shadow.casters.any()):
         return gaussians
-    lit = torch.ones_like(gaussians.opacities)
-    receivers = ~light.shadow.casters
-    lit = lit.masked_scatter(receivers, 1 - _missing(gaussians, light.shadow, receivers, camera, draw))
-    sh = _Dimmed.apply(gaussians.sh, lit)
+    shadow = light.shadow
+    missing = torch.zeros_like(gaussians.opacities)
+    for offset, strength in zip(shadow.offsets, shadow.strengths, strict=True):
+        if float(strength.detach()) > 0:
+            missing = missing + strength * blocked(gaussians, shadow, offset, camera, draw)
+    sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(0))
     return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
 
 
@@ -65,9 +67,12 @@ class _Dimmed(torch.autograd.Function):
         return grad * lit[:, None, None], to_lit
 
 
-def _missing(gaussians: Gaussians, shadow: Shadow, receivers: Tensor, camera: Camera, draw: Draw) -> Tensor:
-    """Share [R] of its light that each receiver misses."""
-    at_light = _light_camera(camera, shadow.offset.detach())
+def blocked(gaussians: Gaussians, shadow: Shadow, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
+    """Share [N] of the light of a lamp at `offset` [3] mm that the casters keep from each Gaussian; 0 for themselves.
+
+    Nothing but the casters and the width is read of `shadow`.
+    """
+    at_light = _light_camera(camera, offset.detach())
     with torch.no_grad():
         casters = gaussians.select(shadow.casters)
         seen = draw(replace(casters, sh=casters.sh[:, :1], headlight=None, background=None), at_light)
@@ -77,14 +82,16 @@ def _missing(gaussians: Gaussians, shadow: Shadow, receivers: Tensor, camera: Ca
     with torch.no_grad():
         summed = torch.stack([alpha, down @ (seen.alpha * seen.depth) @ across], -1)  # [h, w, 2]
     pose = camera.world_from_camera.to(gaussians.means)
-    points = (gaussians.means[receivers].detach() - pose[:3, 3]) @ pose[:3, :3] - shadow.offset  # [R, 3] light frame
+    receivers = ~shadow.casters
+    points = (gaussians.means[receivers].detach() - pose[:3, 3]) @ pose[:3, :3] - offset  # [R, 3] light frame
     focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
     pixels = torch.stack(project(points, *focus, nearest=NEAREST), 1)  # [R, 2]; those behind fall far outside
     weight, weighted = _look_up(summed, pixels.detach(), at_light).unbind(1)
     before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [R] mm, depth of what casts there
-    pixels = pixels + _parallax(shadow.offset, pixels.detach(), before, at_light)
+    pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
     share = _look_up(alpha[..., None], pixels, at_light)[:, 0]
-    return shadow.strength * torch.where(points[:, 2].detach() > before, share, torch.zeros_like(share))
+    share = torch.where(points[:, 2].detach() > before, share, torch.zeros_like(share))  # [R]
+    return torch.zeros_like(gaussians.opacities).masked_scatter(receivers, share)
 
 
 def _light_camera(camera: Camera, offset: Tensor) -> Camera:

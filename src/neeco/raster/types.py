@@ -10,12 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Shadow:
-    """What the light misses behind some of the Gaussians, since it sits beside the lens (see `shadow.shadowed`)."""
+    """What lamps miss behind some of the Gaussians, since they sit beside the lens (see `shadow.shadowed`)."""
 
     casters: Tensor  # [N] bool: these cast it, all others receive it
-    offset: Tensor  # [3] mm, the light in the camera's frame (OpenCV axes)
-    strength: Tensor  # [] in [0, 1]: share of the light that is missing in the deepest shadow
-    width: Tensor  # [] slope: standard deviation of the shadow's edge, as seen from the light
+    offsets: Tensor  # [L, 3] mm, the lamps in the camera's frame (OpenCV axes)
+    strengths: Tensor  # [L] in [0, 1]: share of the light that is missing in the deepest shadow of each
+    width: Tensor  # [] slope: standard deviation of a shadow's edge, as seen from the lamp
 
     def to(self, device: torch.device | str) -> Shadow:
         """The same shadow on `device`."""

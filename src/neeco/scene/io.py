@@ -25,8 +25,8 @@ from neeco.settings import plain
 SCHEMA = "neeco-scene/2"
 BEFORE_SHADOWS = "neeco-scene/1"  # read as scenes that cast none, with readings counted from zero
 SINCE = {
-    "shadow_offset",
-    "shadow_strength",
+    "shadow_offsets",
+    "shadow_strengths",
     "shadow_width",
     "middle",
     "closed",
@@ -70,7 +70,8 @@ def load_scene(path: Path) -> Learned:
     except NeecoError as error:
         raise NeecoError(f"{path}: {error}; train again") from None
     except (LookupError, ValueError, TypeError, RuntimeError) as error:
-        raise NeecoError(f"{path}: damaged scene ({error}); train again") from None
+        said = " ".join(str(error).split())
+        raise NeecoError(f"{path}: damaged scene ({said}); train again") from None
 
 
 def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:

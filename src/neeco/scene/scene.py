@@ -22,6 +22,7 @@ from neeco.scene.recorded import Recorded
 from neeco.scene.rim import MADE_UP
 from neeco.scene.rotations import rigid_from_vector
 
+LAMPS = 3  # at most: what a laparoscope's light guides come to
 SHADOW_WIDTH = 0.01  # slope, at the start
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
@@ -38,9 +39,9 @@ class Scene(nn.Module):
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
-    instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offset`, `shadow_strength` (0: none) and
-    `shadow_width` the instruments' shadow on the tissue (see `Shadow`). `background` in [0, 1] is the grey behind
-    everything.
+    instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`, `shadow_strengths` (0: no such
+    lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`). `background` in [0, 1] is the grey
+    behind everything.
     """
 
     has_gaussians = True
@@ -70,8 +71,8 @@ class Scene(nn.Module):
         self.registration = nn.Parameter(torch.zeros(7))
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
-        self.shadow_offset = nn.Parameter(torch.zeros(3))
-        self.shadow_strength = nn.Parameter(torch.zeros(()))
+        self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
+        self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
         self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
 
     @property
@@ -137,15 +138,15 @@ class Scene(nn.Module):
 
     @property
     def casts_shadow(self) -> bool:
-        """Was a light beside the lens found, and is there anything that casts its shadow?"""
-        found = not self.shadow_strength.is_meta and float(self.shadow_strength.detach()) > 0
+        """Was a lamp beside the lens found, and is there anything that casts its shadow?"""
+        found = not self.shadow_strengths.is_meta and bool((self.shadow_strengths.detach() > 0).any())
         return found and len(self.canonical) > self.canonical.counts[0]
 
     def _shadow(self) -> Shadow | None:
         if not self.casts_shadow:
             return None
-        strength = self.shadow_strength.clamp(0.0, 1.0)
-        return Shadow(self.canonical.bodies > 0, self.shadow_offset, strength, self.shadow_width)
+        strengths = self.shadow_strengths.clamp(0.0, 1.0)
+        return Shadow(self.canonical.bodies > 0, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
         """`state` with the learned tracker-to-world correction applied to its poses."""

@@ -43,6 +43,8 @@ class Settings:
     """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
     min_share: float = 0.005
     """Refuse images with less than this share of instrument pixels."""
+    camera_effects: str | None = None
+    """YAML file of blur, noise, smoke and the like, and the ranges they are drawn from (docs/synthesis.md)."""
     tries: int = 50
     """How often to draw a state anew when it is refused."""
 

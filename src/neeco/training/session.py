@@ -33,7 +33,7 @@ GAUSSIAN_RATES = {
     "sh_rest": 1.25e-4,
 }
 LIGHT_RATE = 3e-3
-SHADOW_RATES = {"shadow_offset": 3e-2, "shadow_strength": 2e-3, "shadow_width": 2e-5}  # mm, share, slope
+SHADOW_RATES = {"shadow_offsets": 3e-2, "shadow_strengths": 2e-3, "shadow_width": 2e-5}  # mm, share, slope
 REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
 

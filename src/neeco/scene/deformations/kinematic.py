@@ -33,7 +33,7 @@ from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
 from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
-WRIST_FRACTIONS = (0.4, 0.6, 0.8)  # of the run: the shaft has shape, and time is left to spin all of it
+LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
 SHADOW_AT = 1000  # iteration: instruments have shape
 RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is left
@@ -250,10 +250,10 @@ class Kinematic(Deformation):
         return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
 
     def between_steps(self, training: Training, before: float) -> None:
-        if self.settings.shadow and training.iteration == SHADOW_AT:
+        passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
+        if self.settings.shadow and (passed or training.iteration == SHADOW_AT):
             training.instruments.find_shadow()
-        passed = [mark for mark in WRIST_FRACTIONS if before < mark <= training.progress]
-        if WRIST_FRACTIONS[0] in passed:
+        if LOOKS_AGAIN_AT[0] in passed:
             training.instruments.place_wrists(self)
         elif passed and self.settings.wrist_again:
             training.instruments.replace_wrists(self)

@@ -1,98 +1,161 @@
-"""Where the light is that casts the instruments' shadow on the tissue: tried around the lens, then learned."""
+"""Where the lamps are that cast the instruments' shadows on the tissue: tried around the lens, then learned."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from neeco.raster import rasterize
-from neeco.raster.types import Gaussians, Rendering
+from neeco.raster.shadow import blocked
+from neeco.raster.types import Gaussians, Shadow
+from neeco.scene.scene import LAMPS
 from neeco.training.instruments.solid import SOLID, spread
 from neeco.training.session import GaussianSession
 
 DIRECTIONS = 8
-RADII = (0.04, 0.02, 0.08)  # of the tissue's distance; the first is tried all around, the others where that was best
+RADII = (0.02, 0.04, 0.08)  # of the tissue's distance
 TRIED_FRAMES = 12
 COVERED = 0.05  # of a pixel, by solid instrument: the tissue is not judged by more
 BESIDE = 7  # px, side of the square about a pixel that must be as little covered
-AGREE = 0.75  # share of the frames that a shadow must make better
-EXPLAINS = 0.01  # share of the squared error beside the instruments that it must take away
-STRONGEST = 0.9
+BRIGHT = 0.8  # of white: highlights are drawn worse than any shadow is dark
+LARGEST = 0.1  # of white: residuals count for no more
+FAINT = 0.02  # opacity
+AGREE = 0.75  # share of the frames that the lamps must make better
+EXPLAINS = 0.01  # share of the squared error beside the instruments that each lamp must take away
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """A light tried: the squared error it takes away, the share of frames it makes better, and what it is."""
+class _Fit:
+    """Lamps chosen among those tried, and how strong they are."""
 
-    taken: float
-    agree: float
-    strength: float
-    offset: Tensor  # [3] mm, camera frame
+    chosen: tuple[int, ...]
+    strengths: NDArray[np.float64]  # [L]
+    taken: float  # squared error they take away
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What `frames` frames say of `tried` lamps, as the normal equations of a fit of their strengths."""
+
+    power: NDArray[np.float64]  # [F, C, C]: what their shadows have in common
+    along: NDArray[np.float64]  # [F, C]: with what the photographs are darker than the drawings
+    total: float  # squared error
+
+    def fit(self, chosen: tuple[int, ...]) -> _Fit:
+        """The strengths, none negative, that these lamps together explain most with."""
+        power, along = self.power.sum(0)[np.ix_(chosen, chosen)], self.along.sum(0)[list(chosen)]
+        root = np.linalg.cholesky(power + 1e-6 * np.eye(len(chosen)))
+        strengths, _ = nnls(root.T, np.linalg.solve(root, along))
+        return _Fit(chosen, strengths, float(2 * strengths @ along - strengths @ power @ strengths))
+
+    def agree(self, fit: _Fit) -> float:
+        """Share of the frames that the lamps make better."""
+        index = list(fit.chosen)
+        common = np.einsum("i,fij,j->f", fit.strengths, self.power[:, index][:, :, index], fit.strengths)
+        return float((2 * self.along[:, index] @ fit.strengths > common).mean())
 
 
 @torch.no_grad()
 def find_shadow(session: GaussianSession) -> None:
-    """Set the scene's shadow to the light that best explains what the tissue and the solid part of the instruments do
-    not; leave it off where none explains enough."""
-    scene, views = session.scene, session.views
-    frames = spread(session, TRIED_FRAMES)
-    plain = [_drawn(session, index) for index in frames]
-    beside = [_beside(views.masks[index], drawing) for index, drawing in zip(frames, plain, strict=True)]
-    residuals = [
-        (drawing.color - views.target(index)) * pixels
-        for index, drawing, pixels in zip(frames, plain, beside, strict=True)
-    ]
-    total = sum(float(residual.square().sum()) for residual in residuals)
-
-    def tried(radius: float, angle: float) -> _Trial:
-        offset = scene.center.new_tensor([math.cos(angle), math.sin(angle), 0.0]) * radius * 2 * session.extent
-        scene.shadow_offset.copy_(offset)
-        scene.shadow_strength.fill_(1.0)
-        darkened = [
-            (drawing.color - _drawn(session, index).color) * pixels
-            for index, drawing, pixels in zip(frames, plain, beside, strict=True)
-        ]
-        along = [float((dark * residual).sum()) for dark, residual in zip(darkened, residuals, strict=True)]
-        power = sum(float(dark.square().sum()) for dark in darkened)
-        strength = min(STRONGEST, max(0.0, sum(along) / max(power, 1e-12)))
-        taken = 2 * strength * sum(along) - strength**2 * power
-        return _Trial(taken, sum(value > 0 for value in along) / len(along), strength, offset)
-
-    angles = [2 * math.pi * k / DIRECTIONS for k in range(DIRECTIONS)]
-    trials = [tried(RADII[0], angle) for angle in angles]
-    angle = angles[max(range(DIRECTIONS), key=lambda k: trials[k].taken)]
-    best = max([*trials, *(tried(radius, angle) for radius in RADII[1:])], key=lambda trial: trial.taken)
-    found = best.taken > EXPLAINS * total and best.agree >= AGREE
-    scene.shadow_offset.copy_(best.offset if found else torch.zeros_like(best.offset))
-    scene.shadow_strength.fill_(best.strength if found else 0.0)
-    scene.diagnostics["shadow"] = {
-        "found": found,
-        "explains": round(best.taken / max(total, 1e-12), 4),
-        "agree": round(best.agree, 2),
-        "started_from_mm": [round(float(v), 2) for v in best.offset],
-        "strength": round(best.strength, 3),
-    }
+    """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
+    shadows of the lamps found before do not; none where none explains enough."""
+    scene = session.scene
+    free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
+    offsets = _tried(2 * session.extent).to(scene.center)
+    evidence = _ask(session, offsets)
+    fit = _choose(evidence, len(free))
+    agree = evidence.agree(fit)
+    looks = scene.diagnostics.setdefault("shadow", [])
+    looks.append(
+        {
+            "iteration": session.iteration,
+            "explains": round(fit.taken / max(evidence.total, 1e-12), 4),
+            "agree": round(agree, 2),
+            "found_at_mm": [],
+        }
+    )
+    if not fit.chosen or agree < AGREE:
+        return
+    for lamp, tried, strength in zip(free, fit.chosen, fit.strengths, strict=False):
+        scene.shadow_offsets[lamp] = offsets[tried]
+        scene.shadow_strengths[lamp] = float(strength)
+        looks[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[tried]])
+    _fade(session)
 
 
-def _drawn(session: GaussianSession, index: int) -> Rendering:
-    """Frame `index` without what is faint of the instruments, with one channel: how much of a pixel is instrument.
+def _fade(session: GaussianSession) -> None:
+    """Let what is faint of the instruments be learned anew: it may have been the shadow."""
+    canonical = session.scene.canonical
+    logits = canonical.opacity_logits
+    faint = (canonical.bodies > 0) & (torch.sigmoid(logits) <= SOLID)
+    logits[faint] = logits[faint].clamp_max(math.log(FAINT / (1 - FAINT)))
+    session.adam.forget("opacity_logits")
+
+
+def _tried(distance: float) -> Tensor:
+    """Lamps [C, 3] mm around the lens, camera frame."""
+    angles = torch.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
+    around = torch.stack([angles.cos(), angles.sin(), torch.zeros(DIRECTIONS)], 1)
+    return torch.cat([radius * distance * around for radius in RADII])
+
+
+def _choose(evidence: _Evidence, most: int) -> _Fit:
+    """One lamp after the other, always the one that brings most, as long as it brings enough; at most `most`."""
+    best = _Fit((), np.zeros(0), 0.0)
+    while len(best.chosen) < most:
+        others = set(range(evidence.along.shape[1])) - set(best.chosen)
+        more = max((evidence.fit((*best.chosen, k)) for k in sorted(others)), key=lambda fit: fit.taken)
+        if more.taken - best.taken < EXPLAINS * evidence.total or not (more.strengths > 0).all():
+            break
+        best = more
+    return best
+
+
+def _ask(session: GaussianSession, offsets: Tensor) -> _Evidence:
+    """What the training frames say of lamps at `offsets` [C, 3] mm."""
+    power, along, total = [], [], 0.0
+    for index in spread(session, TRIED_FRAMES):
+        color, dark, instrument = _drawn(session, index, offsets)
+        target, mask = session.views.target(index), session.views.masks[index]
+        counts = _beside(instrument) & (torch.maximum(color, target).amax(-1) < BRIGHT)
+        if mask is not None:
+            counts &= mask
+        residual = (color - target)[counts].clamp(-LARGEST, LARGEST)  # [P, 3]
+        darkened = color[counts][:, :, None] * dark[counts][:, None, :]  # [P, 3, C]
+        total += float(residual.square().sum())
+        flat = darkened.flatten(0, 1)  # [3 P, C]
+        power.append((flat.T @ flat).double().cpu().numpy())
+        along.append((flat.T @ residual.flatten()).double().cpu().numpy())
+    return _Evidence(np.stack(power), np.stack(along), total)
+
+
+def _drawn(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Frame `index` without what is faint of the instruments: colour [H, W, 3], what of the light each lamp [H, W, C]
+    would miss there, and how much of a pixel is instrument [H, W].
 
     What is faint may be the shadow, learned as a part that moves along.
     """
     state, camera = session.corrected(index)
-    posed: Gaussians = session.scene.at(state)
-    instrument = session.scene.canonical.bodies > 0
+    scene = session.scene
+    posed: Gaussians = scene.at(state)
+    instrument = scene.canonical.bodies > 0
     kept = ~instrument | (posed.opacities > SOLID)
-    return rasterize(posed.select(kept), camera, channels=instrument[kept].float()[:, None])
-
-
-def _beside(mask: Tensor | None, drawing: Rendering) -> Tensor:
-    """[H, W, 1] 1 where the frame counts and no instrument is near."""
+    posed, instrument = posed.select(kept), instrument[kept]
+    shadow = Shadow(instrument, offsets, offsets.new_zeros(len(offsets)), scene.shadow_width)
+    missed = [blocked(posed, shadow, offset, camera, rasterize) for offset in offsets]
+    channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
+    drawing = rasterize(posed, camera, channels=channels)
     assert drawing.channels is not None
-    near = max_pool2d(drawing.channels[..., 0][None, None], BESIDE, 1, BESIDE // 2)[0, 0]
-    beside = near < COVERED
-    return (beside if mask is None else beside & mask)[..., None].float()
+    return drawing.color, drawing.channels[..., 1:], drawing.channels[..., 0]
+
+
+def _beside(instrument: Tensor) -> Tensor:
+    """[H, W] bool: where no instrument is near, of how much of a pixel is instrument."""
+    return max_pool2d(instrument[None, None], BESIDE, 1, BESIDE // 2)[0, 0] < COVERED
