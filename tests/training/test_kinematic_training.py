@@ -44,7 +44,7 @@ CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.pla
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
     monkeypatch.setattr(Kinematic, "learns_from", 12)
-    monkeypatch.setattr(kinematic, "SHADOW_AT", 10)
+    monkeypatch.setattr(kinematic, "SHADOW_AT", (10,))
     monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
     monkeypatch.setattr(module, "ROW_INTERVAL", 1)
 

@@ -35,7 +35,7 @@ from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
 
 LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
-SHADOW_AT = 1000  # iteration: instruments have shape
+SHADOW_AT = (1000, 1500)  # iterations: instruments have shape, and no shadow is learned yet as a part of them
 RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is left
 
 
@@ -251,7 +251,7 @@ class Kinematic(Deformation):
 
     def between_steps(self, training: Training, before: float) -> None:
         passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
-        if self.settings.shadow and (passed or training.iteration == SHADOW_AT):
+        if self.settings.shadow and (passed or training.iteration in SHADOW_AT):
             training.instruments.find_shadow()
         if LOOKS_AGAIN_AT[0] in passed:
             training.instruments.place_wrists(self)

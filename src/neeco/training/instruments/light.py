@@ -16,7 +16,7 @@ from neeco.raster import rasterize
 from neeco.raster.shadow import blocked
 from neeco.raster.types import Gaussians, Shadow
 from neeco.scene.scene import LAMPS
-from neeco.training.instruments.solid import SOLID, spread
+from neeco.training.instruments.solid import spread
 from neeco.training.session import GaussianSession
 
 DIRECTIONS = 8
@@ -26,9 +26,10 @@ COVERED = 0.05  # of a pixel, by solid instrument: the tissue is not judged by m
 BESIDE = 7  # px, side of the square about a pixel that must be as little covered
 BRIGHT = 0.8  # of white: highlights are drawn worse than any shadow is dark
 LARGEST = 0.1  # of white: residuals count for no more
+OPAQUE = 0.5  # opacity: of the instruments, what is less may be the shadow
 FAINT = 0.02  # opacity
-AGREE = 0.75  # share of the frames that the lamps must make better
-EXPLAINS = 0.01  # share of the squared error beside the instruments that each lamp must take away
+AGREE = 0.8  # share of the frames that the lamps must make better
+EXPLAINS = 0.005  # share of the squared error beside the instruments that each lamp must take away
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def _fade(session: GaussianSession) -> None:
     """Let what is faint of the instruments be learned anew: it may have been the shadow."""
     canonical = session.scene.canonical
     logits = canonical.opacity_logits
-    faint = (canonical.bodies > 0) & (torch.sigmoid(logits) <= SOLID)
+    faint = (canonical.bodies > 0) & (torch.sigmoid(logits) <= OPAQUE)
     logits[faint] = logits[faint].clamp_max(math.log(FAINT / (1 - FAINT)))
     session.adam.forget("opacity_logits")
 
@@ -146,7 +147,7 @@ def _drawn(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tenso
     scene = session.scene
     posed: Gaussians = scene.at(state)
     instrument = scene.canonical.bodies > 0
-    kept = ~instrument | (posed.opacities > SOLID)
+    kept = ~instrument | (posed.opacities > OPAQUE)
     posed, instrument = posed.select(kept), instrument[kept]
     shadow = Shadow(instrument, offsets, offsets.new_zeros(len(offsets)), scene.shadow_width)
     missed = [blocked(posed, shadow, offset, camera, rasterize) for offset in offsets]
