@@ -1,8 +1,8 @@
 """The shadows that what moves casts on what stands still, under lamps that sit beside the lens.
 
 The casters are drawn once more, from every lamp: how opaque they are there, blurred by the lamp's width, is how much of
-its light a Gaussian behind them misses. Only brightness changes; nothing is added to the image, and labels know nothing
-of it.
+its light a Gaussian behind them misses. Shares of light add up, stored colours do not: they go with its root (`GAMMA`).
+Only brightness changes; nothing is added to the image, and labels know nothing of it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
 RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
 TAPS = 6  # map pixels to each side of the blur's middle, which is cut off there
+GAMMA = 2.2  # of stored images, about
+DARKEST = 0.01  # of the light reaches any place
 NEAR = 1e-6
 NEAREST = 1e-3  # mm
 HALF = 0.5 / SH_C0
@@ -42,7 +44,7 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     for offset, strength in zip(shadow.offsets, shadow.strengths, strict=True):
         if float(strength.detach()) > 0:
             missing = missing + strength * blocked(gaussians, shadow, offset, camera, draw)
-    sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(0))
+    sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA))
     return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
 
 

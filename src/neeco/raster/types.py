@@ -14,7 +14,7 @@ class Shadow:
 
     casters: Tensor  # [N] bool: these cast it, all others receive it
     offsets: Tensor  # [L, 3] mm, the lamps in the camera's frame (OpenCV axes)
-    strengths: Tensor  # [L] in [0, 1]: share of the light that is missing in the deepest shadow of each
+    strengths: Tensor  # [L] in [0, 1]: share of all (linear) light that each gives, missing in its deepest shadow
     width: Tensor  # [] slope: standard deviation of a shadow's edge, as seen from the lamp
 
     def to(self, device: torch.device | str) -> Shadow:

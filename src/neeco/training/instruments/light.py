@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from neeco.raster import rasterize
-from neeco.raster.shadow import blocked
+from neeco.raster.shadow import GAMMA, blocked
 from neeco.raster.types import Gaussians, Shadow
 from neeco.scene.scene import LAMPS
 from neeco.training.instruments.solid import spread
@@ -25,6 +25,7 @@ TRIED_FRAMES = 12
 COVERED = 0.05  # of a pixel, by solid instrument: the tissue is not judged by more
 BESIDE = 7  # px, side of the square about a pixel that must be as little covered
 BRIGHT = 0.8  # of white: highlights are drawn worse than any shadow is dark
+DIMMEST = 0.05  # of white: what is drawn darker is taken to be so
 LARGEST = 0.1  # of white: residuals count for no more
 OPAQUE = 0.5  # opacity: of the instruments, what is less may be the shadow
 FAINT = 0.02  # opacity
@@ -128,8 +129,11 @@ def _ask(session: GaussianSession, offsets: Tensor) -> _Evidence:
         counts = _beside(instrument) & (torch.maximum(color, target).amax(-1) < BRIGHT)
         if mask is not None:
             counts &= mask
-        residual = (color - target)[counts].clamp(-LARGEST, LARGEST)  # [P, 3]
-        darkened = color[counts][:, :, None] * dark[counts][:, None, :]  # [P, 3, C]
+        color, target = color[counts].clamp(DIMMEST, 1), target[counts]  # [P, 3]
+        # in light, where lamps add up, but counted as it is stored: divided by the slope of the stored curve
+        residual = (color - target**GAMMA * color ** (1 - GAMMA)) / GAMMA
+        residual = residual.clamp(-LARGEST, LARGEST)
+        darkened = (color / GAMMA)[:, :, None] * dark[counts][:, None, :]  # [P, 3, C]
         total += float(residual.square().sum())
         flat = darkened.flatten(0, 1)  # [3 P, C]
         power.append((flat.T @ flat).double().cpu().numpy())
