@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import Format, Settings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Draw a labelled data set of states that nobody recorded."""
+    """Draw a labelled data set of states that nobody recorded: of one run, or of one run's tissue under the instruments
+    of others (--tissue, --instruments)."""
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[Path | None, tyro.conf.arg(metavar="RUN"), tyro.conf.Positional] = None
     """Run folder that `neeco train` wrote."""
+    tissue: Path | None = None
+    """Instead of RUN: the run whose tissue and light are drawn."""
+    instruments: tuple[Path, ...] = ()
+    """With --tissue: the runs whose instruments stand before it."""
     output: Path
     """Data set folder to write; must be empty or absent unless --resume."""
     settings: tyro.conf.OmitArgPrefixes[Settings]
@@ -34,15 +41,23 @@ def run(arguments: Arguments) -> int:
     from neeco.cli._bars import counting
     from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
-    from neeco.training.run import open_run
+    from neeco.training.run import load_run, open_run
 
     settings = arguments.settings
     settings.check()
-    opened = open_run(arguments.run, device_of(arguments.device))
-    with opened as trained, counting("synthesize", settings.count) as advance:
+    drawn, casts = _runs(arguments)
+    device = device_of(arguments.device)
+    with open_run(drawn, device) as trained, counting("synthesize", settings.count) as advance:
         try:
             summary = synthesize(
-                trained, arguments.output, settings, arguments.formats, arguments.resume, advance, arguments.workers
+                trained,
+                arguments.output,
+                settings,
+                arguments.formats,
+                arguments.resume,
+                on_progress=advance,
+                workers=arguments.workers,
+                casts=[load_run(cast, device) for cast in casts],
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt("what was drawn is kept; run the same command again with --resume") from None
@@ -52,3 +67,15 @@ def run(arguments: Arguments) -> int:
     if summary.skipped:
         print(f"skipped given states {summary.skipped}: refused from every view tried")
     return 0
+
+
+def _runs(arguments: Arguments) -> tuple[Path, tuple[Path, ...]]:
+    """The run that is drawn, and those whose instruments are drawn over its tissue."""
+    if (arguments.run is None) == (arguments.tissue is None):
+        raise NeecoError("synthesize: give a RUN, or --tissue RUN with --instruments RUN ...; one of the two")
+    if (arguments.tissue is None) != (not arguments.instruments):
+        raise NeecoError("--instruments: goes with --tissue RUN, and that with it; give both or neither")
+    if arguments.run is not None:
+        return arguments.run, ()
+    assert arguments.tissue is not None
+    return arguments.tissue, arguments.instruments

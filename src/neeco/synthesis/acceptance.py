@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,9 @@ WORKING_END = ("hinge", "tip_left", "tip_right")
 BURIED_SHARE = 0.05
 TOLERANCE_MM = (2.0, 5.0)
 TOLERANCE_STATES = 12
-LEAVES_IMAGE, ENTERS_TISSUE = "leaves the image", "enters the tissue"
+APART_MM = 6.0  # surfaces of instruments seen at one place, or their insides meet: about a shaft's thickness
+CROSSING = 5  # px nearer than that: instruments are taken to be in each other
+LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,13 @@ class Acceptance:
 
     min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
     lie behind the tissue surface, as this camera sees it (see `buried_depth`); None asks nothing. A single view cannot
-    tell "inside the tissue" from "behind a fold of it": both are refused.
+    tell "inside the tissue" from "behind a fold of it": both are refused. casts: instruments that were recorded
+    together, which alone may touch; empty: all were.
     """
 
     min_share: float
     tolerance_mm: float | None
+    casts: tuple[frozenset[str], ...] = ()
 
     def why_refused(self, scene: Scene, drawing: LayeredDrawing) -> str | None:
         """The reason, or None when the drawing is worth keeping."""
@@ -46,7 +51,20 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
+        if any(_crossing(drawing, a, b) for a, b in combinations(self.casts, 2)):
+            return ENTERS_ANOTHER
         return None
+
+
+def _crossing(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[str]) -> bool:
+    """Whether any of `some` instruments comes so near any of the `others` that they must be in each other, as far as
+    this camera sees it."""
+    for a, b in product(sorted(some & drawing.alone.keys()), sorted(others & drawing.alone.keys())):
+        first, second = drawing.alone[a], drawing.alone[b]
+        both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
+        if int((np.abs(first.depth - second.depth)[both] < APART_MM).sum()) >= CROSSING:
+            return True
+    return False
 
 
 def buried_depth(scene: Scene, drawing: LayeredDrawing) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,10 +12,11 @@ from neeco.errors import NeecoError
 from neeco.files import new_folder, write_json
 from neeco.raster.threads import threads
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE
+from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE
 from neeco.synthesis.effects import read_effects
 from neeco.synthesis.indexes import (
     INFO,
+    SCENE_FILE,
     check_output,
     counted,
     description,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 REMEDIES = {  # where every given state was refused
     LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
+    ENTERS_ANOTHER: "mix fewer instruments",
     ENTERS_TISSUE: "give a larger --tissue-tolerance-mm, or --no-tissue-check",
 }
 
@@ -61,8 +63,10 @@ def synthesize(
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
     workers: int = 1,
+    casts: Sequence[Run] = (),
 ) -> Synthesized:
-    """Write a labelled data set of `settings.count` images of the run's scene to `output`.
+    """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `casts` of its tissue
+    under the instruments of those runs.
 
     Image `index` depends on (scene, settings, index) alone, however many `workers` (processes) share the work.
     Interrupted (Ctrl-C) or failing, it keeps and indexes what is done, for `resume`; where no image was drawn at all,
@@ -74,22 +78,24 @@ def synthesize(
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
     output = Path(output)
-    scene = gaussian_scene(run.scene, VERB)
+    scenes = [gaussian_scene(given.scene, VERB) for given in (run, *casts)]
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     identity = settings.identity() | {
         "states_sha256": states_fingerprint(settings.states),
         "similar_views": SIMILAR,
         "camera_effects": effects,
     }
-    info = description(run, identity)
+    info = description(run, identity, casts)
     begun = check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():
         raise NeecoError(
             f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
         )
-    maker = Maker.of(scene, settings)
+    maker = Maker.of(scenes[0], settings, scenes[1:])
     info["tissue_tolerance_mm"] = maker.acceptance.tolerance_mm
-    write = partial(write_indexes, output, info=info, scene=scene, labeller=maker.labeller, formats=formats)
+    if maker.gains:
+        info["color_gains"] = [[round(value, 4) for value in gain] for gain in maker.gains]
+    write = partial(write_indexes, output, info=info, scene=maker.scene, labeller=maker.labeller, formats=formats)
     with new_folder(output):
         if begun:
             remove_leftovers(output)
@@ -99,7 +105,8 @@ def synthesize(
             made, missing = 0, [k for k in range(settings.count) if k not in records]
             if records:
                 on_progress(len(records))
-            source = Source(Path(run.path) / "scene.safetensors", settings, str(scene.center.device))
+            files = [Path(given.path) / SCENE_FILE for given in (run, *casts)]
+            source = Source(files[0], settings, str(scenes[0].center.device), tuple(files[1:]))
             for record in _made(maker, source, output, missing, min(workers, len(missing))):
                 records[record["index"]] = record
                 made += not record.get("skipped")

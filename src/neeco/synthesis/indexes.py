@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,25 +41,33 @@ if TYPE_CHECKING:
 
 SCHEMA = "neeco-dataset/1"
 INFO = "dataset.json"
+SCENE_FILE = "scene.safetensors"
 
 
-def description(run: Run, settings: dict[str, Any]) -> dict[str, Any]:
-    """How a data set of the run's scene is made: what dataset.json begins with. `settings` must stay the same for it to
-    be continued."""
-    scene_file = Path(run.path) / "scene.safetensors"
-    try:
-        digest = hashlib.sha256(scene_file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
-    return {
+def description(run: Run, settings: dict[str, Any], casts: Sequence[Run] = ()) -> dict[str, Any]:
+    """How a data set of the run's scene, or of its tissue under the instruments of `casts`, is made: what dataset.json
+    begins with. `settings` must stay the same for it to be continued."""
+    info = {
         "schema": SCHEMA,
         "version": neeco.__version__,
-        "scene_sha256": digest,
+        "scene_sha256": _digest(run),
         "settings": settings,
         "soft": {"share_per_count": SHARE_PER_COUNT},
         "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
         "scene": str(run.path),
     }
+    if casts:
+        info["settings"] = settings | {"instruments_sha256": [_digest(cast) for cast in casts]}
+        info["instruments"] = [str(cast.path) for cast in casts]
+    return info
+
+
+def _digest(run: Run) -> str:
+    scene_file = Path(run.path) / SCENE_FILE
+    try:
+        return hashlib.sha256(scene_file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from neeco.labels.threshold import DeltaThresholds, ThresholdLabels
 from neeco.synthesis.acceptance import Acceptance, find_tolerance
 from neeco.synthesis.effects import CameraEffects, read_effects
 from neeco.synthesis.indexes import counted
+from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.motion import RecordedMotion, exposure
 from neeco.synthesis.optics import image_circle, mean_light, through_camera
 from neeco.synthesis.samplers import Sampler, make_sampler
@@ -37,17 +39,26 @@ class Maker:
 
     scene: Scene
     labeller: Labeller
-    sampler: Sampler
+    sampler: Sampler | MixedSampler
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
     motion: RecordedMotion | None = None  # known where effects open a shutter
+    gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each cast were multiplied
 
     @classmethod
-    def of(cls, scene: Scene, settings: Settings) -> Maker:
-        """What `settings` ask for. Raises NeecoError where the scene cannot give it."""
+    def of(cls, scene: Scene, settings: Settings, casts: Sequence[Scene] = ()) -> Maker:
+        """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `casts`. Raises
+        NeecoError where the scenes cannot give it."""
+        sampler: Sampler | MixedSampler
+        together: tuple[frozenset[str], ...] = ()
+        mixture = Mixture.of(scene, casts) if casts else None
+        if mixture is None:
+            sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
+        else:
+            scene, sampler = mixture.scene, mixture.sampler(settings)
+            together = tuple(frozenset(instrument.name for instrument in cast.instruments) for cast in casts)
         labeller = make_labeller(scene, settings)
-        sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
         effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects))
         motion = None
         if effects is not None and "shutter_s" in effects.ranges:
@@ -57,7 +68,9 @@ class Maker:
                     f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to tell "
                     "how anything moved; leave it out"
                 )
-        return cls(scene, labeller, sampler, make_acceptance(scene, labeller, settings), settings, effects, motion)
+        acceptance = replace(make_acceptance(scene, labeller, settings), casts=together)
+        gains = () if mixture is None else mixture.gains
+        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
 
     def make(self, output: Path, index: int) -> Record:
         """Draw, judge and write image `index`; returns its record.

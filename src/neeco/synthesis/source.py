@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -16,26 +15,25 @@ from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.making import Maker
 from neeco.synthesis.settings import Settings
 
-if TYPE_CHECKING:
-    from neeco.scene import Scene
-
 VERB = "synthesize"
 
 
 @dataclass(frozen=True)
 class Source:
-    """A scene file and how to draw it; small enough to be sent."""
+    """Scene files and how to draw them; small enough to be sent. `casts`: those whose instruments are drawn over the
+    tissue of `scene`, instead of its own."""
 
     scene: Path
     settings: Settings
     device: str = "cpu"
+    casts: tuple[Path, ...] = ()
 
     @contextmanager
     def opened(self, threads: int) -> Iterator[Maker]:
         """The maker of its images, in a process of its own that may use so many threads."""
         set_threads(threads)
         keep_freed_memory()
-        learned = load_scene(self.scene).to(torch.device(self.device))
-        scene: Scene = gaussian_scene(learned, VERB)
+        device = torch.device(self.device)
+        scene, *casts = (gaussian_scene(load_scene(path).to(device), VERB) for path in (self.scene, *self.casts))
         with scene.torch_threads():
-            yield Maker.of(scene, self.settings)
+            yield Maker.of(scene, self.settings, casts)

@@ -1,0 +1,229 @@
+"""The tissue of one run under the instruments of others: one scene of them all, and where the instruments stand in it.
+
+An instrument stands before the camera as in its own recording, its working end as far before the tissue as it was
+there; lengths stay what they are (mm). The light is that of the tissue's capture.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch import Tensor, nn
+
+from neeco.capture.model import InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.labels.drawing import surface_depth, to_numpy
+from neeco.raster import rasterize
+from neeco.raster.pinhole import project
+from neeco.raster.sh import SH_C0
+from neeco.raster.types import Camera
+from neeco.scene.canonical import CanonicalGaussians, join_bodies
+from neeco.scene.deformations.kinematic import Kinematic
+from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.recorded import Recorded
+from neeco.scene.rim import MADE_UP
+from neeco.scene.scene import Scene
+from neeco.synthesis.acceptance import working_ends
+from neeco.synthesis.samplers import make_sampler
+
+if TYPE_CHECKING:
+    from neeco.synthesis.settings import Settings
+
+Draw = Callable[[int, Generator], tuple[State, Camera]]
+
+COARSE = 0.25  # of the image's size, at which the depth of tissue is looked up
+NEAREST = 0.5  # of its own distance from the lens: an instrument is brought no nearer
+MOMENTS = 24  # that the mixed scene remembers as if they had been recorded
+GAINS = (0.6, 1.6)  # how far colours are changed at most: beyond that, shafts are of other make
+SOLID = 0.5  # opacity of Gaussians that tell a shaft's colour
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A scene of one run's tissue and other runs' instruments, with a way to place them."""
+
+    scene: Scene
+    tissue: Scene
+    casts: tuple[Scene, ...]  # whose instruments they are
+    gains: tuple[tuple[float, float, float], ...]  # by which each cast's colours were multiplied
+
+    @classmethod
+    def of(cls, tissue: Scene, casts: Sequence[Scene]) -> Mixture:
+        """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
+        for scene in (tissue, *casts):
+            if not isinstance(scene.deformation, Kinematic):
+                raise NeecoError(
+                    f"--instruments: method {scene.method} does not keep tissue and instruments apart; "
+                    "mix runs of method kinematic"
+                )
+        names = [instrument.name for scene in casts for instrument in scene.instruments]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise NeecoError(f"--instruments: {twice[0]!r} is in two of the runs; mix runs whose instruments differ")
+        if not names:
+            raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
+        gains = tuple(_gain(tissue, scene) for scene in casts)
+        mixed = _composed(tissue, casts, gains)
+        mixture = cls(mixed, tissue, tuple(casts), gains)
+        mixed.recorded = mixture._remembered()
+        return mixture
+
+    def sampler(self, settings: Settings) -> MixedSampler:
+        """Draws where the instruments stand, each as its own run's sampler does."""
+        if settings.states not in ("inside", "beyond"):
+            raise NeecoError(
+                f"--states: {settings.states}: states of one recording; with --instruments use inside or beyond"
+            )
+        if settings.views == "orbit":
+            raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
+        draws = [make_sampler(s, settings.states, settings.margin, "recorded", settings.count) for s in self.casts]
+        return MixedSampler(self, tuple(draws))
+
+    def place(self, cast: Scene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
+        """The instruments of `cast`, in `state` before `seen_by`, as they stand before `camera` of the tissue's run.
+
+        They are shifted along the line of sight until they are as far before this tissue as before their own.
+        """
+        registered = cast.registered(state)
+        camera_from_world = np.linalg.inv(to_numpy(seen_by.world_from_camera))
+        ends = [point for points in working_ends(cast, state).values() for point in points]
+        ends = ends or [to_numpy(given.pose)[:3, 3] for given in registered.instruments.values()]
+        end = camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]  # [3] mm, camera frame
+        shift = np.eye(4)
+        here, there = tissue_depth(self.tissue, camera, end), tissue_depth(cast, seen_by, end)
+        if here > 0 and there > 0 and end[2] > 0:
+            depth = max(end[2] + here - there, NEAREST * end[2])
+            shift[:3, 3] = (depth / end[2] - 1) * end
+        carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
+        return {
+            name: InstrumentState(torch.from_numpy(carry @ to_numpy(given.pose)), given.joints)
+            for name, given in registered.instruments.items()
+        }
+
+    def _remembered(self) -> Recorded:
+        """Moments spread over the tissue's cameras, the casts' recorded states carried over."""
+        cameras = self.tissue.recorded.cameras
+        if not cameras or any(not scene.recorded.states for scene in self.casts):
+            raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
+        count = min(MOMENTS, len(cameras))
+        chosen, states = [], []
+        for k in range(count):
+            camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
+            placed: dict[str, InstrumentState] = {}
+            for scene in self.casts:
+                own = scene.recorded
+                moment = round(k * (len(own.states) - 1) / max(1, count - 1))
+                placed |= self.place(scene, own.states[moment], own.cameras[moment], camera)
+            chosen.append(camera)
+            states.append(State(placed, 0.0))
+        names = tuple(f"{k:06d}" for k in range(count))
+        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen))
+
+
+@dataclass(frozen=True)
+class MixedSampler:
+    """Draws (state, camera): a recorded camera of the tissue's run, and before it what every cast's sampler draws."""
+
+    mixture: Mixture
+    draws: tuple[Draw, ...]
+    prescribed: bool = False
+
+    def fixed(self, index: int) -> bool:
+        """Never: another draw is another image."""
+        return False
+
+    def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
+        """The next (state, camera) for image `index`."""
+        cameras = self.mixture.tissue.recorded.cameras
+        camera = cameras[int(rng.integers(len(cameras)))]
+        placed: dict[str, InstrumentState] = {}
+        for scene, draw in zip(self.mixture.casts, self.draws, strict=True):
+            placed |= self.mixture.place(scene, *draw(index, rng), camera)
+        return State(placed, 0.0), camera
+
+
+@torch.no_grad()
+def tissue_depth(scene: Scene, camera: Camera, point: np.ndarray) -> float:
+    """Depth mm of the scene's tissue on the line of sight through `point` [3] mm of the camera's frame; 0 for none.
+
+    Beyond the image's border, that of the nearest pixel.
+    """
+    width, height = (max(1, round(COARSE * size)) for size in (camera.width, camera.height))
+    shrink = COARSE * camera.fx, COARSE * camera.fy, COARSE * camera.cx, COARSE * camera.cy
+    coarse = Camera(camera.world_from_camera, *shrink, width, height, camera.near)
+    gaussians = scene.at(scene.recorded.states[0])
+    tissue = rasterize(gaussians.select(scene.canonical.bodies == 0), scene.camera(coarse))
+    x, y = project(point, *shrink, nearest=camera.near)
+    row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, height), (x, width)))
+    return float(surface_depth(tissue)[row, column])
+
+
+def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:
+    """One scene of the tissue of `tissue` and the instruments of `casts`."""
+    instruments = tuple(instrument for scene in casts for instrument in scene.instruments)
+    deformation = Kinematic(instruments, copy.deepcopy(casts[0].settings))
+    deformation.hinges = nn.ModuleList(copy.deepcopy(hinges) for s in casts for hinges in _kinematic(s).hinges)
+    columns = deformation.logit_count
+    bodies = [_body(tissue, 0, columns)]
+    for scene, gain in zip(casts, gains, strict=True):
+        bodies += [_brightened(_body(scene, k + 1, columns), gain) for k in range(len(scene.instruments))]
+    mixed = Scene(
+        tissue.method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
+    ).to(tissue.center.device)
+    with torch.no_grad():
+        own_light = tissue.falloff[1] if len(tissue.canonical.counts) > 1 else tissue.falloff[0]
+        mixed.falloff.copy_(torch.stack([tissue.falloff[0], own_light]))
+        for name in ("vignette", "shadow_offsets", "shadow_strengths", "shadow_width"):
+            getattr(mixed, name).copy_(getattr(tissue, name))
+    mixed.sh_degree = max(scene.sh_degree for scene in (tissue, *casts))
+    mixed.background = tissue.background
+    return mixed.requires_grad_(False)
+
+
+def _kinematic(scene: Scene) -> Kinematic:
+    assert isinstance(scene.deformation, Kinematic)
+    return scene.deformation
+
+
+def _body(scene: Scene, index: int, columns: int) -> CanonicalGaussians:
+    """One body alone, with as many part logits as the mixed scene has, and what of the tissue is made up."""
+    canonical, rows = scene.canonical, scene.canonical.body(index)
+    logits = canonical.extras[PART_LOGITS][rows]
+    made_up = scene.made_up[rows]
+    padded = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
+    alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (made_up.shape[0],))
+    return alone.with_extras(**{PART_LOGITS: padded, MADE_UP: made_up})
+
+
+def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:
+    """The same Gaussians, their colours multiplied."""
+    factor = body.sh_dc.new_tensor(gain)
+    dc = body.sh_dc * factor + (factor - 1) * (0.5 / SH_C0)
+    return dataclasses.replace(body, sh_dc=dc, sh_rest=body.sh_rest * factor)
+
+
+def _gain(tissue: Scene, cast: Scene) -> tuple[float, float, float]:
+    """By what the colours of `cast` are multiplied to look as under the light of `tissue`'s capture, going by the
+    shafts: grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the same
+    run."""
+    if tissue is cast or not tissue.instruments:
+        return 1.0, 1.0, 1.0
+    ratio = _shaft_color(tissue) / _shaft_color(cast).clamp_min(1e-3)
+    red, green, blue = (float(value) for value in ratio.clamp(*GAINS))
+    return red, green, blue
+
+
+def _shaft_color(scene: Scene) -> Tensor:
+    """[3] the mean colour, at 100 mm, of what is solid of the instruments' shafts."""
+    labels = scene.label_channels()
+    shaft = [k for k, (_, part) in enumerate(scene.label_names) if part in ("shaft", "instrument")]
+    weight = labels[:, shaft].sum(1) * (torch.sigmoid(scene.canonical.opacity_logits) > SOLID)
+    color = (scene.canonical.sh_dc[:, 0] * SH_C0 + 0.5).clamp(0, 1)
+    return (weight[:, None] * color).sum(0) / weight.sum().clamp_min(1e-6)

@@ -1,0 +1,103 @@
+"""Several processes make the bytes that one makes; one that is killed costs only what it was at."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from ball_world import ball_scene, run_of
+
+from neeco.errors import NeecoError
+from neeco.raster.threads import torch_threads
+from neeco.synthesis import workers
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.settings import Settings
+
+SETTINGS = Settings(count=10, seed=1, tissue_tolerance_mm=2.0)
+
+
+@pytest.fixture(scope="module")
+def ball_run(tmp_path_factory: pytest.TempPathFactory):
+    return run_of(ball_scene("ball", [(-8, 0, 55), (4, 2, 60), (9, 4, 58)]), tmp_path_factory.mktemp("runs") / "ball")
+
+
+@pytest.fixture(scope="module")
+def alone(ball_run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("alone") / "dataset"
+    with torch_threads(1):
+        synthesize(ball_run, output, SETTINGS)
+    return output
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
+    hired = []
+    real = workers._Crew.hire
+
+    def hire(crew) -> None:
+        real(crew)
+        hired.append(crew.members[-1])
+
+    def kill_the_first(done: int) -> None:
+        if done == 2:
+            os.kill(hired[0].process.pid, signal.SIGKILL)
+
+    monkeypatch.setattr(workers._Crew, "hire", hire)
+    with torch_threads(1):
+        made = synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=kill_the_first, workers=2)
+    assert len(hired) == 3
+    assert made.images == 10
+    assert contents(tmp_path / "set") == contents(alone)
+
+
+def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
+    hired = []
+    real = workers._Crew.hire
+
+    def hire(crew) -> None:
+        real(crew)
+        hired.append(crew.members[-1].process)
+
+    def interrupt(done: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(workers._Crew, "hire", hire)
+    with torch_threads(1), pytest.raises(KeyboardInterrupt):
+        synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=interrupt, workers=2)
+    assert not any(process.is_alive() for process in hired)
+    with torch_threads(1):
+        resumed = synthesize(ball_run, tmp_path / "set", SETTINGS, resume=True, workers=2)
+    assert resumed.made_now <= 7
+    assert contents(tmp_path / "set") == contents(alone)
+
+
+def test_what_a_worker_meets_is_told_in_a_line(ball_run, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, min_share=0.9, tries=2)
+    with torch_threads(1), pytest.raises(NeecoError, match=r"image \d: no acceptable state in 2 tries") as error:
+        synthesize(ball_run, tmp_path / "set", settings, workers=2)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "set").exists()
+
+
+def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -> None:
+    real = workers._Crew.hire
+
+    def hire(crew) -> None:
+        real(crew)
+        os.kill(crew.members[-1].process.pid, signal.SIGKILL)
+
+    monkeypatch.setattr(workers._Crew, "hire", hire)
+    with pytest.raises(NeecoError, match=r"--workers: 3 processes died over image 0 \(exit status -9\)"):
+        synthesize(ball_run, tmp_path / "set", replace(SETTINGS, count=2), workers=2)
+
+
+def test_no_worker_is_none_at_all(ball_run, tmp_path: Path) -> None:
+    with pytest.raises(NeecoError, match="--workers: 0 is none at all"):
+        synthesize(ball_run, tmp_path / "set", SETTINGS, workers=0)
