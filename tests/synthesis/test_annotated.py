@@ -75,7 +75,7 @@ def made(recorded: RecordedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def layers(scene: Scene, state: State) -> LayeredDrawing:
-    return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01)
+    return draw_layers(scene, CompositedLabels(scene), state, CAMERA, 0.01, tissue_image=True)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ Two labellers say which pixel is which: composited.py and threshold.py. Whatever
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -52,7 +52,7 @@ class LayeredDrawing(Drawing):
     camera: Camera
     depth: np.ndarray
     tissue_depth: np.ndarray  # of the tissue drawn alone
-    tissue_image: Tensor  # [H, W, 3] in [0, 1], the same
+    tissue_image: Tensor | None  # [H, W, 3] in [0, 1], the same, where it was asked for
     alone: dict[str, Alone]  # by instrument
     made_up: float  # share of the image that is tissue which no training frame saw
 
@@ -85,8 +85,11 @@ def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
 
 
 @torch.no_grad()
-def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, speckle: float) -> LayeredDrawing:
-    """Draw `state` as `camera` sees it, labelled by `labeller`, and tissue and instruments alone.
+def draw_layers(
+    scene: Scene, labeller: Labeller, state: State, camera: Camera, speckle: float, tissue_image: bool = False
+) -> LayeredDrawing:
+    """Draw `state` as `camera` sees it, labelled by `labeller`, and tissue and instruments alone; of these the depth,
+    and with `tissue_image` what the tissue looks like.
 
     Pieces of an instrument smaller than `speckle` of its largest are not labelled.
     """
@@ -95,13 +98,15 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
     owners = labeller.owners(state, gaussians)
     rendering, parts, share = labeller.draw(gaussians, learned_camera, owners)
     parts, share = _without_speckle(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, speckle)
+    bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)  # colour takes time, and depth knows none
     alone = {}
     for k, name in enumerate(instruments_of(labeller.names)):
         if name in state.instruments:
-            single = rasterize(gaussians.select(owners == k), learned_camera)
+            single = rasterize(bare.select(owners == k), learned_camera)
             alone[name] = Alone((single.alpha > threshold_of(scene)).cpu().numpy(), surface_depth(single))
     behind = owners < 0
-    tissue = rasterize(gaussians.select(behind), learned_camera, channels=scene.made_up[behind][:, None])
+    looked_at = gaussians if tissue_image else bare
+    tissue = rasterize(looked_at.select(behind), learned_camera, channels=scene.made_up[behind][:, None])
     assert tissue.channels is not None
     made_up = (tissue.channels[..., 0].cpu() * (1 - share)).mean()
     return LayeredDrawing(
@@ -112,7 +117,7 @@ def draw_layers(scene: Scene, labeller: Labeller, state: State, camera: Camera, 
         camera=camera,
         depth=surface_depth(rendering),
         tissue_depth=surface_depth(tissue),
-        tissue_image=tissue.color.clamp(0, 1).cpu(),
+        tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
         alone=alone,
         made_up=round(float(made_up), 4),
     )

@@ -37,9 +37,11 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     Gradients reach the lamps' offsets, strengths and width, and the colours; the casters' shapes are taken as they are.
     """
     light = gaussians.headlight
-    if light is None or light.shadow is None or not bool(light.shadow.casters.any()):
+    if light is None or light.shadow is None:
         return gaussians
     shadow = light.shadow
+    if bool(shadow.casters.all()) or not bool(shadow.casters.any()):  # nothing to fall on, or nothing that falls
+        return gaussians
     missing = torch.zeros_like(gaussians.opacities)
     for offset, strength in zip(shadow.offsets, shadow.strengths, strict=True):
         if float(strength.detach()) > 0:

@@ -144,7 +144,7 @@ def fitted(
     """The poses of `frame` fitted to its photograph [H, W, 3], and what the scene draws there; `start`: a neighbour's
     increments."""
     fit = fit_frame(scene, frame, photograph, start, AlignConfig(steps=STEPS))
-    return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.speckle)
+    return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.speckle, tissue_image=True)
 
 
 def usual_of(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:

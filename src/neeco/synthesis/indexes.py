@@ -23,6 +23,7 @@ from neeco.labels.edges import REACH
 from neeco.labels.threshold import ThresholdLabels
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.settings import Format
+from neeco.synthesis.writers.bop import write_bop
 from neeco.synthesis.writers.coco import write_coco
 from neeco.synthesis.writers.folder import (
     DEPTH_MM_PER_COUNT,
@@ -33,6 +34,8 @@ from neeco.synthesis.writers.folder import (
     load_record,
     write_states,
 )
+from neeco.synthesis.writers.imagefolder import write_imagefolder
+from neeco.synthesis.writers.webdataset import write_webdataset
 from neeco.synthesis.writers.yolo import write_yolo
 
 if TYPE_CHECKING:
@@ -134,6 +137,12 @@ def write_indexes(
         write_coco(output, kept, instruments, keypoints)
     if "yolo" in formats:
         write_yolo(output, kept, instruments, keypoints)
+    if "webdataset" in formats:
+        write_webdataset(output, kept)
+    if "bop" in formats:
+        write_bop(output, kept, labeller.names)
+    if "imagefolder" in formats:
+        write_imagefolder(output, kept, instruments)
     if kept:
         write_preview(output, kept, labeller.names)
     thresholds = labeller.thresholds if isinstance(labeller, ThresholdLabels) else None

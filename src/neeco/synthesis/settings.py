@@ -8,7 +8,7 @@ from typing import Any, Literal
 from neeco.errors import NeecoError
 
 LabelWay = Literal["composited", "threshold"]
-Format = Literal["coco", "yolo"]
+Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
 Views = Literal["recorded", "perturbed", "orbit"]
 PATH_PREFIX = "path:"
 

@@ -85,6 +85,7 @@ def _errors(drawing: LayeredDrawing, photograph: Tensor, mask: Tensor | None) ->
     label = drawing.parts.numpy() > 0
     away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
     near = ~label & (away <= BESIDE * float(np.hypot(*label.shape)))
+    assert drawing.tissue_image is not None
     drawn, tissue = (
         uniform_filter((image - photograph).abs().mean(2).numpy(), SMOOTH)
         for image in (drawing.image, drawing.tissue_image)

@@ -5,7 +5,9 @@ A record says everything about its image and is written last, so an image withou
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -15,9 +17,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from neeco.capture.images import write_image, write_labels
+from neeco.capture.images import QUICK, write_image, write_labels
 from neeco.capture.statefile import camera_to_json, state_to_json
-from neeco.files import write_atomically, write_json, write_text
+from neeco.files import write_atomically, write_text
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 
@@ -27,7 +29,8 @@ DEPTH_MM_PER_COUNT = 0.05
 SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
-PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth")  # folders with a PNG of every image
+PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
+MOST_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
 FOLDERS = (*PIXELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation
 
@@ -59,6 +62,7 @@ def write_sample(
     write_labels(root / "ignore" / name, drawing.ignored.to(torch.uint8) * IGNORED)
     write_labels(root / "parts" / name, drawing.parts)
     write_depth(root / "depth" / name, drawing.depth)
+    write_labels(root / "silhouettes" / name, silhouettes(drawing))
     camera = drawing.camera
     record = {
         "index": index,
@@ -75,8 +79,16 @@ def write_sample(
         "refused": dict(sorted(refused.items())),
         "files": {file: (root / file).stat().st_size for file in _files_of(index)},
     }
-    write_json(record_path(root, index), record)
+    _write_record(root, record)
     return record
+
+
+def silhouettes(drawing: LayeredDrawing) -> torch.Tensor:
+    """uint8 [H, W]: bit k is set where instrument k of the labels would be seen if nothing else were there."""
+    bits = np.zeros(drawing.depth.shape, np.uint8)
+    for k, alone in enumerate(list(drawing.alone.values())[:MOST_INSTRUMENTS]):
+        bits |= alone.mask.astype(np.uint8) << k
+    return torch.from_numpy(bits)
 
 
 def write_skipped(
@@ -84,8 +96,12 @@ def write_skipped(
 ) -> Record:
     """Record that `index` has no image, and why; `facts` are added."""
     record: Record = {"index": index, "skipped": True, **facts, "refused": dict(sorted(refused.items())), "files": {}}
-    write_json(record_path(root, index), record)
+    _write_record(root, record)
     return record
+
+
+def _write_record(root: Path, record: Record) -> None:
+    write_text(record_path(root, record["index"]), json.dumps(record, allow_nan=False))
 
 
 def record_path(root: Path, index: int) -> Path:
@@ -107,6 +123,24 @@ def load_record(root: Path, index: int) -> Record | None:
     return record if sizes == record.get("files") and record.get("index") == index else None
 
 
+def link(source: Path, target: Path) -> None:
+    """Make `target` the same file as `source`: a hard link, or a copy where the file system has none. Raises
+    NeecoError."""
+
+    def copy(temporary: Path) -> None:
+        temporary.write_bytes(source.read_bytes())
+
+    with contextlib.suppress(FileNotFoundError):
+        if os.path.samefile(source, target):
+            return
+        target.unlink()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.link(source, target)
+    except OSError:
+        write_atomically(target, copy)
+
+
 def _files_of(index: int) -> list[str]:
     return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
 
@@ -122,7 +156,8 @@ def remove_leftovers(root: Path) -> None:
 def write_depth(path: Path, depth: np.ndarray) -> None:
     """Write depth [H, W] mm as a 16-bit grey PNG of 0.05 mm per count, 0 = none; beyond 3276 mm it saturates."""
     counts = np.clip(np.round(depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16)
-    write_atomically(path, lambda temporary: Image.fromarray(counts).save(temporary, format="PNG"))
+    picture = Image.fromarray(counts)
+    write_atomically(path, lambda temporary: picture.save(temporary, format="PNG", compress_level=QUICK))
 
 
 def write_states(root: Path, records: list[Record]) -> None:

@@ -10,8 +10,6 @@ no hard links), never symbolic ones.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neeco.files import write_atomically, write_text
+from neeco.files import write_text
 from neeco.labels.contours import joined_polygon
-from neeco.synthesis.writers.folder import Record, stem
+from neeco.synthesis.writers.folder import Record, link, stem
 
 FOLDER = "yolo"
 Row = Callable[[dict[str, Any], np.ndarray], list[float]]  # (label, image size [2]) -> numbers after the class
@@ -82,7 +80,7 @@ def _write_variant(
             if label["area"] > 0
         ]
         write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
-        _link(root / record["image"], folder / "images" / split / f"{name}.png")
+        link(root / record["image"], folder / "images" / split / f"{name}.png")
     has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {
@@ -92,20 +90,3 @@ def _write_variant(
         **extra,
     }
     write_text(folder / "data.yaml", yaml.safe_dump(data, sort_keys=False))
-
-
-def _link(source: Path, target: Path) -> None:
-    """Make `target` the same file as `source`, or a copy of it. Raises NeecoError."""
-
-    def copy(temporary: Path) -> None:
-        temporary.write_bytes(source.read_bytes())
-
-    with contextlib.suppress(FileNotFoundError):
-        if os.path.samefile(source, target):
-            return
-        target.unlink()
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.link(source, target)
-    except OSError:
-        write_atomically(target, copy)

@@ -30,6 +30,7 @@ LARGEST = 0.1  # of white: residuals count for no more
 OPAQUE = 0.5  # opacity: of the instruments, what is less may be the shadow
 FAINT = 0.02  # opacity
 AGREE = 0.8  # share of the frames that the lamps must make better
+ASIDE = 0.5  # cosine, as seen from the lens: lamps nearer together than 60 degrees would share one shadow out
 EXPLAINS = 0.005  # share of the squared error beside the instruments that each lamp must take away
 
 
@@ -72,7 +73,8 @@ def find_shadow(session: GaussianSession) -> None:
     free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     offsets = _tried(2 * session.extent).to(scene.center)
     evidence = _ask(session, offsets)
-    fit = _choose(evidence, len(free))
+    there = [scene.shadow_offsets[lamp] for lamp in range(LAMPS) if lamp not in free]
+    fit = _choose(evidence, offsets, there)
     agree = evidence.agree(fit)
     looks = scene.diagnostics.setdefault("shadow", [])
     looks.append(
@@ -108,16 +110,24 @@ def _tried(distance: float) -> Tensor:
     return torch.cat([radius * distance * around for radius in RADII])
 
 
-def _choose(evidence: _Evidence, most: int) -> _Fit:
-    """One lamp after the other, always the one that brings most, as long as it brings enough; at most `most`."""
+def _choose(evidence: _Evidence, offsets: Tensor, there: list[Tensor]) -> _Fit:
+    """One lamp of `offsets` [C, 3] after the other, always the one that brings most, as long as it brings enough and
+    stands aside of those that are `there` already; at most LAMPS with them."""
     best = _Fit((), np.zeros(0), 0.0)
-    while len(best.chosen) < most:
-        others = set(range(evidence.along.shape[1])) - set(best.chosen)
-        more = max((evidence.fit((*best.chosen, k)) for k in sorted(others)), key=lambda fit: fit.taken)
+    while len(there) + len(best.chosen) < LAMPS:
+        taken = [*there, *(offsets[k] for k in best.chosen)]
+        aside = [k for k in range(len(offsets)) if all(_cosine(offsets[k], other) < ASIDE for other in taken)]
+        if not aside:
+            break
+        more = max((evidence.fit((*best.chosen, k)) for k in aside), key=lambda fit: fit.taken)
         if more.taken - best.taken < EXPLAINS * evidence.total or not (more.strengths > 0).all():
             break
         best = more
     return best
+
+
+def _cosine(a: Tensor, b: Tensor) -> float:
+    return float(torch.nn.functional.cosine_similarity(a, b, dim=0))
 
 
 def _ask(session: GaussianSession, offsets: Tensor) -> _Evidence:
