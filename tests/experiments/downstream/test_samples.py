@@ -103,6 +103,31 @@ def test_a_count_takes_the_first_images(drawn: Path) -> None:
     assert len(drawn_samples(DataSet("set", drawn), "instrument", "hard", SIZE)) == 6
 
 
+def annotated(drawn: Path, splits: list[str]) -> Path:
+    """The set as if `neeco annotate` had written it."""
+    info = json.loads((drawn / "dataset.json").read_text())
+    (drawn / "dataset.json").write_text(json.dumps(info | {"settings": {"annotates": "/captures/one"}}))
+    lines = [{"image": f"images/{k:06d}.png", "recorded_split": split} for k, split in enumerate(splits)]
+    (drawn / "states.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return drawn
+
+
+def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
+    splits = ["test", "train", "train", "unseen", "train", "test"]
+    samples = drawn_samples(DataSet("set", annotated(drawn, splits)), "instrument", "hard", SIZE)
+    assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
+
+
+def test_annotated_frames_that_say_no_split_are_refused(drawn: Path) -> None:
+    with refused("--sets set", "none of its frames is of split train"):
+        loaded(annotated(drawn, ["test"] * 6))
+    with refused("--sets set", "states.jsonl: not as `neeco annotate` writes it"):
+        loaded(annotated(drawn, ["train"] * 5))
+    (drawn / "states.jsonl").unlink()
+    with refused("states.jsonl: no such file"):
+        loaded(drawn)
+
+
 @pytest.mark.parametrize("value", [1, 255])
 def test_of_a_set_of_others_masks_are_enough(value: int, tmp_path: Path) -> None:
     root = write_set(tmp_path / "others", info=False)

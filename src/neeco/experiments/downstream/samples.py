@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +17,14 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
 from neeco.evaluation.truth import truth_file
-from neeco.files import read_json
+from neeco.files import read_json, read_text
 
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
 CLASSES: Mapping[str, tuple[str, ...]] = {"instrument": ("instrument",), "parts": ("shaft", "wrist", "jaws")}
 JAWS = ("jaw_left", "jaw_right")  # one class: which of them is left is a name that images do not show
 INFO = "dataset.json"
+STATES = "states.jsonl"
 DRAWN_IN = "images"
 MASK = 255  # an id that means instrument and nothing more, as in black and white masks
 
@@ -187,7 +189,8 @@ def has_labels(capture: Capture, split: str) -> bool:
 def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[int, int]) -> tuple[DrawnSample, ...]:
     """The images of a data set in their order, each with its labels; the first `count` of them.
 
-    A set that `neeco synthesize` wrote says what its ids mean; of another's, masks/ tell instrument from tissue. size:
+    A set that `neeco synthesize` wrote says what its ids mean; of another's, masks/ tell instrument from tissue. Of one
+    that `neeco annotate` wrote only the frames of split train are learned from: models are tested on the others. size:
     (width, height) that they must have. Raises NeecoError.
     """
     folder = data.path / DRAWN_IN
@@ -196,6 +199,7 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
     images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
     if not images:
         raise NeecoError(f"--sets {data.name}: {folder}: has no image; give what `neeco synthesize` wrote")
+    images = _not_tested_on(data, images)
     if data.count is not None and data.count > len(images):
         raise NeecoError(f"--sets {data.name}: {data.path}: has {len(images)} images, not {data.count}; draw more")
     labels, meaning = _labels_of(data, classes)
@@ -211,6 +215,25 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
             )
     samples[0].load()  # whether its ids mean anything is known before the work
     return tuple(_with_edges(sample, data, edges) for sample in samples)
+
+
+def _not_tested_on(data: DataSet, images: list[Path]) -> list[Path]:
+    """The images that are drawn, or recorded frames of split train."""
+    file, states = data.path / INFO, data.path / STATES
+    stated = read_json(file) if file.is_file() else None
+    settings = stated.get("settings") if isinstance(stated, dict) else None
+    if not isinstance(settings, dict) or "annotates" not in settings:
+        return images
+    text = read_text(states, "what `neeco annotate` says of every frame")
+    try:
+        lines = [json.loads(line) for line in text.splitlines()]
+        splits = {Path(line["image"]).name: line["recorded_split"] for line in lines}
+        kept = [image for image in images if splits[image.name] == "train"]
+    except (ValueError, TypeError, LookupError):
+        raise NeecoError(f"--sets {data.name}: {states}: not as `neeco annotate` writes it") from None
+    if not kept:
+        raise NeecoError(f"--sets {data.name}: {data.path}: none of its frames is of split train; annotate more")
+    return kept
 
 
 def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample:

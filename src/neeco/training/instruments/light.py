@@ -20,7 +20,7 @@ from neeco.training.instruments.solid import spread
 from neeco.training.session import GaussianSession
 
 DIRECTIONS = 8
-RADII = (0.02, 0.04, 0.08)  # of the tissue's distance
+RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
 TRIED_FRAMES = 12
 COVERED = 0.05  # of a pixel, by solid instrument: the tissue is not judged by more
 BESIDE = 7  # px, side of the square about a pixel that must be as little covered
