@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from neeco import cluster
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.experiments import jobs as module
-from neeco.experiments import running
 from neeco.experiments.jobs import UNLIMITED, Budget, run_job
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
 from neeco.experiments.running import run_jobs, threads_per_worker
@@ -247,7 +247,7 @@ def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monke
 def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
-    monkeypatch.setattr(running.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
     with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
         run_jobs([make_job()], workers=2)

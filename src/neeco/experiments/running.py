@@ -4,20 +4,16 @@ RAY_ADDRESS names."""
 from __future__ import annotations
 
 import contextlib
-import importlib.util
-import logging
-import os
-import socket
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from neeco.capture import Capture
+from neeco.cluster import joined, require_ray
 from neeco.errors import NeecoError
 from neeco.experiments.machine import usable_cores
 from neeco.experiments.work import JobNews, Work, attempt_job, ended
 
-CONNECT = 5.0  # s that a cluster's head gets to answer
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
 
@@ -80,47 +76,15 @@ def check_workers(workers: int) -> None:
         require_ray()
 
 
-def require_ray() -> None:
-    """Raises NeecoError when Ray is not installed, or nobody listens at the HOST:PORT that RAY_ADDRESS names."""
-    if importlib.util.find_spec("ray") is None:
-        raise NeecoError("--workers: several at once need Ray; install neeco[cluster], or leave --workers out")
-    address = os.environ.get("RAY_ADDRESS", "")
-    host, _, port = address.rpartition(":")
-    if "/" in address or not (host and port.isdecimal()):  # ray://..., auto, local: for Ray to understand
-        return
-    try:
-        socket.create_connection((host, int(port)), CONNECT).close()
-    except (OSError, OverflowError) as error:
-        raise NeecoError(
-            f"RAY_ADDRESS: no Ray cluster answers at {address} ({error}); start it, or unset RAY_ADDRESS to work here"
-        ) from None
-
-
 def _run_on_cluster(jobs: Sequence[Work], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
     device is opened in its worker; jobs that name the same one share it.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else it hides them: no job reserves one
-    import ray
-
-    address = os.environ.get("RAY_ADDRESS")
     threads = threads_per_worker(workers)
-    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if address:
-        try:
-            ray.init(address=address, **quiet)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            told = " ".join(str(error).split()) or type(error).__name__
-            raise NeecoError(f"RAY_ADDRESS: {address} is no cluster that can be joined: {told}") from None
-    else:
-        ray.init(num_cpus=threads * workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
-    try:
+    with joined(threads * workers) as ray:
         return _run_remotely(ray, jobs, workers, threads, report)
-    finally:
-        ray.shutdown()
 
 
 def _run_remotely(

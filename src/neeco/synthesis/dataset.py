@@ -8,11 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neeco import cluster
 from neeco.errors import NeecoError
 from neeco.files import new_folder, write_json
 from neeco.raster.threads import threads
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE
+from neeco.synthesis.cluster import make_on_cluster
 from neeco.synthesis.effects import read_effects
 from neeco.synthesis.indexes import (
     INFO,
@@ -77,6 +79,8 @@ def synthesize(
     settings.check()
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
+    if workers > 1 and cluster.address():
+        cluster.require_ray()
     output = Path(output)
     scenes = [gaussian_scene(given.scene, VERB) for given in (run, *casts)]
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
@@ -122,6 +126,9 @@ def synthesize(
 
 def _made(maker: Maker, source: Source, output: Path, missing: list[int], workers: int) -> Iterator[Record]:
     """The records of the missing images, as they are made."""
+    if workers > 1 and cluster.address():
+        yield from make_on_cluster(source, output, missing, workers)
+        return
     if workers > 1:
         yield from make_in_processes(source, output, missing, workers, max(1, threads() // workers))
         return

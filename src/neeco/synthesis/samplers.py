@@ -18,7 +18,7 @@ from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.synthesis.acceptance import shows_working_end
-from neeco.synthesis.settings import PATH_PREFIX, Views
+from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Views
 from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, Listed, StateSampler
 from neeco.synthesis.views import (
     OrbitViews,
@@ -102,7 +102,7 @@ def states_file(states: str) -> Path:
 
 def states_fingerprint(states: str) -> str | None:
     """sha256 of the file that `--states` names; None when it names a sampler."""
-    if states in ("inside", "beyond", "grid"):
+    if states in SAMPLERS:
         return None
     path = states_file(states)
     try:

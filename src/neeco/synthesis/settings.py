@@ -11,6 +11,7 @@ LabelWay = Literal["composited", "threshold"]
 Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
 Views = Literal["recorded", "perturbed", "orbit"]
 PATH_PREFIX = "path:"
+SAMPLERS = ("inside", "beyond", "grid")  # what `states` may be beside a file
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 

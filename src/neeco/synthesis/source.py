@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,12 +26,11 @@ class Source:
     device: str = "cpu"
     casts: tuple[Path, ...] = ()
 
-    @contextmanager
-    def opened(self, threads: int) -> Iterator[Maker]:
+    def maker(self, threads: int) -> Maker:
         """The maker of its images, in a process of its own that may use so many threads."""
         set_threads(threads)
+        torch.set_num_threads(1)
         keep_freed_memory()
         device = torch.device(self.device)
         scene, *casts = (gaussian_scene(load_scene(path).to(device), VERB) for path in (self.scene, *self.casts))
-        with scene.torch_threads():
-            yield Maker.of(scene, self.settings, casts)
+        return Maker.of(scene, self.settings, casts)

@@ -127,7 +127,8 @@ def _work(source: Source, output: Path, threads: int, line: Connection) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with source.opened(threads) as maker, contextlib.suppress(EOFError):
+        maker = source.maker(threads)
+        with contextlib.suppress(EOFError):
             while True:
                 for index in line.recv():
                     line.send(maker.make(output, index))

@@ -77,7 +77,7 @@ def write_sample(
         "labels": [label.to_json() for label in labels],
         **facts,
         "refused": dict(sorted(refused.items())),
-        "files": {file: (root / file).stat().st_size for file in _files_of(index)},
+        "files": {file: (root / file).stat().st_size for file in files_of(index)},
     }
     _write_record(root, record)
     return record
@@ -116,7 +116,7 @@ def load_record(root: Path, index: int) -> Record | None:
     """
     try:
         record = json.loads(record_path(root, index).read_text(encoding="utf-8"))
-        files = () if record.get("skipped") else _files_of(index)
+        files = () if record.get("skipped") else files_of(index)
         sizes = {name: (root / name).stat().st_size for name in files}
     except (OSError, ValueError, AttributeError):
         return None
@@ -141,7 +141,8 @@ def link(source: Path, target: Path) -> None:
         write_atomically(target, copy)
 
 
-def _files_of(index: int) -> list[str]:
+def files_of(index: int) -> list[str]:
+    """The files of image `index` beside its record, relative to the data set."""
     return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
 
 

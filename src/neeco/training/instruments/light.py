@@ -29,7 +29,8 @@ DIMMEST = 0.05  # of white: what is drawn darker is taken to be so
 LARGEST = 0.1  # of white: residuals count for no more
 OPAQUE = 0.5  # opacity: of the instruments, what is less may be the shadow
 FAINT = 0.02  # opacity
-AGREE = 0.8  # share of the frames that the lamps must make better
+AGREE = 0.75  # share of the frames that the first lamps found must make better
+FURTHER_AGREE = 0.5  # and others, beside them
 ASIDE = 0.5  # cosine, as seen from the lens: lamps nearer together than 60 degrees would share one shadow out
 EXPLAINS = 0.005  # share of the squared error beside the instruments that each lamp must take away
 
@@ -85,7 +86,7 @@ def find_shadow(session: GaussianSession) -> None:
             "found_at_mm": [],
         }
     )
-    if not fit.chosen or agree < AGREE:
+    if not fit.chosen or agree < (FURTHER_AGREE if there else AGREE):
         return
     for lamp, tried, strength in zip(free, fit.chosen, fit.strengths, strict=False):
         scene.shadow_offsets[lamp] = offsets[tried]
