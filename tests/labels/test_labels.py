@@ -9,6 +9,7 @@ from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
+from neeco.synthesis.acceptance import UNSEEN, Acceptance
 
 
 def labelled(scene, state, camera, labeller=None):
@@ -55,7 +56,7 @@ def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
 
 def test_the_share_of_made_up_tissue_is_told(scene, state, camera):
     drawing, _ = labelled(scene, state(), camera)
-    assert drawing.made_up == 0
+    assert not drawing.made_up.any()
     marks = torch.zeros(len(scene.canonical))
     marks[: scene.canonical.counts[0]] = (scene.canonical.means[: scene.canonical.counts[0], 0] > 0).float()
     plain = scene.canonical
@@ -65,7 +66,13 @@ def test_the_share_of_made_up_tissue_is_told(scene, state, camera):
     finally:
         scene.canonical = plain
     behind = 1 - float((drawing.parts > 0).float().mean())
-    assert halved.made_up == pytest.approx(behind / 2, abs=0.02)
+    assert float(halved.made_up.mean()) == pytest.approx(behind / 2, abs=0.02)
+    shown = halved.parts > 0
+    right = torch.arange(camera.width) > camera.width / 2 + 3
+    assert bool(halved.ignored[~shown & right].all())
+    assert torch.equal(halved.ignored[:, : camera.width // 2 - 3], drawing.ignored[:, : camera.width // 2 - 3])
+    assert Acceptance(0.0, None).why_refused(scene, drawing) is None
+    assert Acceptance(0.0, None).why_refused(scene, halved) == UNSEEN
 
 
 def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera):

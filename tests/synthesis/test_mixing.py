@@ -71,12 +71,13 @@ def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: S
     camera = Camera(at(500, 40, -30), 60.0, 60.0, 32.0, 24.0, 64, 48)
     tissue = ball_scene("own", [(0, 0, 50)], wall=130.0)
     mixture = Mixture.of(tissue, [near])
-    moved = torch.eye(4, dtype=torch.float64)
-    moved[:3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert tissue_depth(tissue, CAMERA, np.array([0.0, 0, 60])) == pytest.approx(130.0, rel=0.02)
     placed = mixture.place(near, ball_state("near", -8, 0, 60), CAMERA, CAMERA)["near"].pose
     assert placed[2, 3].item() == pytest.approx(90.0, abs=2.0)  # 40 mm before the wall
     assert placed[0, 3].item() / placed[2, 3].item() == pytest.approx(-8 / 60)  # on the same line of sight
+    deep = Mixture.of(ball_scene("own", [(0, 0, 50)], wall=70.0), [near])
+    close = deep.place(near, ball_state("near", -8, 0, 60), CAMERA, CAMERA)["near"].pose
+    assert close[2, 3].item() == pytest.approx(55.0, abs=0.1)  # not 30: it was recorded no nearer
     beside = mixture.place(near, ball_state("near", -8, 0, 60), CAMERA, camera)["near"].pose
     local = torch.linalg.inv(camera.world_from_camera) @ beside
     assert local[0, 3].item() / local[2, 3].item() == pytest.approx(-8 / 60)

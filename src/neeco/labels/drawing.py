@@ -23,6 +23,7 @@ from neeco.raster.types import Camera, Gaussians, Rendering
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene
 
+MOSTLY = 0.5  # of a pixel
 SURFACE_ALPHA = 0.5  # less opaque than this there is no surface to speak of
 
 
@@ -54,12 +55,14 @@ class LayeredDrawing(Drawing):
     tissue_depth: np.ndarray  # of the tissue drawn alone
     tissue_image: Tensor | None  # [H, W, 3] in [0, 1], the same, where it was asked for
     alone: dict[str, Alone]  # by instrument
-    made_up: float  # share of the image that is tissue which no training frame saw
+    made_up: Tensor  # [H, W] in [0, 1]: how much of a pixel is tissue that no training frame saw
 
     @property
     def ignored(self) -> Tensor:
-        """[H, W] bool: the edge, whose pixels a trainer had better not count (see `edges.uncertain_edge`)."""
-        return torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
+        """[H, W] bool: pixels that a trainer had better not count: the edge (see `edges.uncertain_edge`), and what is
+        mostly made up."""
+        edge = torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
+        return edge | (self.made_up > MOSTLY)
 
 
 class Labeller(Protocol):
@@ -108,7 +111,6 @@ def draw_layers(
     looked_at = gaussians if tissue_image else bare
     tissue = rasterize(looked_at.select(behind), learned_camera, channels=scene.made_up[behind][:, None])
     assert tissue.channels is not None
-    made_up = (tissue.channels[..., 0].cpu() * (1 - share)).mean()
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
         parts=parts,
@@ -119,7 +121,7 @@ def draw_layers(
         tissue_depth=surface_depth(tissue),
         tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
         alone=alone,
-        made_up=round(float(made_up), 4),
+        made_up=tissue.channels[..., 0].cpu() * (1 - share),
     )
 
 

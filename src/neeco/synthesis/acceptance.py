@@ -12,7 +12,7 @@ import torch
 
 from neeco.capture.model import State
 from neeco.labels.annotation import place_in_image
-from neeco.labels.drawing import Labeller, LayeredDrawing, draw_layers, to_numpy
+from neeco.labels.drawing import MOSTLY, Labeller, LayeredDrawing, draw_layers, to_numpy
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:
@@ -24,7 +24,9 @@ TOLERANCE_MM = (2.0, 5.0)
 TOLERANCE_STATES = 12
 APART_MM = 6.0  # surfaces of instruments seen at one place, or their insides meet: about a shaft's thickness
 CROSSING = 5  # px nearer than that: instruments are taken to be in each other
+MOST_MADE_UP = 0.25  # of an image's pixels
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
+UNSEEN = "stands before tissue that no frame saw"
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
+        if float((drawing.made_up > MOSTLY).float().mean()) > MOST_MADE_UP:
+            return UNSEEN
         if any(_crossing(drawing, a, b) for a, b in combinations(self.casts, 2)):
             return ENTERS_ANOTHER
         return None

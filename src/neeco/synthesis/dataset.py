@@ -13,7 +13,7 @@ from neeco.errors import NeecoError
 from neeco.files import new_folder, write_json
 from neeco.raster.threads import threads
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE
+from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE, UNSEEN
 from neeco.synthesis.cluster import make_on_cluster
 from neeco.synthesis.effects import read_effects
 from neeco.synthesis.indexes import (
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 REMEDIES = {  # where every given state was refused
     LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
     ENTERS_ANOTHER: "mix fewer instruments",
+    UNSEEN: "record more of the tissue, or keep --views recorded",
     ENTERS_TISSUE: "give a larger --tissue-tolerance-mm, or --no-tissue-check",
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 Draw = Callable[[int, Generator], tuple[State, Camera]]
 
 COARSE = 0.25  # of the image's size, at which the depth of tissue is looked up
-NEAREST = 0.5  # of its own distance from the lens: an instrument is brought no nearer
 MOMENTS = 24  # that the mixed scene remembers as if they had been recorded
 GAINS = (0.6, 1.6)  # how far colours are changed at most: beyond that, shafts are of other make
 SOLID = 0.5  # opacity of Gaussians that tell a shaft's colour
@@ -53,6 +52,7 @@ class Mixture:
     tissue: Scene
     casts: tuple[Scene, ...]  # whose instruments they are
     gains: tuple[tuple[float, float, float], ...]  # by which each cast's colours were multiplied
+    nearest: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
 
     @classmethod
     def of(cls, tissue: Scene, casts: Sequence[Scene]) -> Mixture:
@@ -71,7 +71,8 @@ class Mixture:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
         gains = tuple(_gain(tissue, scene) for scene in casts)
         mixed = _composed(tissue, casts, gains)
-        mixture = cls(mixed, tissue, tuple(casts), gains)
+        nearest = {name: _nearest(scene) for scene in casts for name in (item.name for item in scene.instruments)}
+        mixture = cls(mixed, tissue, tuple(casts), gains, nearest)
         mixed.recorded = mixture._remembered()
         return mixture
 
@@ -89,17 +90,17 @@ class Mixture:
     def place(self, cast: Scene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
         """The instruments of `cast`, in `state` before `seen_by`, as they stand before `camera` of the tissue's run.
 
-        They are shifted along the line of sight until they are as far before this tissue as before their own.
+        They are shifted along the line of sight until they are as far before this tissue as before their own, but no
+        nearer to the lens than they were recorded: nobody knows what they look like there.
         """
         registered = cast.registered(state)
         camera_from_world = np.linalg.inv(to_numpy(seen_by.world_from_camera))
-        ends = [point for points in working_ends(cast, state).values() for point in points]
-        ends = ends or [to_numpy(given.pose)[:3, 3] for given in registered.instruments.values()]
-        end = camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]  # [3] mm, camera frame
+        end = _working_end(cast, state, seen_by)
         shift = np.eye(4)
         here, there = tissue_depth(self.tissue, camera, end), tissue_depth(cast, seen_by, end)
         if here > 0 and there > 0 and end[2] > 0:
-            depth = max(end[2] + here - there, NEAREST * end[2])
+            nearest = min(self.nearest[name] for name in registered.instruments)
+            depth = max(end[2] + here - there, min(nearest, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
         return {
@@ -147,6 +148,21 @@ class MixedSampler:
         for scene, draw in zip(self.mixture.casts, self.draws, strict=True):
             placed |= self.mixture.place(scene, *draw(index, rng), camera)
         return State(placed, 0.0), camera
+
+
+def _working_end(scene: Scene, state: State, camera: Camera) -> np.ndarray:
+    """The mean [3] mm of the instruments' working ends in the camera's frame; of their origins where none is known."""
+    ends = [point for points in working_ends(scene, state).values() for point in points]
+    ends = ends or [to_numpy(given.pose)[:3, 3] for given in scene.registered(state).instruments.values()]
+    camera_from_world = np.linalg.inv(to_numpy(camera.world_from_camera))
+    return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
+
+
+def _nearest(scene: Scene) -> float:
+    """Depth mm of the working ends in the recorded frame where they were nearest to the lens."""
+    recorded = scene.recorded
+    pairs = zip(recorded.states, recorded.cameras, strict=True)
+    return min((float(_working_end(scene, state, camera)[2]) for state, camera in pairs), default=0.0)
 
 
 @torch.no_grad()
