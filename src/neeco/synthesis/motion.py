@@ -61,7 +61,7 @@ class RecordedMotion:
         for first, second in pairwise(order):
             a, b = recorded.states[first], recorded.states[second]
             if 0 < b.time - a.time <= LONGEST_GAP and set(a.instruments) == set(b.instruments):
-                self._motions.append(_between(a, recorded.cameras[first], b, recorded.cameras[second]))
+                self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
                 states.append(a)
         common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
         self._known = RecordedStates(states, sorted(common)) if common else None
@@ -103,7 +103,8 @@ def _pixels_between(
     return float(max(moved, default=0.0))
 
 
-def _between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
+def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
+    """How everything moved from one recorded moment to a later one, at even speed."""
     seconds = b.time - a.time
     twists = {
         name: _twist(to_numpy(given.pose), to_numpy(b.instruments[name].pose), seconds)
