@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
-from neeco.capture.images import QUICK, write_image, write_labels
+from neeco.capture.images import write_image, write_labels, write_png
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.files import write_atomically, write_text
 from neeco.labels.annotation import InstrumentLabel
@@ -156,9 +155,7 @@ def remove_leftovers(root: Path) -> None:
 
 def write_depth(path: Path, depth: np.ndarray) -> None:
     """Write depth [H, W] mm as a 16-bit grey PNG of 0.05 mm per count, 0 = none; beyond 3276 mm it saturates."""
-    counts = np.clip(np.round(depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16)
-    picture = Image.fromarray(counts)
-    write_atomically(path, lambda temporary: picture.save(temporary, format="PNG", compress_level=QUICK))
+    write_png(path, np.clip(np.round(depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16))
 
 
 def write_states(root: Path, records: list[Record]) -> None:
