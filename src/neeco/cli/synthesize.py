@@ -40,11 +40,9 @@ def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
     from neeco.cli._bars import counting
     from neeco.raster.devices import device_of
-    from neeco.raster.threads import keep_freed_memory
     from neeco.synthesis.dataset import synthesize
     from neeco.training.run import load_run, open_run
 
-    keep_freed_memory()
     settings = arguments.settings
     settings.check()
     drawn, casts = _runs(arguments)
