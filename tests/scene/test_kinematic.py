@@ -84,6 +84,23 @@ def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
     assert (open_["tip_left"] - open_["tip_right"]).norm().item() > 1
 
 
+def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene) -> None:
+    hinges = kinematic.deformation.hinges_of(0)
+    pivot, axis = hinges.hinge(0)
+    _, direction = hinges.shaft()
+    beside = torch.linalg.cross(axis, direction)
+    hinges.tips[0] = torch.stack([pivot + 9 * direction + 2 * beside, pivot + 12 * direction - beside])
+    for reading in (0.1, 0.6):
+        for part in (0, 1):
+            assign(kinematic, 1 + part)
+            canonical = kinematic.canonical
+            canonical.means[TISSUE] = hinges.tips[0, part]
+            drawn = kinematic.at(grasper_state(POSE, reading)).means[TISSUE]
+            side = ("tip_left", "tip_right")[hinges.left_first(0).tolist().index(part)]
+            told = kinematic.keypoints(grasper_state(POSE, reading))["grasper"][side]
+            assert torch.allclose(told, drawn, atol=1e-3)
+
+
 def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
     assign(kinematic, 1)
     hinges = kinematic.deformation.hinges_of(0)

@@ -76,6 +76,19 @@ def test_a_true_hinge_is_found(session: GaussianSession) -> None:
     assert told["verdict"].startswith("found: the reading explains")
 
 
+def test_tips_are_where_the_jaws_end(session: GaussianSession) -> None:
+    conclude(session, session.scene.deformation)
+    points = session.scene.canonical.means[session.scene.canonical.body(1)]
+    for part, jaw in ((0, points[-30:-15]), (1, points[-15:])):
+        end = jaw[(jaw - torch.tensor([0.0, 0.0, PIVOT_MM])).norm(dim=1).argmax()]
+        assert float((hinges_of(session).tips[0, part] - end).norm()) < 1.0
+    with torch.no_grad():
+        session.scene.canonical.opacity_logits[session.scene.canonical.body(1)][-15:] = -4.0
+    conclude(session, session.scene.deformation)
+    assert bool(hinges_of(session).tips[0, 0].isfinite().all())
+    assert bool(hinges_of(session).tips[0, 1].isnan().all())
+
+
 @pytest.mark.parametrize("wrong", ["across", "still"])
 def test_a_hinge_in_the_wrong_place_is_reported(wrong: str, session: GaussianSession) -> None:
     with torch.no_grad():

@@ -38,6 +38,7 @@ class Hinges(nn.Module):
     middle: Tensor
     closed: Tensor
     radius: Tensor
+    tips: Tensor
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         super().__init__()
@@ -51,6 +52,7 @@ class Hinges(nn.Module):
         self.register_buffer("middle", torch.zeros(count))  # rad or mm, as the readings
         self.register_buffer("closed", torch.full((count,), math.nan))  # the lowest recorded reading; nan: not known
         self.register_buffer("radius", torch.tensor(math.inf))  # mm, of the shaft as carved
+        self.register_buffer("tips", torch.full((count, 2, 3), math.nan))  # mm, of each joint's parts as learned
         self.shaft_tilt = nn.Parameter(torch.zeros(2))
         self.shaft_shift = nn.Parameter(torch.zeros(2))
         self.hinge_angle = nn.Parameter(torch.zeros(count))
@@ -123,6 +125,16 @@ class Hinges(nn.Module):
         """[2] rad by which a joint's two parts stand off the shaft, which they lie along where it is closed."""
         opened = self.gains[joint] * (reading - self.closed[joint])
         return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), opened)
+
+    def tips_at(self, joint: int, reading: float) -> Tensor:
+        """[2, 3] mm, instrument frame: the tips of a joint's left and right part. For one that was not measured the
+        shaft's end is taken, from where the joint lies closed."""
+        pivot, axis = self.hinge(joint)
+        origin, direction = self.shaft()
+        known = self.tips[joint].isfinite().all(1)  # [2]
+        points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
+        angles = torch.where(known, self.turns(joint, reading), self.opened(joint, reading))
+        return rotate_about(points, axis, pivot, angles).index_select(0, self.left_first(joint))
 
     @torch.no_grad()
     def beyond_hinge(self, points: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ SINCE = {
     "middle",
     "closed",
     "radius",
+    "tips",
 }  # modules' tensors that it lacks
 
 

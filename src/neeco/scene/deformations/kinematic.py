@@ -31,7 +31,7 @@ from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
-from neeco.scene.rotations import matrix_to_quat, quat_multiply, rotate_about
+from neeco.scene.rotations import matrix_to_quat, quat_multiply
 
 LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
@@ -184,13 +184,9 @@ class Kinematic(Deformation):
             end = hinges.extent[1]
             if hinges.joint_names:
                 points["shaft_near"] = origin + torch.maximum(hinges.wrist_start, hinges.extent[0]) * direction
-                pivot, axis = hinges.hinge(0)
-                points["hinge"] = pivot
-                angles = hinges.opened(0, given.joints[hinges.joint_names[0]])
-                tip = (origin + end * direction)[None]  # [1, 3]
-                ordered = angles.index_select(0, hinges.left_first(0))
-                for name, angle in zip(("tip_left", "tip_right"), ordered.split(1), strict=True):
-                    points[name] = rotate_about(tip, axis, pivot, angle)[0]
+                points["hinge"] = hinges.hinge(0)[0]
+                tips = hinges.tips_at(0, given.joints[hinges.joint_names[0]])
+                points |= {"tip_left": tips[0], "tip_right": tips[1]}
             else:
                 points["shaft_near"] = origin + end * direction
             pose = given.pose.to(origin)

@@ -14,7 +14,7 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinged
 from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.extend import extend_shaft
-from neeco.training.instruments.solid import ENOUGH, solid, solid_extent
+from neeco.training.instruments.solid import ENOUGH, measure_tips, solid, solid_extent
 from neeco.training.session import GaussianSession
 
 FOUND = 0.35  # share of the moving parts' error that the readings must explain: .5-.9 where found, .27 half-way off
@@ -43,6 +43,8 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
                 "labels will be empty; the images show it too little, or another that moves alike has its place"
             )
         hinges.extent.copy_(solid_extent(scene.canonical, index, hinges))
+        if hinges.joint_names:
+            measure_tips(scene.canonical, index, hinges, hinged.part_weights(scene.canonical, index))
         scene.canonical = extend_shaft(
             scene.canonical, index + 1, instrument.name, hinges, scene.recorded, 1.5 * session.extent
         )

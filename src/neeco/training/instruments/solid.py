@@ -11,6 +11,8 @@ from neeco.training.session import GaussianSession
 
 SOLID = 0.3  # opacity of a Gaussian that counts as the instrument's substance
 WITHIN = 0.9  # share of the solid Gaussians that lie within the shaft's radius
+MOSTLY = 0.5  # of a Gaussian, to be counted with a part
+TIP = 0.97  # share of a part's solid Gaussians that lie nearer to the hinge than its tip
 ENOUGH = 10  # solid Gaussians without which an instrument is as good as absent
 
 
@@ -42,3 +44,20 @@ def solid_extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> T
     if len(along) < ENOUGH:
         return hinges.extent.clone()
     return torch.quantile(along, along.new_tensor([0.02, 0.985]))
+
+
+def measure_tips(canonical: CanonicalGaussians, index: int, hinges: Hinges, weights: Tensor) -> None:
+    """Set the tips of every joint's parts to where their solid Gaussians lie farthest from the hinge; leave them
+    unknown where there are too few. weights [M, part_count]."""
+    points, kept = canonical.means[canonical.body(index + 1)], solid(canonical, index)
+    shares = hinges.parts(points, weights)
+    for joint in range(len(hinges.joint_names)):
+        pivot, _ = hinges.hinge(joint)
+        found = torch.full_like(hinges.tips[joint], torch.nan)
+        for side, part in enumerate(hinges.left_first(joint).tolist()):
+            of_part = points[kept & (shares[:, 2 + 2 * joint + side] > MOSTLY)]
+            if len(of_part) < ENOUGH:
+                continue
+            away = (of_part - pivot).norm(dim=1)
+            found[part] = of_part[away >= away.quantile(TIP)].mean(0)
+        hinges.tips[joint] = found
