@@ -18,6 +18,7 @@ from torch.nn.functional import conv2d
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.resize import resize_camera, resize_image
 from neeco.raster import rasterize
+from neeco.raster.shadow import shadowed
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.rotations import rigid_from_vector
 
@@ -173,13 +174,16 @@ def _normal_equations(
     """J^T W J [P, P] and J^T W r [P] of residual and prior at `parameters`, Jacobian by forward differences."""
     residual = _smooth(image - level.target, level.weight)
     weight = _scale(problem.config) / (residual.abs() / problem.config.huber).clamp_min(1.0)
+    # drawn a dozen times: the shadows, which move as little as what casts them, once
+    camera = problem.scene.camera(problem.moved_camera(level.camera, parameters))
+    still = shadowed(gaussians, camera, rasterize)
     columns = []
     for index in range(len(parameters)):
         moved = parameters.clone()
         step = float(level.step[index % 6])
         moved[index] += step
         is_camera = index >= len(parameters) - 6
-        posed = gaussians if is_camera else problem.gaussians(moved)
+        posed = still if is_camera else replace(problem.gaussians(moved), sh=still.sh, headlight=still.headlight)
         columns.append(_smooth(problem.draw(posed, level, moved) - image, level.weight).flatten() / step)
     jacobian = torch.stack(columns)  # [P, h * w * 3]
     weighted = jacobian * weight.flatten()
