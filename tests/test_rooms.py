@@ -20,7 +20,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("ingest",),
     ("capture",),
     ("raster",),
-    ("files", "registry", "settings"),
+    ("cluster", "files", "registry", "settings"),
     ("errors",),
 )
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -24,6 +24,7 @@ MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside 
 TAPS = 6  # map pixels to each side of the blur's middle, which is cut off there
 GAMMA = 2.2  # of stored images, about
 DARKEST = 0.01  # of the light reaches any place
+FAINT = 1e-4  # of a lamp's light: less is not missed
 NEAR = 1e-6
 NEAREST = 1e-3  # mm
 HALF = 0.5 / SH_C0
@@ -78,24 +79,24 @@ def blocked(gaussians: Gaussians, shadow: Shadow, offset: Tensor, camera: Camera
     """
     at_light = _light_camera(camera, offset.detach())
     with torch.no_grad():
-        casters = gaussians.select(shadow.casters)
-        seen = draw(replace(casters, sh=casters.sh[:, :1], headlight=None, background=None), at_light)
+        bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None)
+        seen = draw(bare.select(shadow.casters), at_light)
     sigma = shadow.width * at_light.fx
     down, across = (_blur(size, sigma) for size in seen.alpha.shape)
     alpha = down @ seen.alpha @ across  # [h, w]
+    focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
     with torch.no_grad():
         summed = torch.stack([alpha, down @ (seen.alpha * seen.depth) @ across], -1)  # [h, w, 2]
-    pose = camera.world_from_camera.to(gaussians.means)
-    receivers = ~shadow.casters
-    points = (gaussians.means[receivers].detach() - pose[:3, 3]) @ pose[:3, :3] - offset  # [R, 3] light frame
-    focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
-    pixels = torch.stack(project(points, *focus, nearest=NEAREST), 1)  # [R, 2]; those behind fall far outside
-    weight, weighted = _look_up(summed, pixels.detach(), at_light).unbind(1)
-    before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [R] mm, depth of what casts there
+        pose = camera.world_from_camera.to(gaussians.means)
+        points = (gaussians.means - pose[:3, 3]) @ pose[:3, :3]  # [N, 3] camera frame
+        pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)  # [N, 2]; those behind fall outside
+        weight, weighted = _look_up(summed, pixels, at_light).unbind(1)
+        before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
+        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~shadow.casters
+    points, before = points[hit], before[hit]  # few: of these alone the gradient is wanted
+    pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
-    share = _look_up(alpha[..., None], pixels, at_light)[:, 0]
-    share = torch.where(points[:, 2].detach() > before, share, torch.zeros_like(share))  # [R]
-    return torch.zeros_like(gaussians.opacities).masked_scatter(receivers, share)
+    return torch.zeros_like(gaussians.opacities).masked_scatter(hit, _look_up(alpha[..., None], pixels, at_light)[:, 0])
 
 
 def _light_camera(camera: Camera, offset: Tensor) -> Camera:
