@@ -22,9 +22,11 @@ from neeco.scene import Scene
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.effects import EFFECTS, CameraEffects, Range, read_effects
 from neeco.synthesis.making import Maker
-from neeco.synthesis.motion import MOST_DRAWINGS, Motion, RecordedMotion, exposure
+from neeco.synthesis.motion import MOST_DRAWINGS, MixedMotion, Motion, RecordedMotion, exposure
 from neeco.synthesis.optics import image_circle, mean_light, through_camera, to_light, to_stored
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.states import rigid
+from neeco.synthesis.views import moved_camera
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0)
 
@@ -201,7 +203,7 @@ def test_another_range_is_another_data_set(run: FakeRun, tmp_path: Path) -> None
 
 
 def test_motion_goes_on_as_recorded(moving: Scene) -> None:
-    motion = RecordedMotion(moving)(rod_state(), np.random.default_rng(0))
+    motion = RecordedMotion(moving.recorded)(rod_state(), np.random.default_rng(0))
     assert motion.instruments["rod"][3:] == pytest.approx([30.0, 0, 0], abs=1e-6)
     assert motion.joints["rod"]["jaw_angle"] == pytest.approx(0.5)
     assert motion.camera == pytest.approx(np.zeros(6), abs=1e-9)
@@ -214,6 +216,20 @@ def test_a_recording_without_times_tells_of_no_motion(run: FakeRun, tmp_path: Pa
     path = effects_file(tmp_path, "shutter_s: 0.02\n")
     with pytest.raises(NeecoError, match=r"effects.yaml: shutter_s: no two recorded frames are close enough in time"):
         Maker.of(run.scene, replace(SETTINGS, camera_effects=path))
+
+
+def test_mixed_instruments_and_camera_move_each_as_recorded(moving: Scene) -> None:
+    other = replace(
+        moving.recorded,
+        cameras=tuple(moved_camera(CAMERA, rigid(np.eye(3), np.array([0, 2.0 * k, 0]))) for k in range(12)),
+        states=tuple(State({}, k / 25) for k in range(12)),
+    )
+    motion = MixedMotion(other, [moving.recorded])
+    assert motion.known
+    drawn = motion(rod_state(), np.random.default_rng(0))
+    assert drawn.instruments["rod"][3:] == pytest.approx([30.0, 0, 0], abs=1e-6)
+    assert drawn.camera[3:] == pytest.approx([0, 50.0, 0], abs=1e-6)
+    assert not MixedMotion(other, [replace(moving.recorded, states=moving.recorded.states[:1])]).known
 
 
 def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: Scene) -> None:
@@ -251,3 +267,5 @@ def test_motion_blur_is_the_integral_over_the_exposure(
     assert torch.equal(made.parts, sharp.parts)  # of the middle of the exposure
     assert float((made.share - sharp.share).abs().max()) > seen
     assert float(made.share.sum()) == pytest.approx(float(sharp.share.sum()), rel=0.05)
+    cut = maker._photographed(sharp, {"shutter_s": 0.05, "field_of_view": 0.3}, np.random.default_rng(0))
+    assert not bool(cut.share[torch.from_numpy(image_circle(48, 64, 0.3) <= 0.5)].any())

@@ -71,7 +71,8 @@ def synthesize(
     """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `casts` of its tissue
     under the instruments of those runs.
 
-    Image `index` depends on (scene, settings, index) alone, however many `workers` (processes) share the work.
+    Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: processes started
+    anew, so that a script needs `if __name__ == "__main__"` about its own start.
     Interrupted (Ctrl-C) or failing, it keeps and indexes what is done, for `resume`; where no image was drawn at all,
     `output` is left as it was found. `on_progress` is told how many images are done. How many threads torch takes is
     the caller's to set (`open_run`). Raises NeecoError for bad settings, an output that is not empty (without `resume`)

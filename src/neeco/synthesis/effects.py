@@ -62,6 +62,11 @@ class CameraEffects:
     ranges: Mapping[str, Range]
     soft_masks: SoftMasks = "mid"
 
+    @property
+    def moves(self) -> bool:
+        """Whether anything goes on while the shutter is open."""
+        return "shutter_s" in self.ranges
+
     def draw(self, rng: Generator) -> dict[str, float]:
         """The effects of one image by name. Always takes as much from `rng`, so that a value depends on no other's
         range."""

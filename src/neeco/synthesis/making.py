@@ -21,7 +21,7 @@ from neeco.synthesis.acceptance import Acceptance, find_tolerance
 from neeco.synthesis.effects import CameraEffects, read_effects
 from neeco.synthesis.indexes import counted
 from neeco.synthesis.mixing import MixedSampler, Mixture
-from neeco.synthesis.motion import RecordedMotion, exposure
+from neeco.synthesis.motion import MixedMotion, RecordedMotion, exposure
 from neeco.synthesis.optics import image_circle, mean_light, through_camera
 from neeco.synthesis.samplers import Sampler, make_sampler
 from neeco.synthesis.settings import Settings
@@ -43,7 +43,7 @@ class Maker:
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
-    motion: RecordedMotion | None = None  # known where effects open a shutter
+    motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each cast were multiplied
 
     @classmethod
@@ -59,15 +59,10 @@ class Maker:
             scene, sampler = mixture.scene, mixture.sampler(settings)
             together = tuple(frozenset(instrument.name for instrument in cast.instruments) for cast in casts)
         labeller = make_labeller(scene, settings)
-        effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects))
-        motion = None
-        if effects is not None and "shutter_s" in effects.ranges:
-            motion = RecordedMotion(scene)
-            if not motion.known:
-                raise NeecoError(
-                    f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to tell "
-                    "how anything moved; leave it out"
-                )
+        effects, motion = None, None
+        if settings.camera_effects is not None:
+            effects = read_effects(Path(settings.camera_effects))
+            motion = _motion(scene if mixture is None else mixture.tissue, casts, settings) if effects.moves else None
         acceptance = replace(make_acceptance(scene, labeller, settings), casts=together)
         gains = () if mixture is None else mixture.gains
         return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
@@ -112,6 +107,8 @@ class Maker:
         if self.effects is None or not values:
             return drawing
         drawing = self._exposed(drawing, values.get("shutter_s", 0.0), rng)
+        if "field_of_view" in values:
+            drawing = _within_circle(drawing, values["field_of_view"])
         image = through_camera(drawing.image.numpy(), drawing.depth, values, rng)
         return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
 
@@ -145,6 +142,18 @@ def make_acceptance(scene: Scene, labeller: Labeller, settings: Settings) -> Acc
         return Acceptance(settings.min_share, None)
     tolerance = settings.tissue_tolerance_mm
     return Acceptance(settings.min_share, find_tolerance(scene, labeller) if tolerance is None else tolerance)
+
+
+def _motion(scene: Scene, casts: Sequence[Scene], settings: Settings) -> RecordedMotion | MixedMotion:
+    """How things go on while a shutter is open. Raises NeecoError where the recordings do not tell."""
+    recorded = scene.recorded
+    motion = MixedMotion(recorded, [cast.recorded for cast in casts]) if casts else RecordedMotion(recorded)
+    if not motion.known:
+        raise NeecoError(
+            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to tell how "
+            "anything moved; leave it out"
+        )
+    return motion
 
 
 def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:

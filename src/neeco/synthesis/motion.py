@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from neeco.synthesis.states import rigid
 from neeco.synthesis.views import SIMILAR, moved_camera, surface_points
 
 if TYPE_CHECKING:
-    from neeco.scene import Scene
+    from neeco.scene import Recorded, Scene
 
 MOST_DRAWINGS = 64
 PIXELS_APART = 1.0  # at most, between two drawings of an exposure
@@ -54,8 +54,7 @@ class Motion:
 class RecordedMotion:
     """Draws motions: those of one of the recorded moments whose instruments stood most like the drawn ones."""
 
-    def __init__(self, scene: Scene) -> None:
-        recorded = scene.recorded
+    def __init__(self, recorded: Recorded) -> None:
         order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
         self._motions, states = [], []
         for first, second in pairwise(order):
@@ -71,12 +70,37 @@ class RecordedMotion:
         """Whether the recording says how anything moved."""
         return bool(self._motions)
 
+    def any(self, rng: Generator) -> Motion:
+        """That of any moment."""
+        return self._motions[int(rng.integers(len(self._motions)))]
+
     def __call__(self, state: State, rng: Generator) -> Motion:
         """How `state` goes on."""
         if self._known is None or self._known.still:
-            return self._motions[int(rng.integers(len(self._motions)))]
+            return self.any(rng)
         nearest = np.argsort(self._known.distances(state), kind="stable")[:SIMILAR]
         return self._motions[int(nearest[rng.integers(len(nearest))])]
+
+
+class MixedMotion:
+    """Draws motions of instruments and a camera that were not recorded together: each as at some moment of its own."""
+
+    def __init__(self, tissue: Recorded, casts: Sequence[Recorded]) -> None:
+        self._tissue, self._casts = RecordedMotion(tissue), [RecordedMotion(cast) for cast in casts]
+
+    @property
+    def known(self) -> bool:
+        """Whether every recording says how anything moved."""
+        return self._tissue.known and all(cast.known for cast in self._casts)
+
+    def __call__(self, state: State, rng: Generator) -> Motion:
+        """How `state` goes on."""
+        moments = [cast.any(rng) for cast in self._casts]
+        return Motion(
+            {name: twist for moment in moments for name, twist in moment.instruments.items()},
+            {name: rates for moment in moments for name, rates in moment.joints.items()},
+            self._tissue.any(rng).camera,
+        )
 
 
 def exposure(scene: Scene, drawing: LayeredDrawing, motion: Motion, shutter_s: float) -> list[tuple[State, Camera]]:
