@@ -106,7 +106,8 @@ class InstrumentSearch(Protocol):
         """Look again, and move a wrist where spinning the shaft up to there costs no more than it did."""
 
     def find_shadow(self) -> None:
-        """Find where the light is that casts the instruments' shadow; leave it off where none explains anything."""
+        """Find where lamps are that cast the instruments' shadows, beside those found before; none where none explains
+        anything."""
 
     def conclude(self, hinged: Hinged) -> None:
         """Set each instrument's extent, prolong its shaft, and judge whether its joints were found."""

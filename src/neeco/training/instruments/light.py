@@ -29,6 +29,7 @@ DIMMEST = 0.05  # of white: what is drawn darker is taken to be so
 LARGEST = 0.1  # of white: residuals count for no more
 OPAQUE = 0.5  # opacity: of the instruments, what is less may be the shadow
 FAINT = 0.02  # opacity
+STRONGEST = 0.9  # to begin with: nothing is learned of a lamp that gives all the light
 AGREE = 0.75  # share of the frames that the first lamps found must make better
 FURTHER_AGREE = 0.5  # and others, beside them
 ASIDE = 0.5  # cosine, as seen from the lens: lamps nearer together than 60 degrees would share one shadow out
@@ -46,7 +47,7 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What `frames` frames say of `tried` lamps, as the normal equations of a fit of their strengths."""
+    """What F frames say of C lamps that were tried, as the normal equations of a fit of their strengths."""
 
     power: NDArray[np.float64]  # [F, C, C]: what their shadows have in common
     along: NDArray[np.float64]  # [F, C]: with what the photographs are darker than the drawings
@@ -71,6 +72,8 @@ def find_shadow(session: GaussianSession) -> None:
     """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
     shadows of the lamps found before do not; none where none explains enough."""
     scene = session.scene
+    if not scene.instruments:
+        return
     free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
     offsets = _tried(2 * session.extent).to(scene.center)
     evidence = _ask(session, offsets)
@@ -90,7 +93,7 @@ def find_shadow(session: GaussianSession) -> None:
         return
     for lamp, tried, strength in zip(free, fit.chosen, fit.strengths, strict=False):
         scene.shadow_offsets[lamp] = offsets[tried]
-        scene.shadow_strengths[lamp] = float(strength)
+        scene.shadow_strengths[lamp] = min(float(strength), STRONGEST)
         looks[-1]["found_at_mm"].append([round(float(v), 2) for v in offsets[tried]])
     _fade(session)
 
