@@ -17,17 +17,13 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_image, read_labels
+from neeco.evaluation.image_metrics import psnr
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw, draw_layers
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.motion import exposure, motion_between
 from neeco.synthesis.optics import mean_light
 from neeco.training.run import open_run
-
-
-def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> float:
-    """Of the pixels of a mask [H, W]."""
-    return float(-10 * np.log10(((a - b) ** 2)[mask].mean()))
 
 
 @torch.no_grad()
@@ -54,11 +50,10 @@ def main() -> None:
             motion = motion_between(states[before], cameras[before], states[after], cameras[after])
             sharp = draw_layers(scene, labeller, states[now], cameras[now], 0.0)
             moments = exposure(scene, sharp, motion, arguments.shutter)
-            exposed = mean_light([draw(scene, *moment).image.numpy() for moment in moments])
-            photograph = read_image(file).numpy()
-            mask = read_labels(arguments.capture / "truth/masks" / f"{file.stem}.png").numpy() > 0
-            everything = np.ones_like(mask)
-            row = [psnr(image, photograph, of) for image in (sharp.image.numpy(), exposed) for of in (everything, mask)]
+            exposed = torch.from_numpy(mean_light([draw(scene, *moment).image.numpy() for moment in moments]))
+            photograph = read_image(file)
+            mask = read_labels(arguments.capture / "truth/masks" / f"{file.stem}.png") > 0
+            row = [psnr(image, photograph, of) for image in (sharp.image, exposed) for of in (None, mask)]
             rows.append([*row, len(moments)])
             print(f"{file.stem}   " + "   ".join(f"{value:6.2f}" for value in row) + f"   {len(moments)}")
     print("mean     " + "  ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)))

@@ -23,7 +23,7 @@ from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.synthesis.acceptance import ENTERS_ANOTHER, Acceptance
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.mixing import Mixture, tissue_depth
+from neeco.synthesis.mixing import Mixture, ground_of, tissue_depth
 from neeco.synthesis.settings import Settings
 
 FINE = Camera(torch.eye(4, dtype=torch.float64), 240.0, 240.0, 128.0, 96.0, 256, 192)
@@ -71,7 +71,7 @@ def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: S
     camera = Camera(at(500, 40, -30), 60.0, 60.0, 32.0, 24.0, 64, 48)
     tissue = ball_scene("own", [(0, 0, 50)], wall=130.0)
     mixture = Mixture.of(tissue, [near])
-    assert tissue_depth(tissue, CAMERA, np.array([0.0, 0, 60])) == pytest.approx(130.0, rel=0.02)
+    assert tissue_depth(ground_of(tissue), CAMERA, np.array([0.0, 0, 60])) == pytest.approx(130.0, rel=0.02)
     placed = mixture.place(near, ball_state("near", -8, 0, 60), CAMERA, CAMERA)["near"].pose
     assert placed[2, 3].item() == pytest.approx(90.0, abs=2.0)  # 40 mm before the wall
     assert placed[0, 3].item() / placed[2, 3].item() == pytest.approx(-8 / 60)  # on the same line of sight

@@ -17,7 +17,7 @@ from torch.nn.functional import grid_sample
 
 from neeco.raster.pinhole import project
 from neeco.raster.sh import SH_C0
-from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
+from neeco.raster.types import Camera, Gaussians, Rendering
 
 RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
@@ -46,7 +46,7 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     missing = torch.zeros_like(gaussians.opacities)
     for offset, strength in zip(shadow.offsets, shadow.strengths, strict=True):
         if float(strength.detach()) > 0:
-            missing = missing + strength * blocked(gaussians, shadow, offset, camera, draw)
+            missing = missing + strength * blocked(gaussians, shadow.casters, shadow.width, offset, camera, draw)
     sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA))
     return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
 
@@ -72,16 +72,14 @@ class _Dimmed(torch.autograd.Function):
         return grad * lit[:, None, None], to_lit
 
 
-def blocked(gaussians: Gaussians, shadow: Shadow, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
-    """Share [N] of the light of a lamp at `offset` [3] mm that the casters keep from each Gaussian; 0 for themselves.
-
-    Nothing but the casters and the width is read of `shadow`.
-    """
+def blocked(gaussians: Gaussians, casters: Tensor, width: Tensor, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
+    """Share [N] of the light of a lamp at `offset` [3] mm, of this `width` (slope), that the `casters` (bool [N]) keep
+    from each Gaussian; 0 for themselves."""
     at_light = _light_camera(camera, offset.detach())
     with torch.no_grad():
         bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None)
-        seen = draw(bare.select(shadow.casters), at_light)
-    sigma = shadow.width * at_light.fx
+        seen = draw(bare.select(casters), at_light)
+    sigma = width * at_light.fx
     down, across = (_blur(size, sigma) for size in seen.alpha.shape)
     alpha = down @ seen.alpha @ across  # [h, w]
     focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
@@ -92,7 +90,7 @@ def blocked(gaussians: Gaussians, shadow: Shadow, offset: Tensor, camera: Camera
         pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)  # [N, 2]; those behind fall outside
         weight, weighted = _look_up(summed, pixels, at_light).unbind(1)
         before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
-        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~shadow.casters
+        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~casters
     points, before = points[hit], before[hit]  # few: of these alone the gradient is wanted
     pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)

@@ -120,10 +120,14 @@ def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
 
 def shows_working_end(scene: Scene, state: State, camera: Camera) -> bool:
     """Whether any hinge or tip projects into the image; where none is known, any instrument's origin."""
-    ends = working_ends(scene, state)
-    if not ends:
-        ends = {name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()}
-    return any_in_image(camera, ends)
+    return any_in_image(camera, ends_or_origins(scene, state))
+
+
+def ends_or_origins(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
+    """The `working_ends`; where none is known, every instrument's origin [3] mm."""
+    return working_ends(scene, state) or {
+        name: [to_numpy(item.pose[:3, 3])] for name, item in scene.registered(state).instruments.items()
+    }
 
 
 def any_in_image(camera: Camera, points: Mapping[str, Sequence[np.ndarray]]) -> bool:

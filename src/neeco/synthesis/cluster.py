@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,10 @@ Made = list[tuple[Record, dict[str, bytes]]]  # of every image its record and it
 
 @dataclass(frozen=True)
 class Parcel:
-    """A source with the content of its files, by their place in it."""
+    """A source with the content of its files, by their place in it. Of the same content, equal: by its key."""
 
-    source: Source
-    files: Mapping[str, bytes]
+    source: Source = field(compare=False)
+    files: Mapping[str, bytes] = field(compare=False)
     key: str
 
     @classmethod
@@ -109,7 +109,7 @@ def _kept(output: Path, record: Record, files: Mapping[str, bytes]) -> Record:
 def _make_there(parcel: Parcel, indices: tuple[int, ...]) -> Made | str:
     """In the worker: the images, or in a line what is wrong."""
     try:
-        maker = _maker(_Keyed(parcel))
+        maker = _maker(parcel)
         with tempfile.TemporaryDirectory() as folder:
             made = []
             for index in indices:
@@ -123,21 +123,8 @@ def _make_there(parcel: Parcel, indices: tuple[int, ...]) -> Made | str:
         return str(error)
 
 
-@dataclass(frozen=True, eq=False)
-class _Keyed:
-    """A parcel that equals another of the same content."""
-
-    parcel: Parcel
-
-    def __hash__(self) -> int:
-        return hash(self.parcel.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Keyed) and self.parcel.key == other.parcel.key
-
-
 @lru_cache(maxsize=1)
-def _maker(keyed: _Keyed) -> Maker:
+def _maker(parcel: Parcel) -> Maker:
     """Opened once in a worker, whatever number of tasks it gets."""
     with tempfile.TemporaryDirectory() as folder:
-        return keyed.parcel.unpacked(Path(folder)).maker(threads=1)
+        return parcel.unpacked(Path(folder)).maker(threads=1)

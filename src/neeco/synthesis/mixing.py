@@ -19,18 +19,19 @@ from torch import Tensor, nn
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.evaluation.resize import resize_camera
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project
 from neeco.raster.sh import SH_C0
-from neeco.raster.types import Camera
+from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.hinges import PART_LOGITS
 from neeco.scene.recorded import Recorded
 from neeco.scene.rim import MADE_UP
 from neeco.scene.scene import Scene
-from neeco.synthesis.acceptance import working_ends
+from neeco.synthesis.acceptance import ends_or_origins
 from neeco.synthesis.samplers import make_sampler
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ class Mixture:
     casts: tuple[Scene, ...]  # whose instruments they are
     gains: tuple[tuple[float, float, float], ...]  # by which each cast's colours were multiplied
     nearest: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
+    ground: Gaussians  # the tissue alone
+    grounds: tuple[Gaussians, ...]  # the same of every cast
 
     @classmethod
     def of(cls, tissue: Scene, casts: Sequence[Scene]) -> Mixture:
@@ -69,10 +72,13 @@ class Mixture:
             raise NeecoError(f"--instruments: {twice[0]!r} is in two of the runs; mix runs whose instruments differ")
         if not names:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
+        if any(not scene.recorded.states for scene in (tissue, *casts)):
+            raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         gains = tuple(_gain(tissue, scene) for scene in casts)
         mixed = _composed(tissue, casts, gains)
         nearest = {name: _nearest(scene) for scene in casts for name in (item.name for item in scene.instruments)}
-        mixture = cls(mixed, tissue, tuple(casts), gains, nearest)
+        grounds = tuple(ground_of(scene) for scene in casts)
+        mixture = cls(mixed, tissue, tuple(casts), gains, nearest, ground_of(tissue), grounds)
         mixed.recorded = mixture._remembered()
         return mixture
 
@@ -97,7 +103,8 @@ class Mixture:
         camera_from_world = np.linalg.inv(to_numpy(seen_by.world_from_camera))
         end = _working_end(cast, state, seen_by)
         shift = np.eye(4)
-        here, there = tissue_depth(self.tissue, camera, end), tissue_depth(cast, seen_by, end)
+        own = self.grounds[self.casts.index(cast)]
+        here, there = tissue_depth(self.ground, camera, end), tissue_depth(own, seen_by, end)
         if here > 0 and there > 0 and end[2] > 0:
             nearest = min(self.nearest[name] for name in registered.instruments)
             depth = max(end[2] + here - there, min(nearest, end[2]))
@@ -111,8 +118,6 @@ class Mixture:
     def _remembered(self) -> Recorded:
         """Moments spread over the tissue's cameras, the casts' recorded states carried over."""
         cameras = self.tissue.recorded.cameras
-        if not cameras or any(not scene.recorded.states for scene in self.casts):
-            raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
         count = min(MOMENTS, len(cameras))
         chosen, states = [], []
         for k in range(count):
@@ -152,8 +157,7 @@ class MixedSampler:
 
 def _working_end(scene: Scene, state: State, camera: Camera) -> np.ndarray:
     """The mean [3] mm of the instruments' working ends in the camera's frame; of their origins where none is known."""
-    ends = [point for points in working_ends(scene, state).values() for point in points]
-    ends = ends or [to_numpy(given.pose)[:3, 3] for given in scene.registered(state).instruments.values()]
+    ends = [point for points in ends_or_origins(scene, state).values() for point in points]
     camera_from_world = np.linalg.inv(to_numpy(camera.world_from_camera))
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
 
@@ -166,19 +170,23 @@ def _nearest(scene: Scene) -> float:
 
 
 @torch.no_grad()
-def tissue_depth(scene: Scene, camera: Camera, point: np.ndarray) -> float:
-    """Depth mm of the scene's tissue on the line of sight through `point` [3] mm of the camera's frame; 0 for none.
+def ground_of(scene: Scene) -> Gaussians:
+    """The scene's tissue alone, which stands still; for its depth, so without its light."""
+    gaussians = scene.at(scene.recorded.states[0])
+    return dataclasses.replace(gaussians, sh=gaussians.sh[:, :1], headlight=None).select(scene.canonical.bodies == 0)
+
+
+@torch.no_grad()
+def tissue_depth(ground: Gaussians, camera: Camera, point: np.ndarray) -> float:
+    """Depth mm of a tissue alone on the line of sight through `point` [3] mm of the camera's frame; 0 for none.
 
     Beyond the image's border, that of the nearest pixel.
     """
-    width, height = (max(1, round(COARSE * size)) for size in (camera.width, camera.height))
-    shrink = COARSE * camera.fx, COARSE * camera.fy, COARSE * camera.cx, COARSE * camera.cy
-    coarse = Camera(camera.world_from_camera, *shrink, width, height, camera.near)
-    gaussians = scene.at(scene.recorded.states[0])
-    tissue = rasterize(gaussians.select(scene.canonical.bodies == 0), scene.camera(coarse))
-    x, y = project(point, *shrink, nearest=camera.near)
-    row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, height), (x, width)))
-    return float(surface_depth(tissue)[row, column])
+    coarse = resize_camera(camera, COARSE)
+    drawn = rasterize(ground, coarse)
+    x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
+    row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))
+    return float(surface_depth(drawn)[row, column])
 
 
 def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:

@@ -13,13 +13,12 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import InstrumentState, State
-from neeco.capture.similarity import RecordedStates
 from neeco.labels.annotation import place_in_image
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 from neeco.raster.types import Camera
 from neeco.synthesis.acceptance import working_ends
 from neeco.synthesis.states import rigid
-from neeco.synthesis.views import SIMILAR, moved_camera, surface_points
+from neeco.synthesis.views import LikeMoments, moved_camera, surface_points
 
 if TYPE_CHECKING:
     from neeco.scene import Recorded, Scene
@@ -62,8 +61,7 @@ class RecordedMotion:
             if 0 < b.time - a.time <= LONGEST_GAP and set(a.instruments) == set(b.instruments):
                 self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
                 states.append(a)
-        common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
-        self._known = RecordedStates(states, sorted(common)) if common else None
+        self._moments = LikeMoments(states, len(states), joints=True)
 
     @property
     def known(self) -> bool:
@@ -72,14 +70,11 @@ class RecordedMotion:
 
     def any(self, rng: Generator) -> Motion:
         """That of any moment."""
-        return self._motions[int(rng.integers(len(self._motions)))]
+        return self._motions[self._moments.any(rng)]
 
     def __call__(self, state: State, rng: Generator) -> Motion:
         """How `state` goes on."""
-        if self._known is None or self._known.still:
-            return self.any(rng)
-        nearest = np.argsort(self._known.distances(state), kind="stable")[:SIMILAR]
-        return self._motions[int(nearest[rng.integers(len(nearest))])]
+        return self._motions[self._moments.like(state, rng)]
 
 
 class MixedMotion:

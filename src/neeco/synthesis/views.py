@@ -27,6 +27,28 @@ class ViewSampler(Protocol):
     def __call__(self, state: State, rng: Generator) -> Camera: ...
 
 
+class LikeMoments:
+    """Picks one of `count` recorded moments (its index): of the SIMILAR whose instruments stood most like the drawn
+    ones, or any where nothing tells them apart. states: the moments'; empty: nothing does."""
+
+    def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
+        common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
+        known = RecordedStates(states, sorted(common), joints) if common else None
+        self._known = None if known is None or known.still else known
+        self._count = count
+
+    def any(self, rng: Generator) -> int:
+        """Any moment."""
+        return int(rng.integers(self._count))
+
+    def like(self, state: State, rng: Generator) -> int:
+        """A moment like `state`."""
+        if self._known is None or not set(self._known.instruments) <= set(state.instruments):
+            return self.any(rng)
+        nearest = np.argsort(self._known.distances(state), kind="stable")[:SIMILAR]
+        return int(nearest[rng.integers(len(nearest))])
+
+
 class RecordedViews:
     """The camera of a recorded frame, one of the SIMILAR whose instruments stood most like the drawn ones.
 
@@ -38,14 +60,10 @@ class RecordedViews:
         if not cameras:
             raise NeecoError("views: the scene remembers no recorded camera; train it again with this version")
         self.cameras = cameras
-        common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
-        self.known = RecordedStates(states, sorted(common), joints=False) if common else None
+        self._moments = LikeMoments(states, len(cameras), joints=False)
 
     def __call__(self, state: State, rng: Generator) -> Camera:
-        if self.known is None or self.known.still or not set(self.known.instruments) <= set(state.instruments):
-            return self.cameras[int(rng.integers(len(self.cameras)))]
-        nearest = np.argsort(self.known.distances(state), kind="stable")[:SIMILAR]
-        return self.cameras[int(nearest[rng.integers(len(nearest))])]
+        return self.cameras[self._moments.like(state, rng)]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
+from neeco.capture.poses import swap_camera_axes
 from neeco.files import write_json
 from neeco.labels.contours import bounding_box
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
@@ -50,8 +51,7 @@ def _camera(record: Record) -> dict[str, Any]:
     """Intrinsics, where the world is from here, and mm per count of the depth image."""
     given = record["intrinsics"]
     matrix = [given["fl_x"], 0.0, given["cx"], 0.0, given["fl_y"], given["cy"], 0.0, 0.0, 1.0]
-    # a record's camera is world_from_camera with OpenGL axes, as in transforms.json
-    pose = np.linalg.inv(np.array(record["camera"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    pose = np.linalg.inv(swap_camera_axes(np.array(record["camera"])))
     return {
         "cam_K": matrix,
         "depth_scale": DEPTH_MM_PER_COUNT,

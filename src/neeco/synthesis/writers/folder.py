@@ -162,10 +162,15 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        line = {key: value for key, value in record.items() if key not in ("files", "refused")}
+        line = told(record)
         line["labels"] = [_without_polygons(label) for label in record["labels"]]
         lines.append(json.dumps(line, allow_nan=False))
     write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
+
+
+def told(record: Record) -> dict[str, Any]:
+    """What a record says of its image, without what it says of the making."""
+    return {key: value for key, value in record.items() if key not in ("files", "refused")}
 
 
 def _without_polygons(label: dict[str, Any]) -> dict[str, Any]:

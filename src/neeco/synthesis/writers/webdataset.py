@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from neeco.files import write_atomically
-from neeco.synthesis.writers.folder import Record, stem
+from neeco.synthesis.writers.folder import Record, stem, told
 
 FOLDER = "webdataset"
 SHARD = 1000  # samples in a tar file
@@ -39,8 +39,7 @@ def _write_shard(root: Path, records: Sequence[Record], path: Path) -> None:
             key = stem(record["index"])
             for folder, ending in ENDINGS.items():
                 _add(tar, f"{key}.{ending}", (root / folder / f"{key}.png").read_bytes())
-            told = {name: value for name, value in record.items() if name not in ("files", "refused")}
-            _add(tar, f"{key}.json", json.dumps(told, allow_nan=False).encode())
+            _add(tar, f"{key}.json", json.dumps(told(record), allow_nan=False).encode())
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:

@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 
 from neeco.raster import rasterize
 from neeco.raster.shadow import GAMMA, blocked
-from neeco.raster.types import Gaussians, Shadow
+from neeco.raster.types import Gaussians
 from neeco.scene.scene import LAMPS
 from neeco.training.instruments.solid import spread
 from neeco.training.session import GaussianSession
@@ -72,9 +72,9 @@ def find_shadow(session: GaussianSession) -> None:
     """Add to the scene's lamps those that best explain what the tissue, the solid part of the instruments and the
     shadows of the lamps found before do not; none where none explains enough."""
     scene = session.scene
-    if not scene.instruments:
-        return
     free = [lamp for lamp in range(LAMPS) if float(scene.shadow_strengths[lamp]) <= 0]
+    if not scene.instruments or not free:
+        return
     offsets = _tried(2 * session.extent).to(scene.center)
     evidence = _ask(session, offsets)
     there = [scene.shadow_offsets[lamp] for lamp in range(LAMPS) if lamp not in free]
@@ -167,8 +167,7 @@ def _drawn(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tenso
     instrument = scene.canonical.bodies > 0
     kept = ~instrument | (posed.opacities > OPAQUE)
     posed, instrument = posed.select(kept), instrument[kept]
-    shadow = Shadow(instrument, offsets, offsets.new_zeros(len(offsets)), scene.shadow_width)
-    missed = [blocked(posed, shadow, offset, camera, rasterize) for offset in offsets]
+    missed = [blocked(posed, instrument, scene.shadow_width, offset, camera, rasterize) for offset in offsets]
     channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
     drawing = rasterize(posed, camera, channels=channels)
     assert drawing.channels is not None
