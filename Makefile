@@ -1,10 +1,10 @@
-# make demo | test | lint | bench. Everything happens in .venv; nothing outside this folder is touched.
+# make demo | test | lint | bench | viewer. Everything happens in .venv; nothing outside this folder is touched.
 
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find CMakeLists.txt native -type f 2>/dev/null)
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench viewer clean
 
 demo: .venv/installed
 	rm -rf demo
@@ -21,12 +21,23 @@ lint: .venv/installed
 bench: .venv/installed
 	$(BIN)/python benchmarks/raster.py
 
-# torch first: whatever needs it then finds the pinned one
-.venv/installed: pyproject.toml constraints.txt $(NATIVE)
+# The page's rasteriser, which the package carries: needed again where the kernels or native/web change. The toolchain
+# (0.4 GB) is no part of the environment.
+viewer: build/zig/bin/python
+	build/zig/bin/python -m ziglang c++ -target wasm32-wasi -mexec-model=reactor -std=c++17 -O3 -msimd128 -fno-exceptions \
+	  -fno-rtti -fno-math-errno -ffinite-math-only -fno-signed-zeros -fno-trapping-math -ffp-contract=off -DNDEBUG -Inative \
+	  native/web/viewer.cpp native/web/system.cpp native/rasterize.cpp native/binning.cpp native/memory.cpp \
+	  -Wl,--strip-all -Wl,--gc-sections -o src/neeco/viewer/viewer.wasm
+	chmod 644 src/neeco/viewer/viewer.wasm
+
+build/zig/bin/python:
+	$(PYTHON) -m venv build/zig
+	build/zig/bin/python -m pip install --quiet --require-hashes --only-binary :all: -r requirements/wasm.txt
+
+.venv/installed: pyproject.toml tools/install $(wildcard requirements/*.txt) $(NATIVE)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "neeco needs Python 3.11 or newer; try: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	tools/install $(BIN)/python --editable
 	touch $@
 
 clean:
