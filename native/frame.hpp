@@ -9,7 +9,11 @@
 
 namespace neeco {
 
-// Aligned for the widest vectors; large blocks ask for huge pages. Freed by std::free. Throws std::bad_alloc.
+// End a call that cannot be carried out, by an exception where there are any.
+[[noreturn]] void refuse(const char* why);
+[[noreturn]] void out_of_memory();
+
+// Aligned for the widest vectors; large blocks ask for huge pages. Freed by std::free. Ends in out_of_memory().
 void* allocate(size_t bytes);
 
 // Lets this process keep what it frees (up to 1 GiB) for its next allocations; false where the system has no such setting.
@@ -99,6 +103,7 @@ struct GaussianInputs {
     const float* falloff = nullptr;     // [N] or null: no headlight
     const float* vignette = nullptr;    // [2], with falloff
     const float* channels = nullptr;    // [N, C] or null
+    const float* gains = nullptr;       // [N] or null: by which colours are multiplied; not for the backward pass
 };
 
 struct Images {

@@ -14,6 +14,13 @@ struct LossInputs {
     double pixels;              // unmasked pixels
 };
 
+struct BlurInputs {
+    int height, width, reach;
+    const float* image;         // [H, W]
+    const float *down, *across;               // [2 reach + 1] windows
+    const float *down_slope, *across_slope;   // and their derivatives, where the plane's is wanted
+};
+
 struct AdamStep {
     float* parameter;
     const float* gradient;
@@ -21,6 +28,34 @@ struct AdamStep {
     float* square;              // exp_avg_sq
     size_t count;
     float lr, beta1, beta2, eps, correction1, correction2_root;
+};
+
+// The rows [first, first + count) of the Gaussians: one body, its parts turned about hinges, then moved to the world.
+struct Body {
+    int total;                  // Gaussians in all
+    int first, count;
+    int joints, logit_count;    // two parts turn with every joint, part 0 with none: 1 + 2 * joints <= logit_count
+    const float* means;         // [N, 3]
+    const float* quats;         // [N, 4]
+    const float* log_scales;    // [N, 3]
+    const float* logits;        // [N, logit_count], with joints
+    const float* numbers;       // kBodyNumbers and kHingeNumbers for every joint, or null: the body stands still
+    float roll;                 // rad about the shaft, of what lies before kSpinEnd
+};
+
+// Where the numbers of a body begin.
+constexpr int kPose = 0, kShaftOrigin = 12, kShaftDirection = 15, kSpinEnd = 18, kGateStart = 19, kGateWidth = 20, kLongest = 21,
+              kBodyNumbers = 22;
+// and of a hinge
+constexpr int kPivot = 0, kAxis = 3, kAngles = 6, kHingeNumbers = 8;
+
+// Of all Gaussians; as gradients, dL/d of what goes into or comes out of posing.
+struct PosedRows {
+    float* means;
+    float* quats;
+    float* scales;              // gradients: of log_scales where they go in
+    float* frames;              // world_from_sh; no gradient
+    float* logits;              // gradients only
 };
 
 struct Kernels {
@@ -33,6 +68,13 @@ struct Kernels {
     void (*project_backward)(Frame&, const GaussianInputs&, const GaussianGradients&);
     double (*photometric)(const LossInputs&, Buffer<float>& work, float* gradient);
     void (*adam)(const AdamStep&);
+    void (*blur)(const BlurInputs&, Buffer<float>& work, float* out, float* slope);  // slope: or null
+    // of harmonics [N, width], half: by how much of the constant one colours are more than harmonics say
+    void (*brighten)(int count, int width, float half, const float* sh, const float* factors, float* out);
+    void (*brighten_backward)(int count, int width, float half, const float* sh, const float* factors, const float* from, float* to_sh,
+                              float* to_factors);
+    void (*pose)(const Body&, const PosedRows&);
+    void (*pose_backward)(const Body&, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers);
 };
 
 // The table for this machine, or the one NEECO_SIMD asks for; throws std::runtime_error when that cannot run here.

@@ -1,5 +1,5 @@
 // Where buffers' memory comes from.
-#include <new>
+#include "frame.hpp"
 
 #ifdef __linux__
 #include <sys/mman.h>
@@ -8,8 +8,6 @@
 #include <malloc.h>
 #endif
 
-#include "frame.hpp"
-
 namespace neeco {
 
 void* allocate(size_t bytes) {
@@ -17,7 +15,7 @@ void* allocate(size_t bytes) {
     const bool large = bytes >= 2 * huge_page;
     const size_t alignment = large ? huge_page : line;
     void* memory = nullptr;
-    if (posix_memalign(&memory, alignment, (bytes + alignment - 1) / alignment * alignment) != 0) throw std::bad_alloc();
+    if (posix_memalign(&memory, alignment, (bytes + alignment - 1) / alignment * alignment) != 0) out_of_memory();
 #ifdef MADV_HUGEPAGE
     // Records, pieces and slots are visited in an order far from their own: with small pages, address translation alone
     // would cost as much as the memory. A refusal is harmless.

@@ -4,6 +4,8 @@
 namespace neeco {
 void bind_raster(nanobind::module_& m);
 void bind_loss(nanobind::module_& m);
+void bind_posing(nanobind::module_& m);
+void bind_shadow(nanobind::module_& m);
 }  // namespace neeco
 
 NB_MODULE(_native, m) {
@@ -12,4 +14,6 @@ NB_MODULE(_native, m) {
     m.doc() = "CPU kernels of neeco: use neeco.raster, not this.";
     neeco::bind_raster(m);
     neeco::bind_loss(m);
+    neeco::bind_posing(m);
+    neeco::bind_shadow(m);
 }

@@ -1,7 +1,6 @@
 // The stages in order, timed.
 #include <algorithm>
 #include <chrono>
-#include <stdexcept>
 
 #include "kernels.hpp"
 
@@ -26,7 +25,7 @@ int padded_values(int wanted) {
     if (wanted <= V) return V;
     NEECO_VALUES(NEECO_FITS)
 #undef NEECO_FITS
-    throw std::invalid_argument("more than 32 channels");
+    refuse("more than 32 channels");
 }
 
 void lay_out(Frame& f, const Kernels& k, const GaussianInputs& in) {
@@ -41,7 +40,7 @@ void lay_out(Frame& f, const Kernels& k, const GaussianInputs& in) {
     f.bands = std::min({2 * ((f.tiles_x + 31) / 32), kMostBands, f.tiles_x});
     f.band_columns = (f.tiles_x + f.bands - 1) / f.bands;
     f.bands = (f.tiles_x + f.band_columns - 1) / f.band_columns;
-    if (static_cast<int64_t>(f.tiles_x) * f.tiles_y >= int64_t{1} << kTileBits) throw std::invalid_argument("image too large");
+    if (static_cast<int64_t>(f.tiles_x) * f.tiles_y >= int64_t{1} << kTileBits) refuse("image too large");
     const size_t pixels = static_cast<size_t>(f.camera.width) * f.camera.height, n = in.count;
     f.records.reserve(n * f.record_stride);
     f.spans.reserve(n);

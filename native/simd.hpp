@@ -7,6 +7,8 @@
 
 #if defined(__SSE2__)
 #include <immintrin.h>
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
 #elif defined(__ARM_NEON)
 #include <arm_neon.h>
 #endif
@@ -66,6 +68,11 @@ NEECO_INLINE bool any(vi m) { return _mm_movemask_epi8((__m128i)m) != 0; }
 NEECO_INLINE vf root(vf x) { return (vf)_mm_sqrt_ps((__m128)x); }
 NEECO_INLINE vf lower(vf a, vf b) { return (vf)_mm_min_ps((__m128)a, (__m128)b); }
 NEECO_INLINE vf higher(vf a, vf b) { return (vf)_mm_max_ps((__m128)a, (__m128)b); }
+#elif defined(__wasm_simd128__)
+NEECO_INLINE bool any(vi m) { return wasm_v128_any_true((v128_t)m); }
+NEECO_INLINE vf root(vf x) { return (vf)wasm_f32x4_sqrt((v128_t)x); }
+NEECO_INLINE vf lower(vf a, vf b) { return (vf)wasm_f32x4_pmin((v128_t)b, (v128_t)a); }
+NEECO_INLINE vf higher(vf a, vf b) { return (vf)wasm_f32x4_pmax((v128_t)b, (v128_t)a); }
 #else
 NEECO_INLINE bool any(vi m) { return (m[0] | m[1] | m[2] | m[3]) != 0; }
 NEECO_INLINE vf root(vf x) { return (vf)vsqrtq_f32((float32x4_t)x); }
@@ -73,17 +80,38 @@ NEECO_INLINE vf lower(vf a, vf b) { return a < b ? a : b; }
 NEECO_INLINE vf higher(vf a, vf b) { return a > b ? a : b; }
 #endif
 
+// 1 / x for normal x, to the last digit but one: where the machine has an estimate, that made good by a step or two of Newton's
+// (the coarse ones would leave errors that are all of one sign, and quotients are multiplied up).
+NEECO_INLINE vf reciprocal(vf x) {
+#if defined(__AVX512F__) && NEECO_WIDTH == 16
+    const vf estimate = (vf)_mm512_rcp14_ps((__m512)x);
+    return estimate * (2.f - x * estimate);
+#elif defined(__AVX__) && NEECO_WIDTH == 8
+    const vf estimate = (vf)_mm256_rcp_ps((__m256)x), error = 1.f - x * estimate;
+    return estimate + estimate * (error + error * error);
+#else
+    return 1.f / x;
+#endif
+}
+
 // 2^x for |x| < 126, relative error 1e-7 (degree 5, fitted on [-1/2, 1/2]); outside it is garbage, never a trap.
 NEECO_INLINE vf exp2_fast(vf x) {
+#if defined(__AVX512DQ__) && NEECO_WIDTH == 16
+    const vf f = (vf)_mm512_reduce_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT);
+#else
     const float magic = 12582912.f;  // 1.5 * 2^23: adding it rounds to the nearest integer
     const vf shifted = x + magic;
     const vf f = x - (shifted - magic);
-    vf p = 1.3276470039e-3f * f + 9.6755416306e-3f;
-    p = p * f + 5.5507132822e-2f;
-    p = p * f + 2.4022119718e-1f;
-    p = p * f + 6.9314696706e-1f;
-    p = p * f + 1.0000000717f;
+#endif
+    // in pairs: shorter than one factor after the other
+    const vf f2 = f * f, low = 6.9314696706e-1f * f + 1.0000000717f, middle = 5.5507132822e-2f * f + 2.4022119718e-1f,
+             high = 1.3276470039e-3f * f + 9.6755416306e-3f;
+    const vf p = (high * f2 + middle) * f2 + low;
+#if defined(__AVX512DQ__) && NEECO_WIDTH == 16
+    return (vf)_mm512_scalef_ps((__m512)p, (__m512)(x - f));
+#else
     return (vf)((vi)p + (((vi)shifted) << 23));
+#endif
 }
 
 // log2 of positive normal x: exponent plus the odd series of atanh on [sqrt(1/2), sqrt(2)].
@@ -200,6 +228,24 @@ constexpr float kLowPass = 0.3f;                      // px^2
 constexpr int kStrip = W < 8 ? W : 8;
 constexpr int kRows = W / kStrip;
 constexpr int kTileHeight = W == 16 ? 64 : 32;
+
+
+// One row of a strip. Shorter than a vector where that holds two rows.
+typedef float vs __attribute__((vector_size(kStrip * 4)));
+typedef int32_t vsi __attribute__((vector_size(kStrip * 4)));
+NEECO_INLINE vs strip_iota() {
+    vs r;
+    for (int i = 0; i < kStrip; i++) r[i] = (float)i;
+    return r;
+}
+#if NEECO_WIDTH == 16
+NEECO_INLINE vs root(vs x) { return (vs)_mm256_sqrt_ps((__m256)x); }
+NEECO_INLINE vs lower(vs a, vs b) { return (vs)_mm256_min_ps((__m256)a, (__m256)b); }
+NEECO_INLINE vs higher(vs a, vs b) { return (vs)_mm256_max_ps((__m256)a, (__m256)b); }
+NEECO_INLINE vf both_rows(vs row) { return (vf)_mm512_broadcast_f32x8((__m256)row); }
+#else
+NEECO_INLINE vf both_rows(vs row) { return row; }
+#endif
 
 }  // namespace NEECO_VARIANT
 }  // namespace neeco

@@ -25,22 +25,22 @@ NEECO_INLINE uint32_t emit_pieces(const Frame& frame, const Ellipse& g, uint32_t
     if (last_x < first_x) return 0;
     const int first_strip = first_x / kStrip, last_strip = last_x / kStrip;
     uint32_t n = 0;
-    for (int base = first_strip; base <= last_strip; base += W) {
-        const vf column = (iota() + (float)base) * (float)kStrip - g.x;
-        const vf from = higher(column + 0.5f, all(-g.half_width));
-        const vf to = higher(lower(column + (kStrip - 0.5f), all(g.half_width)), from);
-        const vf at_top = lower(higher(all(g.peak), from), to), at_bottom = lower(higher(all(-g.peak), from), to);
-        const vf top = g.y + g.slope * at_top + root(higher(all(0.f), g.k0 - g.k1 * at_top * at_top));
-        const vf bottom = g.y + g.slope * at_bottom - root(higher(all(0.f), g.k0 - g.k1 * at_bottom * at_bottom));
-        const vf low = lower(higher(bottom - 0.501f, all(0.f)), all(height));
-        const vf high = lower(higher(top - 0.499f, all(-1.f)), all(height - 1.f));
-        vi first = to_int(low);
-        first -= to_float(first) < low;                // ceil
-        const vi last = to_int(high + 1.f) - 1;        // floor
-        int32_t firsts[W], lasts[W];
+    for (int base = first_strip; base <= last_strip; base += kStrip) {  // as many strips at a time as a strip has columns
+        const vs column = (strip_iota() + (float)base) * (float)kStrip - g.x, zero = {};
+        const vs from = higher(column + 0.5f, zero - g.half_width);
+        const vs to = higher(lower(column + (kStrip - 0.5f), zero + g.half_width), from);
+        const vs at_top = lower(higher(zero + g.peak, from), to), at_bottom = lower(higher(zero - g.peak, from), to);
+        const vs top = g.y + g.slope * at_top + root(higher(zero, g.k0 - g.k1 * at_top * at_top));
+        const vs bottom = g.y + g.slope * at_bottom - root(higher(zero, g.k0 - g.k1 * at_bottom * at_bottom));
+        const vs low = lower(higher(bottom - 0.501f, zero), zero + height);
+        const vs high = lower(higher(top - 0.499f, zero - 1.f), zero + (height - 1.f));
+        vsi first = __builtin_convertvector(low, vsi);
+        first -= __builtin_convertvector(first, vs) < low;            // ceil
+        const vsi last = __builtin_convertvector(high + 1.f, vsi) - 1;  // floor
+        int32_t firsts[kStrip], lasts[kStrip];
         std::memcpy(firsts, &first, sizeof first);
         std::memcpy(lasts, &last, sizeof last);
-        const int strips = lower(W, last_strip - base + 1);
+        const int strips = lower(kStrip, last_strip - base + 1);
         for (int i = 0; i < strips; i++) {
             const int a = firsts[i], b = lasts[i];
             if (a > b) continue;
@@ -116,7 +116,8 @@ NEECO_INLINE void project_batch(Frame& frame, const GaussianInputs& in, Chunk& c
     if (in.sh_count > 1) sh_basis(in.sh_count, direction_lanes(c, in, p, index).local, basis);
     else basis[0] = all(kSh0);
     add_sh(in.sh_count, in.sh, index, basis, color);
-    const vf light = in.falloff ? light_lanes(in, p, index).factor : all(1.f);
+    vf light = in.falloff ? light_lanes(in, p, index).factor : all(1.f);
+    if (in.gains) light *= gather(in.gains, index, 1);
     seen &= finite(color[0]) & finite(color[1]) & finite(color[2]) & finite(light);
     const vf a = -0.5f * kLog2E * p.cov_yy * inverse_det, b = kLog2E * p.cov_xy * inverse_det,
              cc = -0.5f * kLog2E * p.cov_xx * inverse_det;

@@ -4,6 +4,9 @@
 #include "adam.hpp"
 #include "project.hpp"
 #include "project_backward.hpp"
+#include "posing.hpp"
+#include "blur.hpp"
+#include "brighten.hpp"
 
 #define NEECO_TEXT2(x) #x
 #define NEECO_TEXT(x) NEECO_TEXT2(x)
@@ -15,7 +18,8 @@ namespace neeco {
 const Kernels& NEECO_JOIN(kernels_, NEECO_VARIANT)() {
     namespace v = NEECO_VARIANT;
     static const Kernels table = {NEECO_TEXT(NEECO_VARIANT), v::W, v::kStrip, v::kTileHeight, v::project, v::composite,
-                                  v::composite_backward, v::project_backward, v::photometric, v::adam};
+                                  v::composite_backward, v::project_backward, v::photometric, v::adam, v::blur, v::brighten,
+                                  v::brighten_backward, v::pose, v::pose_backward};
     return table;
 }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from neeco.raster.reference import (
     usable_gaussians,
 )
 from neeco.raster.sh import rotation_matrices
+
+TOLERANCE = 1e-3
 
 
 @dataclass
@@ -73,16 +75,21 @@ def leaves(scene: Scene, dtype: torch.dtype) -> tuple[dict[str, Tensor], Gaussia
     return t, gaussians, camera
 
 
+def on_cuda(scene: Scene) -> Scene:
+    """The same, where `draw` then draws."""
+    return replace(scene, tensors={name: tensor.cuda() for name, tensor in scene.tensors.items()})
+
+
 def draw(scene: Scene, dtype: torch.dtype, backend: str, weights: Tensor) -> tuple[Rendering, dict[str, Tensor]]:
     """The image, and the gradients of a weighted sum of everything drawn. weights [H, W], 0: left out."""
     t, gaussians, camera = leaves(scene, dtype)
     out = rasterize(gaussians, camera, channels=t.get("channels"), background=t["background"], backend=backend)
     g = torch.Generator().manual_seed(1)
-    loss = torch.zeros((), dtype=dtype)
+    loss = torch.zeros((), dtype=dtype, device=out.color.device)
     for image in (out.color, out.alpha, 0.01 * out.depth, out.channels):
         if image is not None:
             pixels = weights.reshape(weights.shape + (1,) * (image.dim() - 2))
-            loss = loss + (image * (pixels * torch.randn(image.shape, generator=g)).to(dtype)).sum()
+            loss = loss + (image * (pixels * torch.randn(image.shape, generator=g)).to(image)).sum()
     loss.backward()
     t["center_offsets"] = out.center_offsets
     return out, {k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in t.items() if k != "sh_frames"}
@@ -109,6 +116,24 @@ def decided_pixels(scene: Scene, tolerance: float = 1e-4) -> Tensor:
 
 def error(actual: Tensor, expected: Tensor) -> float:
     """|actual - expected| / |expected|, or |actual| where nothing is expected."""
-    expected = expected.detach().double()
+    expected = expected.detach().cpu().double()
     scale = expected.norm()
-    return float((actual.detach().double() - expected).norm() / (scale if scale > 1e-9 else 1.0))
+    return float((actual.detach().cpu().double() - expected).norm() / (scale if scale > 1e-9 else 1.0))
+
+
+def assert_same_as_reference(scene: Scene, backend: str = "cpu") -> None:
+    """Image, visibility and every gradient, where no cut-off leaves the choice to rounding."""
+    decided = decided_pixels(scene)
+    expected, expected_gradients = draw(scene, torch.float64, "reference", decided)
+    actual, gradients = draw(scene, torch.float32, backend, decided)
+    for name in ("color", "alpha", "depth", "channels"):
+        image, wanted = getattr(actual, name), getattr(expected, name)
+        assert (image is None) == (wanted is None)
+        if image is not None:
+            pixels = decided.reshape(decided.shape + (1,) * (image.dim() - 2))
+            assert error(image * pixels, wanted * pixels) < TOLERANCE, name
+    for name, wanted in expected_gradients.items():
+        assert error(gradients[name], wanted) < TOLERANCE, f"gradient of {name}"
+    assert bool((actual.visible | (expected.radii == 0)).all()), "a Gaussian that is drawn counts as visible"
+    both = actual.visible & (expected.radii > 0)
+    assert error(actual.radii[both], expected.radii[both]) < TOLERANCE

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, rasterize
-from neeco.raster.shadow import GAMMA
+from neeco.raster.shadow import GAMMA, Casting, _Behind, behind_reference
 from neeco.raster.types import Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
@@ -140,3 +142,36 @@ def gradient(value: Callable[[Tensor], Tensor], at: float) -> float:
 def slope(value: Callable[[Tensor], Tensor], at: float, step: float) -> float:
     with torch.no_grad():
         return float((value(torch.tensor(at + step)) - value(torch.tensor(at - step))) / (2 * step))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    size=st.tuples(st.integers(1, 40), st.integers(1, 30)),
+    count=st.integers(0, 300),
+    seed=st.integers(0, 2**31),
+    offset=st.tuples(*[st.floats(-20, 20, width=32)] * 3),
+)
+def test_the_kernel_finds_behind_what_the_reference_finds(
+    size: tuple[int, int], count: int, seed: int, offset: tuple[float, float, float]
+) -> None:
+    g = torch.Generator().manual_seed(seed)
+    camera = replace(CAMERA, width=size[0], height=size[1], cx=size[0] / 2, cy=size[1] / 2, fx=30.0, fy=25.0)
+    points = torch.randn(count, 3, generator=g) * 30 + torch.tensor([0.0, 0.0, 60.0])
+    casters = torch.rand(count, generator=g) < 0.2
+    alpha = torch.rand(size[1], size[0], generator=g) * (torch.rand(size[1], size[0], generator=g) < 0.7)
+    weighted = alpha * (40 + 30 * torch.rand(size[1], size[0], generator=g))
+    weights, lamp, found = torch.rand(count, generator=g), torch.tensor(offset), []
+    for dtype, function in ((torch.float32, _by_kernel), (torch.float64, behind_reference)):
+        among = Casting(casters, scene(), points.to(dtype))
+        opacity, at = (torch.tensor(t.tolist(), dtype=dtype).reshape(t.shape).requires_grad_() for t in (alpha, lamp))
+        share = function(opacity, weighted.to(dtype), at, among, camera)
+        (share * weights.to(dtype)).sum().backward()
+        found.append([share.detach(), opacity.grad, at.grad])
+    for ours, theirs in zip(*found, strict=True):
+        # at the edge of a pixel, or just as deep as what casts, rounding decides: of few
+        off = (ours.double() - theirs).abs()
+        assert float(off.sum()) <= 1e-3 + 0.01 * float(theirs.abs().sum())
+
+
+def _by_kernel(alpha: Tensor, weighted: Tensor, offset: Tensor, among: Casting, at_light: Camera) -> Tensor:
+    return _Behind.apply(alpha, weighted, offset, among, at_light)

@@ -6,6 +6,8 @@ a tensor for its value. So this is shown without a GPU.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 import numpy as np
 import pytest
 import torch
@@ -14,8 +16,11 @@ from torch import Tensor
 
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
+from neeco.scene.deformations import hexplane, nps, time_mlp
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.scene.methods import METHODS
+from neeco.scene.nerfies import scene as nerf_scene
+from neeco.scene.nerfies import warp
 from neeco.scene.nerfies.render import Rays
 from neeco.scene.nerfies.session import elastic_loss, robust
 from neeco.scene.scene import Scene
@@ -89,3 +94,28 @@ def test_a_field_and_its_losses_stay_on_the_device() -> None:
     assert all_meta(loss, *(parameter.grad for parameter in scene.parameters()))
     rendering = scene.draw(scene.recorded.states[0], scene.recorded.cameras[0])
     assert all_meta(rendering.color, rendering.alpha, rendering.depth)
+
+
+class TestProducts:
+    """Networks alone are multiplied with fewer bits; by what, their device decides."""
+
+    @pytest.fixture
+    def asked(self, monkeypatch: pytest.MonkeyPatch) -> list[torch.device]:
+        asked: list[torch.device] = []
+
+        def note(device: torch.device) -> AbstractContextManager[None]:
+            asked.append(device)
+            return nullcontext()
+
+        for module in (nps, time_mlp, hexplane, nerf_scene, warp):
+            monkeypatch.setattr(module, "quick_products", note)
+        return asked
+
+    def test_a_network_that_moves_gaussians(self, scene: Scene, asked: list[torch.device]) -> None:
+        scene.at(scene.recorded.states[3])
+        assert asked == ([META] if scene.deformation.large_operations else [])
+
+    def test_the_networks_of_a_field(self, asked: list[torch.device]) -> None:
+        scene = make_nerf(fine_samples=5).to(META)
+        scene.trace(Rays(*torch.ones(2, 7, 3, device=META), torch.zeros(7, dtype=torch.float64, device=META)))
+        assert asked == [META] * 4  # coarse and fine, each through the warp

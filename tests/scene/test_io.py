@@ -119,6 +119,7 @@ def test_a_missing_tensor_is_refused(kinematic: Scene, tmp_path: Path, drop: str
         ("canonical.sh_dc", lambda tensor: tensor[..., :2], "sh_dc has shape"),
         ("canonical.extras.part_logits", lambda tensor: tensor[:-1], "extras.part_logits has shape"),
         ("canonical.means", lambda tensor: tensor * torch.nan, "means contains NaN"),
+        ("module.vignette", lambda tensor: tensor / 0, "vignette contains NaN"),
         ("recorded.poses", lambda tensor: tensor[:1], "out of bounds"),
     ],
 )
@@ -141,4 +142,40 @@ def test_a_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
 
 def test_no_file_is_no_scene(tmp_path: Path) -> None:
     with pytest.raises(NeecoError, match="no such scene"):
+        load_scene(tmp_path / "scene.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("tensor", "value", "told"),
+    [
+        ("recorded.cameras", 0.0, "the recorded pose of camera in frame 0 is no rigid transform"),
+        ("recorded.cameras", float("nan"), "the recorded pose of camera in frame 0 is no rigid transform"),
+        ("recorded.poses", 7.0, "the recorded pose of grasper in frame 0 is no rigid transform"),
+    ],
+)
+def test_recorded_poses_that_are_none_are_refused(
+    tensor: str, value: float, told: str, any_scene: Scene, tmp_path: Path
+) -> None:
+    tensors, header = pack_scene(any_scene)
+    if tensor not in tensors:
+        pytest.skip("it has no instrument")
+    tensors[tensor] = torch.full_like(tensors[tensor], value)
+    save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
+    with pytest.raises(NeecoError, match=rf"scene.safetensors: damaged scene \({told}\)"):
+        load_scene(tmp_path / "scene.safetensors")
+
+
+@pytest.mark.parametrize("change", [{"recorded": 3}, {"instruments": [{"name": 1}]}, {"deformation": []}])
+def test_a_header_built_otherwise_is_refused(change: dict[str, object], any_scene: Scene, tmp_path: Path) -> None:
+    tensors, header = pack_scene(any_scene)
+    save_tensors(tensors, {"neeco": json.dumps(header | change)}, tmp_path / "scene.safetensors")
+    with pytest.raises(NeecoError, match=r"scene.safetensors: header: .*; it is damaged; train again"):
+        load_scene(tmp_path / "scene.safetensors")
+
+
+def test_half_a_character_is_refused(kinematic: Scene, tmp_path: Path) -> None:
+    tensors, header = pack_scene(kinematic)
+    header["diagnostics"] = {"note": "\ud800"}
+    save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
+    with pytest.raises(NeecoError, match=r"damaged scene .*half a character"):
         load_scene(tmp_path / "scene.safetensors")

@@ -13,9 +13,9 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS, Spin
-from neeco.scene.rotations import quat_to_matrix, rotate_about
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
 UNIT = torch.nn.functional.normalize
@@ -180,9 +180,10 @@ def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene
 
 
 def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
-    hinges, points = kinematic.deformation.hinges_of(0), kinematic.canonical.means[TISSUE:]
+    hinges, state = kinematic.deformation.hinges_of(0), grasper_state(pose_of(0, 0, 0, 0, 0, 0))
+    assign(kinematic, 0)
     origin, direction = hinges.shaft()
-    spun, _ = hinges.spin(points, kinematic.canonical.quats[TISSUE:], 2.0)
+    points, spun = (kinematic.at(state, Spin(shaft_roll=roll)).means[TISSUE:] for roll in (0.0, 2.0))
     distances = [torch.linalg.cross(p - origin, direction.expand_as(p)).norm(dim=1) for p in (points, spun)]
     assert torch.allclose(*distances, atol=1e-4)
     assert torch.allclose(hinges.along_shaft(spun), hinges.along_shaft(points), atol=1e-4)

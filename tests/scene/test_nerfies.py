@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.raster.rotations import skew
 from neeco.scene.encoding import encode_by_octave, window
 from neeco.scene.nerfies.render import composite, even_depths, finer_depths
 from neeco.scene.nerfies.scene import NerfScene
@@ -19,7 +20,6 @@ from neeco.scene.nerfies.session import elastic_loss, robust
 from neeco.scene.nerfies.settings import PUBLISHED, NerfiesSettings
 from neeco.scene.nerfies.warp import WarpField, move_by_screw
 from neeco.scene.recorded import Recorded
-from neeco.scene.rotations import skew
 from neeco.scene.scene import gaussian_scene
 
 

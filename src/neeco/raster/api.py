@@ -1,19 +1,22 @@
-"""`rasterize`: one entry point, three backends."""
+"""`rasterize`: one entry point, four backends."""
 
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.raster.devices import cuda_backend
 from neeco.raster.native import goes_native
 from neeco.raster.shadow import shadowed
+from neeco.raster.triton.ready import require_triton
 from neeco.raster.types import Camera, Gaussians, Rendering
 
-BACKENDS = ("auto", "reference", "cpu", "cuda")
+BACKENDS = ("auto", "reference", "cpu", "cuda", "triton")
 SH_COUNTS = (1, 4, 9, 16)
 
 
@@ -29,9 +32,10 @@ def rasterize(
 
     channels [N, C], C <= 32: composited like colour over background 0. background [3]: what lies behind; by default
     the Gaussians' background, or black.
-    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat), or
-    "auto": cuda for tensors on a CUDA device, cpu for those on the CPU, reference on other devices and where
-    `kernels("torch")` asks for it. The camera's pose may stay on the CPU.
+    backend: "cpu" (native, float32), "reference" (plain torch, any float type and device, slow), "cuda" (gsplat),
+    "triton" (neeco's own, float32, on a CUDA device), or "auto": for tensors on a CUDA device cuda where gsplat is
+    installed, else triton; cpu for those on the CPU, reference on other devices and where `kernels("torch")` asks for
+    it. The camera's pose may stay on the CPU.
 
     Defined by the reference:
     - the projected covariance gets 0.3 px^2 on its diagonal; the projection is linearised at the mean, moved to within
@@ -50,10 +54,13 @@ def rasterize(
     if background is None:
         background = gaussians.background
     _check(gaussians, camera, channels, background)
+    if channels is not None and channels.shape[1] == 0:  # no kernel need know of none
+        drawn = rasterize(gaussians, camera, background=background, backend=backend)
+        return replace(drawn, channels=drawn.color.new_zeros((camera.height, camera.width, 0)))
     gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if goes_native(gaussians.means) else "reference"
-        backend = "cuda" if gaussians.means.is_cuda else on_cpu
+        backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
     if backend == "reference":
         from neeco.raster.reference import rasterize_reference
 
@@ -68,6 +75,11 @@ def rasterize(
         from neeco.raster.cuda import rasterize_cuda
 
         return rasterize_cuda(gaussians, camera, channels, background)
+    if backend == "triton":
+        require_triton(gaussians.means.device)
+        from neeco.raster.triton.backend import rasterize_triton
+
+        return rasterize_triton(gaussians, camera, channels, background)
     raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
 
 

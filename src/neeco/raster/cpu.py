@@ -17,12 +17,6 @@ def rasterize_cpu(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
     """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
-    if channels is not None and channels.shape[1] == 0:
-        rendering = rasterize_cpu(gaussians, camera, None, background)
-        empty = rendering.color.new_zeros((camera.height, camera.width, 0))
-        return Rendering(
-            rendering.color, rendering.alpha, rendering.depth, empty, rendering.radii, rendering.center_offsets
-        )
     light = gaussians.headlight
     differentiable = [
         gaussians.means,

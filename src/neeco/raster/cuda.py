@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from neeco.raster.on_device import constant
 from neeco.raster.reference import camera_from_world, usable_gaussians
 from neeco.raster.sh import headlight_factor, sh_colors
 from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
@@ -36,11 +37,9 @@ def rasterize_cuda(
     if channels is not None:
         values = torch.cat([values, channels[index].float()], dim=-1)
 
-    last_row = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=device)
+    last_row = constant((0.0, 0.0, 0.0, 1.0), device)[None]
     view = torch.cat([torch.cat([rotation, translation[:, None]], dim=1), last_row])  # camera_from_world
-    intrinsics = torch.tensor(
-        [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device
-    )
+    intrinsics = constant((camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0), device).view(3, 3)
     images, alphas, info = rasterization(
         means,
         gaussians.quats[index].float(),

@@ -1,7 +1,8 @@
-"""The photometric loss of 3DGS, (1 - w) L1 + w (1 - SSIM): its definition for any device, and a fused native kernel."""
+"""The photometric loss of 3DGS, (1 - w) L1 + w (1 - SSIM): its definition for any device, and the fused kernels."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,8 +11,11 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from neeco.errors import NeecoError
-from neeco.raster.native import goes_native, native
+from neeco.raster.native import all_native, native
+from neeco.raster.triton.ready import goes_triton
 
+# image, target, mask, weight of SSIM, whether the gradient is wanted: the loss [] and the gradient
+Kernel = Callable[[Tensor, Tensor, Tensor | None, float, bool], tuple[Tensor, Tensor | None]]
 WINDOW = 11  # px, side of the Gaussian window
 SIGMA = 1.5  # px
 C1, C2 = 1e-4, 9e-4  # (0.01)^2 and (0.03)^2 for images in [0, 1]
@@ -23,16 +27,16 @@ def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, 
     image, target [H, W, 3] in [0, 1]; mask [H, W] bool, False where the loss must not look. A mask multiplies both
     images before anything is compared, and both means run over its True pixels; with none of those the loss is 0.
     SSIM (Wang et al. 2004) with an 11 x 11 Gaussian window of sigma 1.5, zero padding, C1 = 1e-4, C2 = 9e-4, each
-    colour apart, as in 3DGS. float32 on the CPU takes the native kernel, everything else the definition; all tensors
-    are on one device. Raises NeecoError where shapes do not fit.
+    colour apart, as in 3DGS. float32 on the CPU takes the native kernel, float32 on a CUDA device with Triton kernels
+    that give the same bits every time (not run on a GPU), everything else the definition; all tensors are on one
+    device. Raises NeecoError where shapes do not fit.
     """
-    if not (goes_native(image) and image.dtype == torch.float32):
+    native_kernel = all_native(image)
+    if not native_kernel and not goes_triton(image):
         return photometric_loss_reference(image, target.detach(), mask, ssim_weight)
     _check(image, target, mask)
-    pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
-    if pixels == 0:
-        return 0.0 * image.sum()
-    return _Photometric.apply(image, target, mask, pixels, ssim_weight)
+    kernel = _by_native if native_kernel else _by_triton
+    return _Photometric.apply(image, target, mask, ssim_weight, kernel)
 
 
 def photometric_loss_reference(
@@ -68,27 +72,39 @@ def _blur(planes: Tensor) -> Tensor:
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, pixels: float, ssim_weight: float
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, kernel: Kernel
     ) -> Tensor:
-        plain = image.detach().contiguous()
-        gradient = torch.empty_like(plain) if ctx.needs_input_grad[0] else None
-        loss = native().photometric(
-            plain,
-            target.detach().to(torch.float32).contiguous(),
-            None if mask is None else mask.to(torch.float32).contiguous(),
-            ssim_weight,
-            pixels,
-            gradient,
-        )
+        plain, seen = image.detach().contiguous(), target.detach().to(torch.float32).contiguous()
+        loss, gradient = kernel(plain, seen, mask, ssim_weight, ctx.needs_input_grad[0])
         if gradient is not None:
             ctx.save_for_backward(gradient)
-        return torch.tensor(loss, dtype=image.dtype)
+        return loss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *outer: Tensor) -> Any:
         (gradient,) = ctx.saved_tensors
         return gradient * outer[0], None, None, None, None
+
+
+def _by_native(
+    image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, wanted: bool
+) -> tuple[Tensor, Tensor | None]:
+    pixels = float(target.shape[0] * target.shape[1]) if mask is None else float(mask.sum())
+    if pixels == 0:
+        return image.new_zeros(()), torch.zeros_like(image) if wanted else None
+    gradient = torch.empty_like(image) if wanted else None
+    counts = None if mask is None else mask.to(torch.float32).contiguous()
+    loss = native().photometric(image, target, counts, ssim_weight, pixels, gradient)
+    return torch.tensor(loss, dtype=image.dtype), gradient
+
+
+def _by_triton(
+    image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, wanted: bool
+) -> tuple[Tensor, Tensor | None]:
+    from neeco.raster.triton.photometric import photometric
+
+    return photometric(image, target, None if mask is None else mask.contiguous(), ssim_weight, wanted)
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

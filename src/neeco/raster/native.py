@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Literal, get_args
 
+import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
@@ -43,3 +44,8 @@ def kernels(family: Family) -> Iterator[None]:
 def goes_native(tensor: Tensor) -> bool:
     """Whether the native kernels work on `tensor`: it is on the CPU, and `kernels("torch")` is not in force."""
     return tensor.device.type == "cpu" and _family.get() == "native"
+
+
+def all_native(*tensors: Tensor) -> bool:
+    """Whether native kernels, which know float32 alone, work on `tensors` as they are."""
+    return all(goes_native(tensor) and tensor.dtype == torch.float32 for tensor in tensors)

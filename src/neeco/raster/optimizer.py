@@ -1,18 +1,37 @@
-"""Adam: one native pass per tensor on the CPU, plain torch elsewhere.
+"""Adam: one native pass per tensor on the CPU, one Triton launch for all tensors on CUDA, plain torch elsewhere.
 
 The moments are plain tensors that belong to the caller: density control edits their rows, checkpoints save them.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.raster.native import goes_native, native
+from neeco.raster.native import all_native, native
+from neeco.raster.triton.ready import goes_triton
+
+BETAS = (0.9, 0.999)
+EPS = 1e-15  # as in 3DGS
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class Update:
+    """One tensor's share of a step. All have the parameter's shape [N, ...], type and device."""
+
+    parameter: Tensor
+    gradient: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    lr: float
+    step: int  # counts from 1
+
+
 def adam_step(
     param: Tensor,
     grad: Tensor,
@@ -21,30 +40,60 @@ def adam_step(
     *,
     lr: float,
     step: int,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPS,
 ) -> None:
-    """One step of Adam (Kingma and Ba 2015), in place, without autograd.
+    """One step of Adam (Kingma and Ba 2015), in place, without autograd: `adam_steps` of one tensor, whose gradient may
+    be of another float type."""
+    adam_steps([Update(param, grad.detach().to(param.dtype), exp_avg, exp_avg_sq, lr, step)], betas, eps)
 
-    All tensors have param's shape [N, ...] and device, the moments its type too. step counts from 1. float32 on the CPU
-    takes the native kernel, needs contiguous tensors, and gives the same bits from the same inputs, whatever the number
-    of threads. Raises NeecoError where tensors do not fit.
+
+@torch.no_grad()
+def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, eps: float = EPS) -> None:
+    """A step of Adam for each of several tensors, in place, without autograd.
+
+    float32 on the CPU takes the native kernel, float32 on a CUDA device with Triton one launch of a kernel for all
+    tensors there (not run on a GPU), everything else plain torch. Both kernels need contiguous tensors, and give the
+    same bits from the same inputs, the native one whatever the number of threads. Raises NeecoError where tensors do
+    not fit.
     """
-    if step < 1:
-        raise NeecoError(f"adam_step: step: {step}; counts from 1")
-    gradient = grad.detach().to(param.dtype)
-    for name, tensor in (("grad", gradient), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if _kind(tensor) != _kind(param):
-            raise NeecoError(f"adam_step: {name}: {_kind(tensor)}; expected {_kind(param)}, as the parameter")
-    if not (goes_native(param) and param.dtype == torch.float32):
-        param.sub_(lr * adam_update(gradient, exp_avg, exp_avg_sq, step, betas, eps))
-        return
-    for name, tensor in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if not tensor.is_contiguous():
-            raise NeecoError(f"adam_step: {name}: must be contiguous")
-    native().adam(param.detach(), gradient.contiguous(), exp_avg, exp_avg_sq, lr, step, *betas, eps)
-    # Autograd notices in-place changes by this counter, which native code does not touch.
-    torch.autograd.graph.increment_version(param)
+    together: list[Update] = []
+    for update in updates:
+        _check(update)
+        parameter = update.parameter
+        by_triton = goes_triton(parameter)
+        if not by_triton and not all_native(parameter):
+            moved = adam_update(update.gradient, update.exp_avg, update.exp_avg_sq, update.step, betas, eps)
+            parameter.sub_(update.lr * moved)
+            continue
+        for name in ("parameter", "exp_avg", "exp_avg_sq"):
+            if not getattr(update, name).is_contiguous():
+                raise NeecoError(f"adam_step: {name}: must be contiguous")
+        if by_triton:
+            together.append(update)
+        else:
+            _step_native(update, betas, eps)
+    if together:
+        from neeco.raster.triton.adam import step_together
+
+        tensors = [(u.parameter, u.gradient.contiguous(), u.exp_avg, u.exp_avg_sq) for u in together]
+        step_together(tensors, [(u.lr, u.step) for u in together], betas, eps)
+    # Autograd notices in-place changes by this counter, which no kernel touches.
+    for update in updates:
+        torch.autograd.graph.increment_version(update.parameter)
+
+
+def _step_native(update: Update, betas: tuple[float, float], eps: float) -> None:
+    native().adam(
+        update.parameter.detach(),
+        update.gradient.contiguous(),
+        update.exp_avg,
+        update.exp_avg_sq,
+        update.lr,
+        update.step,
+        *betas,
+        eps,
+    )
 
 
 @torch.no_grad()
@@ -57,36 +106,52 @@ def adam_update(
     return mean / (1 - betas[0] ** step) / ((square / (1 - betas[1] ** step)).sqrt() + eps)
 
 
+def _check(update: Update) -> None:
+    if update.step < 1:
+        raise NeecoError(f"adam_step: step: {update.step}; counts from 1")
+    wanted = _kind(update.parameter)
+    for name in ("gradient", "exp_avg", "exp_avg_sq"):
+        if _kind(getattr(update, name)) != wanted:
+            raise NeecoError(f"adam_step: {name}: {_kind(getattr(update, name))}; expected {wanted}, as the parameter")
+
+
 def _kind(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)} on {tensor.device}"
 
 
 class Adam:
-    """One learning rate per call; each tensor keeps its own step count (Kingma & Ba 2015, eps 1e-15 as in 3DGS)."""
+    """Every tensor has its learning rate, step by step, and keeps its own step count (eps 1e-15 as in 3DGS).
 
-    def __init__(self) -> None:
+    `views`: over how many images the gradients of a step are means. Rates, which are stated for one, are multiplied by
+    its root, and the betas taken to that power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training"; to
+    first order also gsplat's rule): so many images then move a tensor, and are remembered, about as one by one.
+    """
+
+    def __init__(self, views: int = 1) -> None:
+        self.rate_scale = math.sqrt(views)
+        self.betas = (BETAS[0] ** views, BETAS[1] ** views)
         self.first: dict[str, Tensor] = {}
         self.second: dict[str, Tensor] = {}
         self.steps: dict[str, int] = {}
 
     @torch.no_grad()
-    def step(self, name: str, parameter: Tensor, learning_rate: float) -> None:
-        """Update `parameter` in place by its gradient and clear the gradient. Without a gradient nothing happens."""
-        if parameter.grad is None:
-            return
-        if name not in self.first:
-            self.first[name], self.second[name] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-            self.steps[name] = 0
-        self.steps[name] += 1
-        adam_step(
-            parameter.detach(),
-            parameter.grad.contiguous(),
-            self.first[name],
-            self.second[name],
-            lr=learning_rate,
-            step=self.steps[name],
-        )
-        parameter.grad = None
+    def step(self, learned: Iterable[tuple[str, Tensor, float]]) -> None:
+        """Update parameters, given with their names and learning rates, in place by their gradients, and clear those.
+
+        Without a gradient nothing happens.
+        """
+        updates = []
+        for name, parameter, rate in learned:
+            if parameter.grad is None:
+                continue
+            if name not in self.first:
+                self.first[name], self.second[name] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                self.steps[name] = 0
+            self.steps[name] += 1
+            moments, lr = (self.first[name], self.second[name]), self.rate_scale * rate
+            updates.append(Update(parameter.detach(), parameter.grad.contiguous(), *moments, lr, self.steps[name]))
+            parameter.grad = None
+        adam_steps(updates, self.betas)
 
     def select_rows(self, names: list[str], index: Tensor, fresh: Tensor) -> None:
         """Keep the moments of rows `index` [M]; rows marked `fresh` [M] start at zero."""

@@ -59,8 +59,8 @@ def pixel_centers(rows: int, columns: int) -> Tensor:
 def in_image(points: Tensor, camera: Camera) -> Tensor:
     """[P] bool: which points [P, 3] mm of the world fall into the camera's image, whatever stands before them."""
     pixels, depths = project_world(points, camera)
-    size = pixels.new_tensor([camera.width, camera.height])
-    return ((pixels >= 0) & (pixels < size)).all(1) & (depths > camera.near)
+    u, v = pixels.unbind(-1)
+    return (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > camera.near)
 
 
 def _intrinsic(points: Array, camera: Camera, nearest: float | None) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from neeco.raster.pinhole import field_slopes
 from neeco.raster.types import Camera, Headlight
 
 SH_C0 = 0.28209479177387814  # the constant harmonic
+HALF = 0.5 / SH_C0  # by how much of it colours are more than harmonics say
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -48,6 +49,13 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(basis, dim=-1)
+
+
+def brightened(sh: Tensor, factor: Tensor) -> Tensor:
+    """Harmonics [N, K, 3] with the colours, half a unit more than they say, multiplied by `factor` [N, 1, 1] or [3]."""
+    lit = sh * factor
+    lit[:, :1] += HALF * (factor - 1)
+    return lit
 
 
 def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tensor | None) -> Tensor:

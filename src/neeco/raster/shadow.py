@@ -8,26 +8,28 @@ Only brightness changes; nothing is added to the image, and labels know nothing 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
+from neeco.raster.blur import blur
+from neeco.raster.native import all_native, native
+from neeco.raster.on_device import constant
 from neeco.raster.pinhole import project
-from neeco.raster.sh import SH_C0
+from neeco.raster.sh import HALF, brightened
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
-TAPS = 6  # map pixels to each side of the blur's middle, which is cut off there
 GAMMA = 2.2  # of stored images, about
 DARKEST = 0.01  # of the light reaches any place
 FAINT = 1e-4  # of a lamp's light: less is not missed
 NEAR = 1e-6
 NEAREST = 1e-3  # mm
-HALF = 0.5 / SH_C0
 
 Draw = Callable[[Gaussians, Camera], Rendering]
 
@@ -41,12 +43,15 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     if light is None or light.shadow is None:
         return gaussians
     shadow = light.shadow
-    if bool(shadow.casters.all()) or not bool(shadow.casters.any()):  # nothing to fall on, or nothing that falls
+    casters, lit = shadow.casters, shadow.strengths.detach() > 0
+    every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # the device is asked once
+    if every or not some:  # nothing to fall on, or nothing that falls
         return gaussians
     missing = torch.zeros_like(gaussians.opacities)
-    for offset, strength in zip(shadow.offsets, shadow.strengths, strict=True):
-        if float(strength.detach()) > 0:
-            missing = missing + strength * blocked(gaussians, shadow.casters, shadow.width, offset, camera, draw)
+    among = Casting.of(gaussians, casters, camera)
+    for shining, offset, strength in zip(shines, shadow.offsets, shadow.strengths, strict=True):
+        if shining:
+            missing = missing + strength * blocked(among, shadow.width, offset, camera, draw)
     sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA))
     return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
 
@@ -54,47 +59,105 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
 class _Dimmed(torch.autograd.Function):
     """Harmonics [N, K, 3] whose colour, half a unit more than they say, is multiplied by `lit` [N].
 
-    Written out since torch's own steps would fill and add up several tensors of this size.
+    Written out since torch's own steps would fill and add up several tensors of this size. float32 on the CPU takes the
+    native kernel.
     """
 
     @staticmethod
     def forward(ctx: Any, sh: Tensor, lit: Tensor) -> Tensor:
         ctx.save_for_backward(sh, lit)
-        dimmed = sh * lit[:, None, None]
-        dimmed[:, 0] += (HALF * (lit - 1))[:, None]
-        return dimmed
+        if not all_native(sh, lit):
+            return brightened(sh, lit[:, None, None])
+        out = sh.new_empty(sh.shape)
+        native().brighten(sh.detach().contiguous(), lit.detach().contiguous(), HALF, out)
+        return out
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         sh, lit = ctx.saved_tensors
         (grad,) = grads
-        to_lit = (grad.flatten(1) * sh.flatten(1)).sum(1) + HALF * grad[:, 0].sum(1)
-        return grad * lit[:, None, None], to_lit
+        if not all_native(sh, lit):
+            to_lit = (grad.flatten(1) * sh.flatten(1)).sum(1) + HALF * grad[:, 0].sum(1)
+            return grad * lit[:, None, None], to_lit
+        to_sh, to_lit = sh.new_empty(sh.shape), lit.new_empty(lit.shape)
+        native().brighten_backward(
+            sh.detach().contiguous(), lit.detach().contiguous(), HALF, grad.contiguous(), to_sh, to_lit
+        )
+        return to_sh, to_lit
 
 
-def blocked(gaussians: Gaussians, casters: Tensor, width: Tensor, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
-    """Share [N] of the light of a lamp at `offset` [3] mm, of this `width` (slope), that the `casters` (bool [N]) keep
-    from each Gaussian; 0 for themselves."""
+@dataclass(frozen=True)
+class Casting:
+    """Those that cast and those that may stand behind them, as a camera sees them: the same for every lamp."""
+
+    casters: Tensor  # [N] bool
+    bare: Gaussians  # the casters, as opaque as they are and of no particular colour
+    points: Tensor  # [N, 3] mm, means of all in the camera's frame
+
+    @staticmethod
+    @torch.no_grad()
+    def of(gaussians: Gaussians, casters: Tensor, camera: Camera) -> Casting:
+        """Of all the Gaussians and which of them cast, bool [N]."""
+        bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None).select(casters)
+        pose = camera.world_from_camera.to(gaussians.means)
+        return Casting(casters, bare, (gaussians.means - pose[:3, 3]) @ pose[:3, :3])
+
+
+def blocked(among: Casting, width: Tensor, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
+    """Share [N] of the light of a lamp at `offset` [3] mm, of this `width` (slope), that the casters keep from each
+    Gaussian; 0 for themselves."""
     at_light = _light_camera(camera, offset.detach())
     with torch.no_grad():
-        bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None)
-        seen = draw(bare.select(casters), at_light)
+        seen = draw(among.bare, at_light)
     sigma = width * at_light.fx
-    down, across = (_blur(size, sigma) for size in seen.alpha.shape)
-    alpha = down @ seen.alpha @ across  # [h, w]
+    alpha = blur(seen.alpha, sigma)  # [h, w]
+    with torch.no_grad():
+        weighted = blur(seen.alpha * seen.depth, sigma)  # [h, w]
+    if all_native(alpha, among.points):
+        return _Behind.apply(alpha, weighted, offset, among, at_light)
+    return behind_reference(alpha, weighted, offset, among, at_light)
+
+
+def behind_reference(alpha: Tensor, weighted: Tensor, offset: Tensor, among: Casting, at_light: Camera) -> Tensor:
+    """Share [N] of a lamp's light that misses each Gaussian: what its map (opacity `alpha` [h, w], and that times
+    depth, `weighted`) shows before it. Gradients reach the map's opacity and the lamp's offset [3] mm. Any float type
+    and device."""
     focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
     with torch.no_grad():
-        summed = torch.stack([alpha, down @ (seen.alpha * seen.depth) @ across], -1)  # [h, w, 2]
-        pose = camera.world_from_camera.to(gaussians.means)
-        points = (gaussians.means - pose[:3, 3]) @ pose[:3, :3]  # [N, 3] camera frame
+        summed = torch.stack([alpha, weighted], -1)  # [h, w, 2]
+        points = among.points
         pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)  # [N, 2]; those behind fall outside
-        weight, weighted = _look_up(summed, pixels, at_light).unbind(1)
-        before = (weighted / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
-        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~casters
-    points, before = points[hit], before[hit]  # few: of these alone the gradient is wanted
+        weight, sums = _look_up(summed, pixels, at_light).unbind(1)
+        before = (sums / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
+        hit = (weight > FAINT) & (points[:, 2] - offset[2] > before) & ~among.casters
+    few = hit.nonzero()[:, 0]  # of these alone the gradient is wanted
+    points, before = points[few], before[few]
     pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
-    return torch.zeros_like(gaussians.opacities).masked_scatter(hit, _look_up(alpha[..., None], pixels, at_light)[:, 0])
+    return torch.zeros_like(among.points[:, 0]).masked_scatter(hit, _look_up(alpha[..., None], pixels, at_light)[:, 0])
+
+
+class _Behind(torch.autograd.Function):
+    """`behind_reference` by the native kernel."""
+
+    @staticmethod
+    def forward(ctx: Any, alpha: Tensor, weighted: Tensor, offset: Tensor, among: Casting, at_light: Camera) -> Tensor:
+        focus = constant((at_light.fx, at_light.fy, at_light.cx, at_light.cy), offset.device)
+        plain = [t.detach().float().contiguous() for t in (alpha, weighted, among.points, among.casters, offset, focus)]
+        out = among.points.new_empty(len(among.points))
+        native().behind(*plain, NEAREST, out)
+        ctx.save_for_backward(*plain)
+        ctx.drawn = out
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        alpha, *_, offset, _ = plain = ctx.saved_tensors
+        to_alpha, to_offset = torch.zeros_like(alpha), torch.zeros_like(offset)
+        native().behind_backward(*plain, NEAREST, ctx.drawn, gradients[0].contiguous(), to_alpha, to_offset)
+        return to_alpha, None, to_offset, None, None
 
 
 def _light_camera(camera: Camera, offset: Tensor) -> Camera:
@@ -121,20 +184,13 @@ def _parallax(offset: Tensor, pixels: Tensor, depth: Tensor, camera: Camera) -> 
     The map was drawn without a gradient; to first order it moves as a whole.
     """
     moved = offset - offset.detach()  # [3]
-    focal = pixels.new_tensor([camera.fx, camera.fy])
-    middle = pixels.new_tensor([camera.cx, camera.cy])
+    focal = constant((camera.fx, camera.fy), pixels.device)
+    middle = constant((camera.cx, camera.cy), pixels.device)
     return (focal * moved[:2] - (pixels - middle) * moved[2]) / depth[:, None]
-
-
-def _blur(size: int, sigma: Tensor) -> Tensor:
-    """[size, size] that blurs a line of map pixels by a Gaussian of `sigma` of them; nothing comes from beyond it."""
-    steps = (torch.arange(size).to(sigma)[:, None] - torch.arange(size).to(sigma)).abs()
-    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(0.3)).square()) * (steps <= TAPS)
-    return weights / weights[size // 2].sum()
 
 
 def _look_up(image: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
     """Values [R, C] of an image [h, w, C] at pixels [R, 2], linear between their centres, 0 outside."""
-    size = pixels.new_tensor([camera.width, camera.height])
+    size = constant((camera.width, camera.height), pixels.device)
     place = (2 * pixels / size - 1)[None, None]  # [1, 1, R, 2]
     return grid_sample(image.permute(2, 0, 1)[None], place, align_corners=False)[0, :, 0].T

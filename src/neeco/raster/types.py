@@ -67,6 +67,7 @@ class Gaussians:
 
     def select(self, chosen: Tensor) -> Gaussians:
         """The chosen ones (bool [N])."""
+        chosen = chosen.nonzero()[:, 0]  # asked for once: how many there are, a device has to say
         light = self.headlight
         if light is not None:
             shadow = None if light.shadow is None else replace(light.shadow, casters=light.shadow.casters[chosen])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ class CanonicalGaussians:
     sh_rest: Tensor  # [N, 15, 3]
     counts: tuple[int, ...]  # Gaussians per body; sums to N
     extras: Mapping[str, Tensor] = field(default_factory=dict)
+    _joined: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)  # see spherical_harmonics
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -44,13 +46,13 @@ class CanonicalGaussians:
     @property
     def bodies(self) -> Tensor:
         """[N] int64, the body of each row."""
-        device = self.means.device
-        counts = torch.tensor(self.counts, device=device)
-        return torch.repeat_interleave(torch.arange(len(self.counts), device=device), counts, output_size=len(self))
+        like = self.means
+        rows = [like.new_full((count,), body, dtype=torch.int64) for body, count in enumerate(self.counts)]
+        return torch.cat(rows)  # filled there: a copy of the counts would wait for the device
 
     def tensors(self) -> dict[str, Tensor]:
         """Every learned tensor by name; extras as `extras.NAME`."""
-        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counts", "extras")}
+        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("counts", "extras", "_joined")}
         return named | {f"extras.{name}": tensor for name, tensor in self.extras.items()}
 
     @staticmethod
@@ -72,9 +74,18 @@ class CanonicalGaussians:
         return replace(self, extras={**self.extras, **extras})
 
     def spherical_harmonics(self, degree: int) -> Tensor:
-        """[N, (degree + 1)^2, 3]."""
+        """[N, (degree + 1)^2, 3]; not to be changed. What nothing is learned of is joined once, for all drawings."""
         if degree == 0:
             return self.sh_dc
+        parts = self.sh_dc, self.sh_rest
+        if any(part.requires_grad for part in parts):
+            return self._join(degree)
+        made_of = [degree, *(part._version for part in parts)]
+        if not self._joined or self._joined[0] != made_of:
+            self._joined[:] = made_of, self._join(degree)
+        return self._joined[1]
+
+    def _join(self, degree: int) -> Tensor:
         return torch.cat([self.sh_dc, self.sh_rest[:, : (degree + 1) ** 2 - 1]], 1)
 
 

@@ -9,12 +9,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from neeco.raster.posing import HingedBody, part_weights
+from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.rotations import axis_angle_quat, quat_multiply, rotate_about
 
 BEHIND_HINGE = 1.0  # radii of the shaft: how far behind its hinge a jaw may reach
 LONGEST = 0.6  # radii: standard deviation of what turns, or its far end would swing out behind the hinge
 BEHIND_SOFT = 0.25  # radii
+FARTHEST, WIDEST = 1e9, 1e6  # mm: where the radius is not known, a gate so far behind that everything is beyond it
 STILL = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
 STILL_BEYOND = 0.75  # radii of the shaft beyond the hinge, where nothing but jaws is
 PART_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that part weights are the softmax of
@@ -78,44 +80,60 @@ class Hinges(nn.Module):
         origin = self.base[:3, :3] @ torch.cat([self.shaft_shift, zero]) + self.base[:3, 3]
         return origin, direction
 
-    def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
-        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame.
+    def hinges(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """(pivots [J, 3] mm, unit axes [J, 3]) of all joints, instrument frame; `shaft`, where it is there already.
 
-        The shaft is taken as it is: only spinning it (see `spin`) teaches where it lies, or the hinge would drag it
-        along.
+        The shaft is taken as it is: only spinning it teaches where it lies, or the hinges would drag it along.
         """
-        origin, direction = (part.detach() for part in self.shaft())
-        angle = self.hinge_angle[joint]
-        around = self.base[:3, :3] @ torch.stack([angle.cos(), angle.sin(), angle.new_zeros(())])
-        axis = nn.functional.normalize(around - (around @ direction) * direction, dim=0)
-        return origin + self.hinge_depth[joint] * direction, axis
+        origin, direction = (part.detach() for part in shaft or self.shaft())
+        angle = self.hinge_angle
+        around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1) @ self.base[:3, :3].T
+        axes = nn.functional.normalize(around - (around @ direction)[:, None] * direction, dim=1)
+        return origin + self.hinge_depth[:, None] * direction, axes
+
+    def hinge(self, joint: int) -> tuple[Tensor, Tensor]:
+        """(pivot [3] mm, unit axis [3]) of one joint, instrument frame."""
+        pivots, axes = self.hinges()
+        return pivots[joint], axes[joint]
 
     def along_shaft(self, points: Tensor) -> Tensor:
         """Position [M] mm of points [M, 3] along the shaft."""
         origin, direction = self.shaft()
         return (points - origin) @ direction
 
-    def spin(self, points: Tensor, quats: Tensor, roll: float) -> tuple[Tensor, Tensor]:
-        """Turn everything behind the wrist by `roll` rad about the shaft."""
-        origin, direction = self.shaft()
-        angle = (self.along_shaft(points.detach()) < self.wrist_start).to(points.dtype) * roll
-        return rotate_about(points, direction, origin, angle), quat_multiply(axis_angle_quat(direction, angle), quats)
+    def body(self, world_from_instrument: Tensor, joints: Mapping[str, float], roll: float = 0.0) -> HingedBody:
+        """How the instrument's Gaussians stand at these readings, all that lies behind the wrist spun by `roll` rad."""
+        turned = [joints[name] - self.middle[joint] for joint, name in enumerate(self.joint_names)]
+        shaft = self.shaft()
+        return HingedBody(
+            world_from_instrument,
+            *self.hinges(shaft),
+            self.offsets + self.gains * torch.stack(turned)[:, None] if turned else self.offsets,
+            *shaft,
+            self.wrist_start,
+            *self._gate(),
+            LONGEST * self.radius,
+            roll,
+        )
 
-    def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> tuple[Tensor, Tensor | None]:
-        """Move points [M, 3] by the joints; returns them and each one's turn as a quaternion [M, 4] (None without
-        joints).
+    @torch.no_grad()
+    def _gate(self) -> tuple[Tensor, Tensor]:
+        """(start [], width []) mm along the shaft: what lies far behind the first hinge never turns about it."""
+        first = self.hinge_depth.min() if self.joint_names else torch.zeros_like(self.radius)
+        start = first - (BEHIND_HINGE * self.radius).clamp_max(FARTHEST)
+        return start, BEHIND_SOFT * self.radius.clamp_max(WIDEST)
 
-        weights [M, part_count] sum to 1 over parts: body, then two per joint.
-        """
-        turn = None
+    def part_weights(self, points: Tensor, logits: Tensor) -> Tensor:
+        """Part weights [M, part_count] of Gaussians at points [M, 3] mm with part logits [M, part_count or more]."""
+        return part_weights(points, logits[:, : self.part_count], self.shaft(), *self._gate())
+
+    def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> Tensor:
+        """Move points [M, 3] by the joints; weights [M, part_count] sum to 1 over parts: body, then two per joint."""
+        pivots, axes = self.hinges()
         for index, name in enumerate(self.joint_names):
-            pivot, axis = self.hinge(index)
-            part_angles = self.turns(index, joints[name])
-            angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ part_angles
-            points = rotate_about(points, axis, pivot, angle)
-            quat = axis_angle_quat(axis, angle)
-            turn = quat if turn is None else quat_multiply(quat, turn)
-        return points, turn
+            angle = weights[:, 1 + 2 * index : 3 + 2 * index] @ self.turns(index, joints[name])
+            points = rotate_about(points, axes[index], pivots[index], angle)
+        return points
 
     def turns(self, joint: int, reading: float) -> Tensor:
         """[2] rad by which a joint's two parts are turned."""
@@ -135,16 +153,6 @@ class Hinges(nn.Module):
         points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
         angles = torch.where(known, self.turns(joint, reading), self.opened(joint, reading))
         return rotate_about(points, axis, pivot, angles).index_select(0, self.left_first(joint))
-
-    @torch.no_grad()
-    def beyond_hinge(self, points: Tensor) -> Tensor:
-        """[M] in [0, 1]: which points [M, 3] mm lie so that a joint may move them: what is far behind the first hinge
-        never turns about it."""
-        if not self.joint_names:
-            return points.new_ones(len(points))
-        behind = self.hinge_depth.min() - self.along_shaft(points)  # [M] mm
-        reach = torch.sigmoid((BEHIND_HINGE - behind / self.radius) / BEHIND_SOFT)
-        return torch.where(self.radius.isfinite(), reach, torch.ones_like(reach))
 
     def longest(self, weights: Tensor) -> Tensor:
         """[M, 1] mm: how long the Gaussians may be (standard deviation), by their part weights [M, part_count]: what

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from torch import Tensor
 
 from neeco import __version__
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.capture.poses import rigid_fault
 from neeco.errors import NeecoError
-from neeco.files import write_atomically
+from neeco.files import HALVES, require_like, write_atomically
 from neeco.scene.drawable import Learned
 from neeco.scene.method import Stored
 from neeco.scene.methods import method_class, method_settings
@@ -23,7 +25,19 @@ from neeco.scene.scene import Scene
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
+MOST_SAID = 200  # characters
 BEFORE_SHADOWS = "neeco-scene/1"  # read as scenes that cast none, with readings counted from zero
+MOST_PIXELS = 2**26  # of a recorded image
+FARTHEST = 1e9  # mm, rad, s or px: what is more was not recorded
+# what reading a damaged file raises; a nesting without end is a RuntimeError
+DAMAGED = (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
+HEADER = {  # what every scene's header holds, whatever its method
+    "method": str,
+    "diagnostics": {},
+    "deformation": {},
+    "instruments": [{"name": str, "joints": {str: ([float], None)}}],
+    "recorded": [{"name": str, "split": str, "time": float, "joints": {str: {str: float}}, "intrinsics": [float]}],
+}
 SINCE = {
     "shadow_offsets",
     "shadow_strengths",
@@ -62,16 +76,19 @@ def load_scene(path: Path) -> Learned:
         with safe_open(path, framework="pt") as stream:
             header = json.loads((stream.metadata() or {})["neeco"])
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise NeecoError(f"{path}: not a readable neeco scene ({error}); train again") from None
+    except DAMAGED as error:
+        said = " ".join(str(error).split())
+        raise NeecoError(f"{path}: not a readable neeco scene ({said}); train again") from None
+    if not isinstance(header, dict):
+        raise NeecoError(f"{path}: not a readable neeco scene (its header is no object); train again")
     if header.get("schema") not in (SCHEMA, BEFORE_SHADOWS):
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
     try:
         return unpack_scene(tensors, header)
     except NeecoError as error:
         raise NeecoError(f"{path}: {error}; train again") from None
-    except (LookupError, ValueError, TypeError, RuntimeError) as error:
-        said = " ".join(str(error).split())
+    except DAMAGED as error:
+        said = " ".join(str(error).split())[:MOST_SAID]
         raise NeecoError(f"{path}: damaged scene ({said}); train again") from None
 
 
@@ -115,6 +132,9 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     """The inverse of `pack_scene`; which kind of scene, the header's method says."""
+    require_like(header, HEADER, "header", "it is damaged")
+    if HALVES.search(json.dumps(header, ensure_ascii=False)):
+        raise ValueError("its header holds half a character")
     instruments, recorded = _recording(tensors, header)
     method = header["method"]
     settings = method_settings(method, header["deformation"])
@@ -124,28 +144,31 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     if header.get("schema") == BEFORE_SHADOWS:
         module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in SINCE} | module
     scene.load_state_dict(module)
+    for name, parameter in scene.named_parameters():  # buffers may well be infinite: not every shaft has a known end
+        if not torch.isfinite(parameter).all():
+            raise ValueError(f"{name} contains NaN or infinity")
     scene.requires_grad_(False)
     return scene
 
 
 def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:
-    """The instruments, and what the scene was learned from."""
+    """The instruments, and what the scene was learned from. Raises ValueError for what cannot have been recorded."""
     instruments = tuple(
-        Instrument(
-            entry["name"],
-            {name: tuple(limits) if limits is not None else None for name, limits in entry["joints"].items()},
-        )
+        Instrument(entry["name"], {name: _limits(limits) for name, limits in entry["joints"].items()})
         for entry in header["instruments"]
     )
     states, cameras = [], []
     for index, entry in enumerate(header["recorded"]):
         moved = {
-            instrument.name: InstrumentState(tensors["recorded.poses"][index, k], entry["joints"][instrument.name])
+            instrument.name: InstrumentState(
+                _pose(tensors["recorded.poses"][index, k], f"{instrument.name} in frame {index}"),
+                {joint: _number(entry["joints"][instrument.name][joint]) for joint in instrument.joints},
+            )
             for k, instrument in enumerate(instruments)
         }
-        states.append(State(moved, entry["time"]))
-        fx, fy, cx, cy, width, height, near = entry["intrinsics"]
-        cameras.append(Camera(tensors["recorded.cameras"][index], fx, fy, cx, cy, int(width), int(height), near))
+        states.append(State(moved, _number(entry["time"])))
+        pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
+        cameras.append(_camera(pose, *map(_number, entry["intrinsics"])))
     recorded = Recorded(
         tuple(entry["name"] for entry in header["recorded"]),
         tuple(entry["split"] for entry in header["recorded"]),
@@ -153,3 +176,35 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         tuple(cameras),
     )
     return instruments, recorded
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FARTHEST:
+        raise ValueError(f"{value!r} is no number that can be recorded")
+    return value
+
+
+def _limits(pair: Any) -> tuple[float, float] | None:
+    """Of a joint; an end may be infinite: none there."""
+    if pair is None:
+        return None
+    lower, upper = pair
+    for end in (lower, upper):
+        if not (isinstance(end, float) and math.isinf(end)):
+            _number(end)
+    return lower, upper
+
+
+def _pose(pose: Tensor, what: str) -> Tensor:
+    """[4, 4], mm, which it returns."""
+    if tuple(pose.shape) != (4, 4) or rigid_fault(pose.double().numpy()):
+        raise ValueError(f"the recorded pose of {what} is no rigid transform")
+    return pose
+
+
+def _camera(
+    pose: Tensor, fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float
+) -> Camera:
+    if min(fx, fy, near) <= 0 or min(width, height) < 1 or width * height > MOST_PIXELS:
+        raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px cannot be")
+    return Camera(pose, fx, fy, cx, cy, int(width), int(height), near)

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -34,17 +34,28 @@ class StepResult:
     psnr: float
 
     @classmethod
-    def of(cls, loss: Tensor, squared_error: Tensor) -> StepResult:
-        """From the image's loss and its mean squared error, both scalars."""
-        return cls(float(loss.detach()), -10 * math.log10(max(float(squared_error.detach()), 1e-10)))
+    def of(cls, loss: float, squared_error: float) -> StepResult:
+        """From the image's loss and its mean squared error."""
+        return cls(loss, -10 * math.log10(max(squared_error, 1e-10)))
+
+    @classmethod
+    def mean(cls, results: Sequence[StepResult]) -> StepResult:
+        """Of several images, at least one."""
+        count = len(results)
+        return cls(sum(result.loss for result in results) / count, sum(result.psnr for result in results) / count)
 
 
-def check_finite(total: Tensor, iteration: int, where: str = "") -> None:
-    """Raises NeecoError when what is to be minimised, a scalar, has become no number."""
-    value = float(total.detach())
-    if not math.isfinite(value):
+def numbers(*scalars: Tensor) -> list[float]:
+    """The values of scalars on one device, for which it is waited once."""
+    values: list[float] = torch.stack([scalar.detach() for scalar in scalars]).tolist()
+    return values
+
+
+def check_finite(total: float, iteration: int, where: str = "") -> None:
+    """Raises NeecoError when what is to be minimised has become no number."""
+    if not math.isfinite(total):
         raise NeecoError(
-            f"training: the loss became {value} at iteration {iteration}{where}; run `neeco check` on the capture, or "
+            f"training: the loss became {total} at iteration {iteration}{where}; run `neeco check` on the capture, or "
             "train anew with another --seed (the last checkpoint is kept)"
         )
 
@@ -56,14 +67,15 @@ class LearnedViews(Protocol):
     def frames(self) -> tuple[Frame, ...]: ...
     @property
     def images(self) -> tuple[Tensor, ...]:
-        """[H, W, 3] uint8, one per frame."""
+        """[H, W, 3] uint8, one per frame; in the host's memory where `device` is too small for them."""
 
     @property
     def masks(self) -> tuple[Tensor | None, ...]:
-        """[H, W] bool, False where the loss does not look, or None; one per frame."""
+        """[H, W] bool, False where the loss does not look, or None; one per frame, where the images are."""
 
     @property
-    def device(self) -> torch.device: ...
+    def device(self) -> torch.device:
+        """Where everything is computed."""
 
 
 class Config(Protocol):
@@ -129,6 +141,10 @@ class Training(Protocol):
     @property
     def progress(self) -> float:
         """Done share of the run in [0, 1]."""
+
+    def reached(self, iteration: int) -> bool:
+        """Was it this step that came to `iteration`, or past it?"""
+        ...
 
 
 class Session(Protocol):

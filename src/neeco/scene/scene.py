@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
+from neeco.raster.on_device import Answer
+from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
@@ -20,7 +22,7 @@ from neeco.scene.drawable import Drawable
 from neeco.scene.method import Stored
 from neeco.scene.recorded import Recorded
 from neeco.scene.rim import MADE_UP
-from neeco.scene.rotations import rigid_from_vector
+from neeco.scene.seen import SEEN, made_up_of, measure_seen
 
 LAMPS = 3  # at most: what a laparoscope's light guides come to
 SHADOW_WIDTH = 0.01  # slope, at the start
@@ -74,6 +76,8 @@ class Scene(nn.Module):
         self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
         self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
         self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
+        self._shines = Answer(lambda strengths: (strengths > 0).any())
+        self._corrects = Answer(lambda registration: registration.any())
 
     @property
     def settings(self) -> Any:
@@ -102,12 +106,14 @@ class Scene(nn.Module):
         prefix = "canonical."
         canonical = _canonical(
             {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
-            tuple(header["counts"]),
+            _counts(header["counts"], len(stored.instruments)),
         )
         scene = cls(
             header["method"], canonical, deformation, stored.instruments, stored.recorded, canonical.means.new_zeros(3)
         )
         scene.sh_degree = int(header["sh_degree"])
+        if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
+            raise ValueError(f"sh_degree is {scene.sh_degree}, which its harmonics are not of")
         # older scenes call it backdrop, or have none
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         return scene
@@ -131,16 +137,25 @@ class Scene(nn.Module):
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
-    @property
-    def made_up(self) -> Tensor:
-        """[N] 1 for tissue that no frame saw, made up at the end of training (see `neeco.scene.rim`); else 0."""
-        return self.canonical.extras.get(MADE_UP, self.canonical.means.new_zeros(len(self.canonical)))
+    def seen(self) -> Tensor:
+        """[N, 12] how well the training frames saw each Gaussian (see `neeco.scene.seen`). Found out at the end of
+        training; of a scene that is still learned, or was before that was done, here and now."""
+        if SEEN not in self.canonical.extras:
+            seen = measure_seen(self.canonical, self.recorded, self.at)
+            if MADE_UP in self.canonical.extras:  # the rim of what is continued reaches into images
+                seen *= 1 - self.canonical.extras[MADE_UP][:, None]
+            self.canonical = self.canonical.with_extras(**{SEEN: seen})
+        return self.canonical.extras[SEEN]
+
+    def made_up(self, posed: Gaussians, camera: Camera) -> Tensor:
+        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is made up: seen by no training frame, or not
+        from about there."""
+        return made_up_of(self.seen(), posed, camera)
 
     @property
     def casts_shadow(self) -> bool:
         """Was a lamp beside the lens found, and is there anything that casts its shadow?"""
-        found = not self.shadow_strengths.is_meta and bool((self.shadow_strengths.detach() > 0).any())
-        return found and len(self.canonical) > self.canonical.counts[0]
+        return self._shines(self.shadow_strengths) and len(self.canonical) > self.canonical.counts[0]
 
     def _shadow(self) -> Shadow | None:
         if not self.casts_shadow:
@@ -152,7 +167,7 @@ class Scene(nn.Module):
         """`state` with the learned tracker-to-world correction applied to its poses."""
         registration = self.registration
         # a tensor on the device "meta" holds no numbers to ask
-        corrects = registration.requires_grad or registration.is_meta or bool(registration.any())
+        corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
         if not state.instruments or not corrects:
             return state
         correction = rigid_from_vector(self.registration[:6])
@@ -203,6 +218,14 @@ class Scene(nn.Module):
         return self.deformation.keypoints(self.registered(state))
 
 
+def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
+    """Of the Gaussians of the tissue and of each instrument; a scene that knows no instrument may have any bodies."""
+    fits = instruments == 0 or len(counts) in (1, 1 + instruments)
+    if not fits or not all(isinstance(count, int) and count >= 0 for count in counts):
+        raise ValueError(f"counts of {len(counts)} bodies do not fit {instruments} instruments")
+    return tuple(counts)
+
+
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
     """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
@@ -211,6 +234,8 @@ def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> Canonical
         found, wanted = tuple(tensor.shape), (sum(counts), *CANONICAL_SHAPES.get(name, tensor.shape[1:]))
         if found != wanted:
             raise ValueError(f"{name} has shape {list(found)}, not {list(wanted)}")
+        if tensor.dtype != torch.float32:
+            raise ValueError(f"{name} is {tensor.dtype}, not float32")
         if not torch.isfinite(tensor).all():
             raise ValueError(f"{name} contains NaN or infinity")
     return CanonicalGaussians.from_tensors(tensors, counts)

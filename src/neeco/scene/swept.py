@@ -7,6 +7,8 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
+from neeco.raster.on_device import Answer
+
 CELLS = 64  # per side
 
 
@@ -26,11 +28,12 @@ class SweptVolume(nn.Module):
         self.register_buffer("low", torch.zeros(3))
         self.register_buffer("cell", torch.zeros(3))
         self.register_buffer("occupied", torch.zeros(CELLS, CELLS, CELLS, dtype=torch.bool))
+        self._covered = Answer(lambda cell: cell.any())
 
     @property
     def bounded(self) -> bool:
         """Has a volume been covered?"""
-        return bool(self.cell.any())
+        return self._covered(self.cell)
 
     def cover(self, points: Tensor) -> None:
         """Make it the cells whose centre lies within the margin of a cell that holds one of `points` [P, 3] mm."""

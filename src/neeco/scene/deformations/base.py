@@ -144,7 +144,8 @@ class Deformation(nn.Module, Method):
         return {}
 
     def between_steps(self, training: Training, before: float) -> None:
-        """After every step; `before` is the progress before it: for what is due once a mark has been passed."""
+        """After every step; `before` is the progress before it: for what is due once a mark has been passed. A step may
+        be several iterations (`views_per_step`)."""
 
     def finish(self, training: Training) -> None:
         """Find out what is found once learning has ended; may replace the canonical Gaussians."""

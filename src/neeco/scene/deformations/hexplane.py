@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
+from neeco.raster.on_device import quick_products
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._moving import LabelledByMotion
@@ -101,8 +102,10 @@ class HexPlane(LabelledByMotion):
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         places = (canonical.means - self.center) / (MARGIN * self.half_extent)
         rows = self.rows_at(self.times.share(state), perturbation.state_noise)
-        hidden = self.trunk(self.features(places, rows))
-        d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
+        features = self.features(places, rows)
+        with quick_products(places.device):
+            hidden = self.trunk(features)
+            d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()
         return Posed(canonical.means + self.half_extent * d_means, canonical.quats + d_quats, scales)
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.raster.posing import HingedBody, pose_bodies
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
@@ -31,7 +32,6 @@ from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
-from neeco.scene.rotations import matrix_to_quat, quat_multiply
 
 LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
@@ -104,53 +104,20 @@ class Kinematic(Deformation):
         return max((self.hinges_of(i).part_count for i in range(len(self.instruments))), default=1)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        tissue = canonical.body(0)
-        means, quats = [canonical.means[tissue]], [canonical.quats[tissue]]
-        frames = [_no_turn(canonical.means).expand(canonical.counts[0], 4)]
-        scales = [canonical.log_scales[tissue].exp()]
+        roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
+        bodies: list[HingedBody | None] = [None]  # tissue stands still
         for index, instrument in enumerate(self.instruments):
-            moved = self._pose_instrument(canonical, index, instrument, state, perturbation)
-            for collected, part in zip((means, quats, frames, scales), moved, strict=True):
-                collected.append(part)
-        return Posed(torch.cat(means), torch.cat(quats), torch.cat(scales), torch.cat(frames))
-
-    def _pose_instrument(
-        self,
-        canonical: CanonicalGaussians,
-        index: int,
-        instrument: Instrument,
-        state: State,
-        perturbation: Perturbation,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """World means [M, 3], quats [M, 4], SH frames [M, 4] and scales [M, 3] of one instrument's Gaussians."""
-        given = state_of(instrument, state)
-        hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-        points, quats = canonical.means[rows], nn.functional.normalize(canonical.quats[rows], dim=-1)
-        turned = _no_turn(points).expand(points.shape[0], 4)  # [M, 4] instrument_from_sh
-        scales = canonical.log_scales[rows].exp()
-        if isinstance(perturbation, Spin):
-            points, quats = hinges.spin(points, quats, perturbation.shaft_roll)
-            _, turned = hinges.spin(points.detach(), turned, perturbation.shaft_roll)
-        if hinges.joint_names:
-            weights = self.part_weights(canonical, index)
-            scales = torch.minimum(scales, hinges.longest(weights.detach()))
-            points, turn = hinges.bend(points, weights, given.joints)
-            assert turn is not None
-            quats, turned = quat_multiply(turn, quats), quat_multiply(turn, turned)
-        pose = given.pose.to(points)
-        world_quat = matrix_to_quat(pose[:3, :3])
-        means = points @ pose[:3, :3].T + pose[:3, 3]
-        return means, quat_multiply(world_quat, quats), quat_multiply(world_quat, turned).detach(), scales
+            given = state_of(instrument, state)
+            bodies.append(self.hinges_of(index).body(given.pose.to(canonical.means), given.joints, roll))
+        logits = canonical.extras.get(PART_LOGITS)
+        return Posed(
+            *pose_bodies(canonical.means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies)
+        )
 
     def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """Part weights [M, part_count] of one instrument's Gaussians."""
-        hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-        logits = canonical.extras[PART_LOGITS][rows]
-        weights = torch.softmax(logits[:, : hinges.part_count], -1)
-        if not hinges.joint_names:
-            return weights
-        moving = weights[:, 1:] * hinges.beyond_hinge(canonical.means[rows])[:, None]
-        return torch.cat([1 - moving.sum(1, keepdim=True), moving], 1)
+        rows = canonical.body(index + 1)
+        return self.hinges_of(index).part_weights(canonical.means[rows], canonical.extras[PART_LOGITS][rows])
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
@@ -247,7 +214,7 @@ class Kinematic(Deformation):
 
     def between_steps(self, training: Training, before: float) -> None:
         passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
-        if self.settings.shadow and (passed or training.iteration in SHADOW_AT):
+        if self.settings.shadow and (passed or any(map(training.reached, SHADOW_AT))):
             training.instruments.find_shadow()
         if LOOKS_AGAIN_AT[0] in passed:
             training.instruments.place_wrists(self)
@@ -272,11 +239,6 @@ class Kinematic(Deformation):
         }
         fall = floored_decay(progress)
         return {name: rates[name.rsplit(".", 1)[-1]] * fall for name, _ in self.named_parameters()}
-
-
-def _no_turn(like: Tensor) -> Tensor:
-    """The quaternion [4] that turns nothing, of the type and device of `like`."""
-    return like.new_tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def part_names(joints: tuple[str, ...]) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
+from neeco.raster.on_device import quick_products
+from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations.base import (
@@ -31,7 +33,6 @@ from neeco.scene.deformations.base import (
 )
 from neeco.scene.encoding import encode
 from neeco.scene.learning import Training
-from neeco.scene.rotations import matrix_to_quat
 from neeco.scene.swept import SweptVolume
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
@@ -156,7 +157,7 @@ class NPS(LabelledByMotion):
             quat = matrix_to_quat(pose[:3, :3])
             quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
             parts += [quat] if self.settings.state == "rotation_jaw" else [pose[:3, 3], quat]
-            parts.append(pose.new_tensor([given.joints[name] for name in instrument.joints]))
+            parts += [pose.new_full((1,), given.joints[name]) for name in instrument.joints]
         return torch.cat(parts)
 
     def state_vector(self, state: State) -> Tensor:
@@ -195,7 +196,8 @@ class NPS(LabelledByMotion):
             return torch.cat([self.network(part, encoded_state) for part in means.split(self.settings.chunk)])
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         state = encoded_state[None]
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu"):
+        half = torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu")
+        with quick_products(means.device), half:
             features = torch.relu(self.mean_in(encoded) + self.state_in(state))
             for index, layer in enumerate(self.hidden, start=1):
                 summed = layer(features)

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
+from neeco.raster.on_device import quick_products
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations._times import RecordedTimes
@@ -135,16 +136,17 @@ class TimeMLP(LabelledByMotion):
         """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
         encoded = octaves(places, self.settings.L_mean)
         features = encoded
-        for index, layer in enumerate(self.layers):
-            assert isinstance(layer, nn.Linear)
-            if index == SKIP + 1:
-                features = torch.cat([encoded, features], 1)
-            weight: Tensor = layer.weight
-            bias: Tensor = layer.bias
-            if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
-                timeless = features.shape[1]
-                weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
-            features = torch.relu(nn.functional.linear(features, weight, bias))
+        with quick_products(places.device):
+            for index, layer in enumerate(self.layers):
+                assert isinstance(layer, nn.Linear)
+                if index == SKIP + 1:
+                    features = torch.cat([encoded, features], 1)
+                weight: Tensor = layer.weight
+                bias: Tensor = layer.bias
+                if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
+                    timeless = features.shape[1]
+                    weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
+                features = torch.relu(nn.functional.linear(features, weight, bias))
         return self.head(features)
 
     def learning_rates(self, progress: float) -> dict[str, float]:

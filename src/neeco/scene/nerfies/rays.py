@@ -14,14 +14,14 @@ class RayTable:
 
     def __init__(self, views: LearnedViews) -> None:
         device = views.device
-        self.pixels = torch.cat([image.flatten(0, 1) for image in views.images])  # [P, 3]
+        self.pixels = torch.cat([image.flatten(0, 1) for image in views.images]).to(device)  # [P, 3]
         self.counted: Tensor | None = None  # [P], where the loss counts
         if any(mask is not None for mask in views.masks):
             whole = [
-                torch.ones(image.shape[:2], dtype=torch.bool, device=device) if mask is None else mask
+                torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
                 for image, mask in zip(views.images, views.masks, strict=True)
             ]
-            self.counted = torch.cat([mask.flatten() for mask in whole])
+            self.counted = torch.cat([mask.flatten() for mask in whole]).to(device)
         cameras = [frame.camera for frame in views.frames]
         self.sizes = torch.tensor([[camera.width, camera.height] for camera in cameras], device=device)
         ends = self.sizes.prod(1).cumsum(0)

@@ -62,7 +62,7 @@ def even_depths(count: int, bounds: Tensor, rays: int, generator: torch.Generato
     """Depths [R, S] mm, one in each of `count` equal stretches between `bounds` [2]: anywhere by `generator`, without
     one in the middle."""
     device = bounds.device
-    edges = torch.linspace(bounds[0], bounds[1], count + 1, device=device)
+    edges = torch.lerp(bounds[0], bounds[1], torch.linspace(0, 1, count + 1, device=device))
     if generator is None:
         place = torch.full((rays, count), 0.5, device=device)
     else:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
+from neeco.raster.on_device import quick_products
 from neeco.raster.types import Rendering
 from neeco.scene.encoding import encode_by_octave
 from neeco.scene.nerfies.render import Composite, Rays, camera_rays, composite, even_depths, finer_depths
@@ -39,11 +40,12 @@ class Template(nn.Module):
 
     def forward(self, places: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
         """places [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
-        features = self.trunk(encode_by_octave(places, self.frequencies))
-        density = nn.functional.softplus(self.density(features)[..., 0] - 1)
         conditions = conditions[:, None].expand(-1, places.shape[1], -1)
-        seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
-        return density, torch.sigmoid(self.color(seen))
+        with quick_products(places.device):
+            features = self.trunk(encode_by_octave(places, self.frequencies))
+            seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
+            density, color = self.density(features)[..., 0], self.color(seen)
+        return nn.functional.softplus(density - 1), torch.sigmoid(color)
 
     def condition(self, directions: Tensor, appearance: Tensor) -> Tensor:
         """What is the same for all samples of a ray [R, V]."""

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
+from neeco.raster.on_device import quick_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import log_linear
-from neeco.scene.learning import Config, Start, StepResult, check_finite
+from neeco.scene.learning import Config, Start, StepResult, check_finite, numbers
 from neeco.scene.nerfies.rays import RayTable
 from neeco.scene.nerfies.scene import Drawn, NerfScene
 from neeco.scene.nerfies.settings import NerfiesSettings
@@ -119,13 +120,13 @@ class NerfiesSession:
         error = coarse if drawn.fine is None else _error(drawn.fine.color, colors, counted)
         loss = coarse if drawn.fine is None else coarse + error
         total = loss + self._elastic(drawn) + self._background()
-        check_finite(total, self.iteration)
-        total.backward()
+        with quick_products(total.device):
+            total.backward()
         rate = log_linear(settings.rate, FINAL_RATE * settings.rate, progress)
-        for name, parameter in scene.named_parameters():
-            if parameter.numel():
-                self.adam.step(name, parameter, rate)
-        return StepResult.of(loss, error)
+        self.adam.step((name, parameter, rate) for name, parameter in scene.named_parameters() if parameter.numel())
+        value, *seen = numbers(total, loss, error)
+        check_finite(value, self.iteration)
+        return StepResult.of(*seen)
 
     def _elastic(self, drawn: Drawn) -> Tensor:
         """Weighted elastic loss at the sample of median depth of the first rays, which are at random."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from neeco.raster.on_device import quick_products
 from neeco.scene.encoding import encode_by_octave
 
 HEAD_RANGE = 1e-4  # the heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
@@ -74,8 +75,11 @@ class WarpField(nn.Module):
 
     def forward(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
         """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; places in the template [M, 3]."""
-        features = self.trunk(torch.cat([encode_by_octave(points, self.frequencies, opened), codes], -1))
-        return move_by_screw(points, self.rotation(features), self.velocity(features))
+        encoded = encode_by_octave(points, self.frequencies, opened)
+        with quick_products(points.device):
+            features = self.trunk(torch.cat([encoded, codes], -1))
+            rotation, velocity = self.rotation(features), self.velocity(features)
+        return move_by_screw(points, rotation, velocity)
 
     def jacobian(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
         """d place / d point [M, 3, 3]: one backward pass per coordinate, itself differentiable, so that gradients reach

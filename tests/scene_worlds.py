@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.nerfies.settings import NerfiesSettings
-from neeco.scene.rotations import rigid_from_vector
 
 TISSUE, INSTRUMENT = 20, 40
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.5)})
