@@ -1,0 +1,347 @@
+"""What a GPU does: frames and training steps a second, by backend and by stage, and whole verbs beside the CPU.
+
+    python benchmarks/gpu.py [--device cuda:0] [--workload 25000,320x256 ...] [--repeats 30] [--output FOLDER]
+                             [--train CAPTURE [--iterations N]] [--synthesize RUN [--count N]]
+
+Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and draws
+them, `step` poses, draws, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
+do the rasteriser's part alone, on the same posed tensors for all backends. Backends take turns, call by call; numbers
+are medians of the time from an idle device to an idle device, after three calls to warm up. Stages are timed by CUDA
+events in calls of their own, and held against peaks measured in the same run (`stages.MODEL`). FOLDER gets gpu.md and
+gpu.json.
+
+`--device cpu` measures the processor in the same way; without it and without a GPU this ends in one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from raster import make_surface
+from stages import MODEL, Stages, peaks
+from torch import Tensor
+
+from neeco import __version__
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.experiments.jobs import Budget, Job, run_job
+from neeco.experiments.machine import machine
+from neeco.files import write_json, write_text
+from neeco.raster import Camera, Gaussians, rasterize
+from neeco.raster.devices import device_of, failures_told
+from neeco.raster.losses import photometric_loss
+from neeco.raster.optimizer import adam_step
+from neeco.raster.threads import synchronise
+from neeco.raster.triton import ready
+from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.methods import make_deformation, method_settings
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.settings import Settings
+from neeco.training.options import training_config
+from neeco.training.run import open_run
+
+WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")
+KINDS = ("draw", "frame", "draw+backward", "step")
+WARM_UP = 3  # calls of each kind and backend
+GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
+STATE = State({"grasper": InstrumentState(torch.eye(4, dtype=torch.float64), {"jaw_angle": 0.4})})
+
+
+@dataclass(frozen=True)
+class Workload:
+    """How many Gaussians, and the image's size in pixels."""
+
+    gaussians: int
+    width: int
+    height: int
+
+    @staticmethod
+    def of(word: str) -> Workload:
+        """Of `300000,960x540`. Raises NeecoError."""
+        count, _, size = word.partition(",")
+        width, _, height = size.partition("x")
+        if not (count.isdecimal() and width.isdecimal() and height.isdecimal() and int(count) >= 5):
+            raise NeecoError(f"--workload: {word!r}: write GAUSSIANS,WIDTHxHEIGHT, such as {WORKLOADS[0]}")
+        return Workload(int(count), int(width), int(height))
+
+    def __str__(self) -> str:
+        return f"{self.gaussians:,} Gaussians, {self.width}x{self.height}"
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to draw. `ordered`: PyTorch is asked for the same bits every time."""
+
+    name: str
+    word: str
+    ordered: bool = False
+
+    @contextmanager
+    def chosen(self) -> Iterator[None]:
+        """PyTorch's own operations that know no fixed order keep theirs, with a warning."""
+        torch.use_deterministic_algorithms(self.ordered, warn_only=True)
+        try:
+            yield
+        finally:
+            torch.use_deterministic_algorithms(False)
+
+
+def backends_on(device: torch.device) -> list[Backend]:
+    """Those that draw there; Triton's interpreter takes part on the CPU where TRITON_INTERPRET asks for it."""
+    found = []
+    if ready.missing(device) is None:
+        found += [Backend("triton", "triton"), Backend("triton, fixed order", "triton", ordered=True)]
+    if device.type == "cpu":
+        found.insert(0, Backend("cpu", "cpu"))
+    elif importlib.util.find_spec("gsplat") is not None:
+        found.append(Backend("gsplat", "cuda"))
+    return found
+
+
+def surface_scene(gaussians: Gaussians, camera: Camera) -> Scene:
+    """`kinematic`'s scene of these Gaussians; the last fifth is a grasper's, whose frame is the world's."""
+    count = len(gaussians)
+    held = count // 5
+    generator = torch.Generator().manual_seed(1)
+    canonical = CanonicalGaussians(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        log_scales=gaussians.scales.log(),
+        opacity_logits=torch.logit(gaussians.opacities),
+        sh_dc=gaussians.sh[:, :1].contiguous(),
+        sh_rest=gaussians.sh[:, 1:].contiguous(),
+        counts=(count - held, held),
+        extras={PART_LOGITS: torch.randn(count, 3, generator=generator)},
+    )
+    deformation = make_deformation("kinematic", (GRASPER,), method_settings("kinematic", {}))
+    recorded = Recorded(("000000",), ("train",), (STATE,), (camera,))
+    scene = Scene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
+    scene.sh_degree = 3
+    return scene
+
+
+class Case:
+    """A scene on a device, and the four things that are timed, each with any backend."""
+
+    def __init__(self, workload: Workload, device: torch.device) -> None:
+        surface, camera = make_surface(workload.gaussians, workload.width, workload.height, 16)
+        self.scene = surface_scene(surface, camera).to(device)
+        self.camera = camera.to(device)
+        with torch.no_grad():
+            self.posed = self.scene.at(STATE)
+        generator = torch.Generator().manual_seed(2)
+        self.target = torch.rand(workload.height, workload.width, 3, generator=generator).to(device)
+        self.weights = (torch.randn(self.target.shape, generator=generator) / self.target.numel()).to(device)
+        learned = [tensor for tensor in self.scene.canonical.tensors().values() if tensor.is_floating_point()]
+        self.learned = [*learned, *self.scene.deformation.parameters()]
+        self.moments = [(torch.zeros_like(tensor), torch.zeros_like(tensor)) for tensor in self.learned]
+        names = ("means", "quats", "scales", "opacities", "sh")
+        self.leaves = {name: getattr(self.posed, name).clone().requires_grad_() for name in names}
+
+    def call(self, kind: str, backend: Backend) -> None:
+        """One of KINDS. Every call does the same work: Adam's rate is 0."""
+        {"draw": self.draw, "frame": self.frame, "draw+backward": self.gradients, "step": self.step}[kind](backend.word)
+
+    @torch.no_grad()
+    def draw(self, word: str) -> Tensor:
+        return rasterize(self.posed, self.camera, backend=word).color
+
+    @torch.no_grad()
+    def frame(self, word: str) -> Tensor:
+        return rasterize(self.scene.at(STATE), self.camera, backend=word).color
+
+    def gradients(self, word: str) -> None:
+        drawn = rasterize(replace(self.posed, **self.leaves), self.camera, backend=word)
+        torch.autograd.backward(drawn.color, self.weights)
+        for leaf in self.leaves.values():
+            leaf.grad = None
+
+    def step(self, word: str) -> None:
+        for tensor in self.learned:
+            tensor.requires_grad_(True)
+        drawn = rasterize(self.scene.at(STATE), self.camera, backend=word)
+        photometric_loss(drawn.color, self.target, ssim_weight=0.2).backward()
+        for tensor, moments in zip(self.learned, self.moments, strict=True):
+            if tensor.grad is not None:
+                adam_step(tensor, tensor.grad, *moments, lr=0.0, step=1)
+            tensor.requires_grad_(False)
+            tensor.grad = None
+
+
+def measure(workload: Workload, device: torch.device, repeats: int, peak: dict[str, float]) -> dict[str, Any]:
+    """Medians of every kind and backend, in turns; stages of the triton backends; the most memory that PyTorch held."""
+    case, backends = Case(workload, device), backends_on(device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    times: dict[tuple[str, str], list[float]] = {(b.name, kind): [] for b in backends for kind in KINDS}
+    for repeat in range(WARM_UP + repeats):
+        for kind in KINDS:
+            for backend in backends:
+                with backend.chosen():
+                    synchronise(device)
+                    start = time.perf_counter()
+                    case.call(kind, backend)
+                    synchronise(device)
+                if repeat >= WARM_UP:
+                    times[backend.name, kind].append((time.perf_counter() - start) * 1e3)
+    rows = [{"backend": b.name} | {kind: statistics.median(times[b.name, kind]) for kind in KINDS} for b in backends]
+    stages = {}
+    for backend in (backend for backend in backends if backend.word == "triton"):
+        watched = Stages(device)
+        with backend.chosen(), watched.watching():
+            for _ in range(repeats):
+                case.call("draw+backward", backend)
+        stages[backend.name] = watched.rows(peak)
+    most = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
+    return {"workload": asdict(workload), "title": str(workload), "ms": rows, "stages": stages, "memory_bytes": most}
+
+
+def train_both(capture: Path, device: torch.device, iterations: int) -> list[dict[str, Any]]:
+    """`kinematic` from the same seed there and on the CPU: seconds, and PSNR and mask IoU of held-out frames."""
+    rows = []
+    for where in dict.fromkeys((str(device), "cpu")):
+        with tempfile.TemporaryDirectory() as folder:
+            config = training_config("kinematic", {})
+            job = Job("kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where)
+            done = run_job(job)
+        scores = {name: {k: values[k] for k in ("psnr", "mask_iou")} for name, values in done["splits"].items()}
+        rows.append({"device": where, "iterations": iterations, "seconds": done["seconds"], "splits": scores})
+    return rows
+
+
+def synthesize_some(run: Path, device: torch.device, count: int) -> dict[str, Any]:
+    """Images a second of a data set with all labels, one process; what is begun only once is not counted."""
+    with open_run(run, device) as trained, tempfile.TemporaryDirectory() as folder:
+        moments = [time.perf_counter()]
+        synthesize(
+            trained,
+            Path(folder) / "dataset",
+            Settings(count=count),
+            ("coco", "yolo"),
+            False,
+            lambda *_: moments.append(time.perf_counter()),
+        )
+    told = moments[1:]
+    return {"run": str(run), "images": count, "images_per_second": (len(told) - 1) / (told[-1] - told[0])}
+
+
+def hardware(device: torch.device) -> dict[str, Any]:
+    """What was measured, with which versions."""
+    facts = machine(device) | {"neeco": __version__, "commit": output_of("git", "describe", "--always", "--dirty")}
+    for package in ("triton", "gsplat"):
+        found = importlib.util.find_spec(package) is not None
+        facts[package] = importlib.metadata.version(package) if found else None
+    if device.type == "cuda":
+        card = torch.cuda.get_device_properties(device)
+        facts |= {"memory": card.total_memory, "capability": f"{card.major}.{card.minor}", "cuda": torch.version.cuda}
+        facts["driver"] = output_of("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+    return facts
+
+
+def output_of(*words: str) -> str | None:
+    """The first line that a program prints; None where it fails or is not there."""
+    try:
+        result = subprocess.run(words, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return result.stdout.strip().splitlines()[0] if result.stdout.strip() else None
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The whole result as tables."""
+    facts = {key: value for key, value in result["hardware"].items() if value is not None}
+    lines = ["# GPU", "", ", ".join(f"{key} {value}" for key, value in facts.items()), ""]
+    peak = result["peak"]
+    rates = f"{peak['bytes'] / 1e9:.0f} GB/s copying, {peak['flops'] / 1e12:.2f} TFLOP/s float32"
+    lines += [f"Peaks, measured: {rates}. Medians of {result['repeats']}.", "", MODEL, ""]
+    for case in result["workloads"]:
+        memory = f" ({case['memory_bytes'] / 2**30:.2f} GiB at most)" if case["memory_bytes"] else ""
+        lines += [f"## {case['title']}{memory}", ""]
+        lines += ["| backend | frames/s | steps/s | " + " | ".join(f"{kind}, ms" for kind in KINDS) + " |"]
+        lines += ["|---" * (3 + len(KINDS)) + "|"]
+        for row in case["ms"]:
+            cells = [f"{1e3 / row['frame']:.1f}", f"{1e3 / row['step']:.1f}", *(f"{row[kind]:.2f}" for kind in KINDS)]
+            lines.append(f"| {row['backend']} | " + " | ".join(cells) + " |")
+        for name, rows in case["stages"].items():
+            lines += ["", f"| {name}: stage | ms | MB | share of bandwidth | share of arithmetic |", "|---" * 5 + "|"]
+            for row in rows:
+                computed = row["share"].get("arithmetic")
+                told = "-" if computed is None else f"{computed:.0%}"
+                cells = [f"{row['ms']:.3f}", f"{row['bytes'] / 1e6:.1f}", f"{row['share']['bandwidth']:.0%}", told]
+                lines.append(f"| {row['stage']} | " + " | ".join(cells) + " |")
+        lines.append("")
+    for row in result.get("train", ()):
+        scores = [
+            f"{split}: PSNR {found['psnr']:.2f} dB"
+            + ("" if found["mask_iou"] is None else f", mask IoU {found['mask_iou']:.3f}")
+            for split, found in row["splits"].items()
+        ]
+        told = f"{row['iterations']:,} steps in {row['seconds']:.1f} s; {'; '.join(scores)}"
+        lines.append(f"- training on {row['device']}: {told}")
+    if "synthesize" in result:
+        made = result["synthesize"]
+        lines.append(f"- synthesis: {made['images_per_second']:.2f} images/s with all labels, of {made['images']}")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def run(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Measure what was asked for. Raises NeecoError where there is no such device."""
+    workloads = [Workload.of(word) for word in arguments.workload or WORKLOADS]
+    if arguments.repeats < 1 or arguments.count < 2:
+        raise NeecoError("--repeats must be at least 1, --count at least 2")
+    device = device_of(arguments.device)
+    peak = peaks(device)
+    result: dict[str, Any] = {"hardware": hardware(device), "peak": peak, "repeats": arguments.repeats}
+    result["workloads"] = [measure(workload, device, arguments.repeats, peak) for workload in workloads]
+    if arguments.train is not None:
+        result["train"] = train_both(arguments.train, device, arguments.iterations)
+    if arguments.synthesize is not None:
+        result["synthesize"] = synthesize_some(arguments.synthesize, device, arguments.count)
+    return result
+
+
+def main(words: list[str] | None = None) -> int:
+    """Parse, measure, print and write; 1 with one line where that cannot be done."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", help="cuda, cuda:N or cpu")
+    parser.add_argument("--workload", action="append", metavar="GAUSSIANS,WIDTHxHEIGHT", help="repeatable")
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--output", type=Path, metavar="FOLDER")
+    parser.add_argument("--train", type=Path, metavar="CAPTURE")
+    parser.add_argument("--iterations", type=int, default=2000, help="of --train")
+    parser.add_argument("--synthesize", type=Path, metavar="RUN")
+    parser.add_argument("--count", type=int, default=100, help="images of --synthesize")
+    arguments = parser.parse_args(words)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else cuBLAS knows no fixed order
+    try:
+        with failures_told():
+            result = run(arguments)
+        told = markdown(result)
+        if arguments.output is not None:
+            arguments.output.mkdir(parents=True, exist_ok=True)
+            write_json(arguments.output / "gpu.json", result)
+            write_text(arguments.output / "gpu.md", told)
+    except NeecoError as error:
+        print(f"gpu.py: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    print(told, end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

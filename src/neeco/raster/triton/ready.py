@@ -1,0 +1,82 @@
+"""Whether Triton can draw on a device, in words a user can act on. Importing this needs no `triton`."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from neeco.errors import NeecoError
+
+OLDEST = (7, 0)  # compute capability that Triton compiles for
+
+
+def installed() -> bool:
+    """Whether the package `triton` is there; it comes with every CUDA build of PyTorch for Linux."""
+    return importlib.util.find_spec("triton") is not None
+
+
+def interpreted() -> bool:
+    """Whether Triton's interpreter takes the place of its compiler: then kernels run on CPU tensors, slowly."""
+    return os.environ.get("TRITON_INTERPRET", "0").lower() in ("1", "true", "on", "yes", "y")
+
+
+def missing(device: torch.device) -> str | None:
+    """What Triton lacks to draw on `device`, as far as it can be told without trying, with the remedy; None: nothing"""
+    if not installed():
+        return "package triton is missing; on Linux pip install 'neeco[triton]', or draw on the CPU"
+    if interpreted():
+        return None
+    if device.type != "cuda":
+        return f"tensors are on {device}; move them to a CUDA device or use backend='cpu' (tests: TRITON_INTERPRET=1)"
+    capability = torch.cuda.get_device_capability(device)
+    if capability < OLDEST:
+        has, needs = (".".join(map(str, version)) for version in (capability, OLDEST))
+        return (
+            f"{device} has compute capability {has}, Triton needs {needs}; pip install 'neeco[cuda]' to draw with "
+            "gsplat, or use --device cpu"
+        )
+    return None
+
+
+@cache
+def require_triton(device: torch.device) -> None:
+    """Raises NeecoError, one line, unless Triton's kernels run on `device`."""
+    if refusal := missing(device):
+        raise NeecoError(f"backend: triton: {refusal}")
+    if interpreted():
+        return
+    from neeco.raster.triton.probe import launch
+
+    try:
+        launch(device)
+    except Exception as error:  # whatever driver, compiler or assembler say
+        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise NeecoError(
+            f"backend: triton: cannot start a kernel on {device}: {said}; check `nvidia-smi` and that a C compiler "
+            "and Python's headers are installed, or use --device cpu"
+        ) from error
+
+
+@cache
+def starts_on(device: torch.device) -> bool:
+    """Whether `require_triton` has nothing against `device`."""
+    try:
+        require_triton(device)
+    except NeecoError:
+        return False
+    return True
+
+
+def goes_triton(tensor: Tensor) -> bool:
+    """Whether Triton's kernels work on `tensor`: float32 on a CUDA device on which they can be started."""
+    return tensor.is_cuda and tensor.dtype == torch.float32 and starts_on(tensor.device)
+
+
+def working_on(device: torch.device) -> AbstractContextManager[None]:
+    """Until the end of the block, kernels are launched on `device`: Triton launches on the current CUDA device."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()

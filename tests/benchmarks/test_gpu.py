@@ -1,0 +1,164 @@
+"""benchmarks/gpu.py measures what it says, and says in one line where it cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import ClassVar
+
+import pytest
+import torch
+from device_params import DEVICES, SLOW_ON_CPU
+from viewer_world import grasper_scene, write_photographs, write_run
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+KINDS = ("draw", "frame", "draw+backward", "step")
+STAGES = ["project", "bin", "composite", "composite_backward", "project_backward"]
+SMALL = ["--workload", "300,32x24", "--repeats", "2"]
+
+
+@pytest.fixture(scope="module")
+def script() -> Iterator[ModuleType]:
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        spec = importlib.util.spec_from_file_location("gpu", BENCHMARKS / "gpu.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["gpu"] = module  # dataclasses look their module up
+        spec.loader.exec_module(module)
+        yield module
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+        sys.modules.pop("gpu", None)
+
+
+@pytest.fixture
+def quick(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """With a copy of a MiB for the peak, and one thread."""
+    torch.set_num_threads(1)
+    measured = script.peaks
+    monkeypatch.setattr(script, "peaks", lambda device: measured(device, 2**18))
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    return script
+
+
+def test_without_a_gpu_it_ends_in_one_line(script: ModuleType, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert script.main([]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 1
+    assert told.err.startswith("gpu.py: --device: cuda: PyTorch finds no CUDA device")
+    assert script.main(["--device", "cpu", "--workload", "many"]) == 1
+    assert "write GAUSSIANS,WIDTHxHEIGHT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_backend_and_kind_is_timed(device: str, quick: ModuleType, tmp_path: Path, capsys) -> None:
+    assert quick.main([*SMALL, "--device", device, "--output", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "gpu.json").read_text())
+    assert (tmp_path / "gpu.md").read_text() == capsys.readouterr().out
+    assert result["peak"]["bytes"] > 1e8
+    assert result["peak"]["flops"] > 1e8
+    assert (result["hardware"]["gpu"] is not None) == (device == "cuda")
+    (case,) = result["workloads"]
+    assert case["workload"] == {"gaussians": 300, "width": 32, "height": 24}
+    for row in case["ms"]:
+        assert all(row[kind] > 0 for kind in KINDS)
+        assert row["step"] > row["draw"]  # which it contains
+    for rows in case["stages"].values():
+        check_stages(rows)
+    assert bool(case["stages"]) == any("triton" in row["backend"] for row in case["ms"])
+
+
+def check_stages(rows: list[dict]) -> None:
+    assert [row["stage"] for row in rows] == STAGES
+    for row in rows:
+        assert row["ms"] > 0
+        assert row["bytes"] > 300
+        assert row["share"]["bandwidth"] > 0
+        assert (row["flops"] > 0) == ("composite" in row["stage"])
+        assert ("arithmetic" in row["share"]) == ("composite" in row["stage"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="needs triton")
+def test_stages_are_told_apart(tmp_path: Path) -> None:
+    """By Triton's interpreter, in a process of its own."""
+    words = ["--device", "cpu", "--workload", "40,16x16", "--repeats", "1", "--output", str(tmp_path)]
+    command = [sys.executable, str(BENCHMARKS / "gpu.py"), *words]
+    result = subprocess.run(command, env={**os.environ, "TRITON_INTERPRET": "1"}, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    (case,) = json.loads((tmp_path / "gpu.json").read_text())["workloads"]
+    assert [row["backend"] for row in case["ms"]] == ["cpu", "triton", "triton, fixed order"]
+    assert list(case["stages"]) == ["triton", "triton, fixed order"]
+    for rows in case["stages"].values():
+        check_stages(rows)
+
+
+def test_a_tile_is_walked_until_its_last_pixel_is_full(script: ModuleType) -> None:
+    never = 2**31 - 1
+    full_at = torch.full((3, 6), 4, dtype=torch.int32)  # tiles of 2: two rows of three, the lower ones cut
+    full_at[0, 2] = never
+    full_at[2, 4] = 7
+    starts = torch.tensor([0, 9, 12, 30, 30, 40, 60], dtype=torch.int32)
+    walked = sys.modules["stages"].walked(full_at, starts, 2)
+    assert walked.tolist() == [5, 3, 5, 0, 5, 8]
+
+
+@pytest.mark.parametrize("device", SLOW_ON_CPU)
+def test_training_and_synthesis_are_timed_too(
+    device: str, quick: ModuleType, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    scene = grasper_scene()
+    capture = write_photographs(scene, tmp_path / "capture")
+    run = write_run(scene, tmp_path / "run", capture)
+    monkeypatch.setattr("neeco.training.instruments.discovery.TISSUE_STEPS", 5)
+    words = ["--train", str(capture), "--iterations", "4", "--synthesize", str(run), "--count", "3"]
+    assert quick.main([*SMALL, "--device", device, *words, "--output", str(tmp_path / "out")]) == 0
+    result = json.loads((tmp_path / "out" / "gpu.json").read_text())
+    assert [row["device"] for row in result["train"]] == list(dict.fromkeys((device, "cpu")))
+    assert all(row["seconds"] > 0 and 3 < row["splits"]["test"]["psnr"] < 60 for row in result["train"])
+    assert result["synthesize"]["images"] == 3
+    assert result["synthesize"]["images_per_second"] > 0
+    assert "images/s with all labels, of 3" in capsys.readouterr().out
+
+
+class Event:
+    """A CUDA event: the place that it has in its stream, one a millisecond."""
+
+    recorded: ClassVar[list[str]] = []
+
+    def __init__(self, enable_timing: bool) -> None:
+        assert enable_timing
+
+    def record(self, stream: str) -> None:
+        self.at = len(self.recorded)
+        self.recorded.append(stream)
+
+    def elapsed_time(self, end: Event) -> float:
+        return float(end.at - self.at)
+
+
+def test_a_gpu_is_timed_by_events_in_its_own_stream_and_named(script: ModuleType, monkeypatch) -> None:
+    card = SimpleNamespace(total_memory=8 * 2**30, major=8, minor=9)
+    monkeypatch.setattr(Event, "recorded", [])
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: f"stream of {device}")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Some Card")
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: card)
+    device = torch.device("cuda:1")
+    marks = sys.modules["stages"].Marks(device)
+    first, _, third = (marks.mark() for _ in range(3))
+    assert marks.between(first, third) == 2.0
+    assert Event.recorded == ["stream of cuda:1"] * 3
+    facts = script.hardware(device)
+    assert (facts["gpu"], facts["capability"], facts["memory"]) == ("Some Card", "8.9", 8 * 2**30)
+    assert {"driver", "cuda", "torch", "triton", "gsplat", "commit", "neeco"} <= facts.keys()
