@@ -1,0 +1,49 @@
+"""`neeco export`: a scene in one state, for other viewers of Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from neeco.errors import NeecoError
+from neeco.settings import Device
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Write a run's scene in one state as a file that other viewers of Gaussians open. They know neither hinges nor
+    lamps nor labels: nothing moves there, and the light is that of one camera."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder that `neeco train` wrote."""
+    format: Literal["ply", "spz"] = "ply"
+    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser."""
+    output: Path | None = None
+    """File to write; scene.ply or scene.spz in the run folder when not given."""
+    frame: int = 0
+    """Number of the frame, of those trained on, whose state and light are taken."""
+    states: Path | None = None
+    """The first state of this states.jsonl instead, in the light of its own camera where it names one."""
+    device: Device = "auto"
+
+
+def run(arguments: Arguments) -> int:
+    """Write the file and say what it holds."""
+    from neeco.raster.devices import device_of
+    from neeco.scene.scene import gaussian_scene
+    from neeco.training.run import open_run
+    from neeco.viewer.splats import splats_of, standing, write_splats
+
+    with open_run(arguments.run, device_of(arguments.device)) as trained:
+        scene = gaussian_scene(trained.scene, "export")
+        frames = len(scene.recorded.states)
+        if not 0 <= arguments.frame < frames:
+            raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
+        splats = splats_of(scene, *standing(scene, arguments.frame, arguments.states))
+    output = arguments.output or arguments.run / f"scene.{arguments.format}"
+    write_splats(splats, output, arguments.format)
+    print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without hinges and labels")
+    return 0

@@ -1,0 +1,66 @@
+"""`neeco view`: look at a run and steer it, in a browser or as one file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from neeco.errors import NeecoError
+from neeco.settings import Device
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
+    that is still trained, too. With --export, write one file that does so without a server."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
+    """Run folders that `neeco train` wrote or is writing: one, or two to compare."""
+    port: int = 8080
+    """Port to listen on; the next free one where it is taken."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Any but this machine's own loopback needs the token in the address that is printed."""
+    no_browser: bool = False
+    """Open no web browser; only print the address."""
+    export: Path | None = None
+    """Write this HTML file instead, of the one run given."""
+    sh: int = 3
+    """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
+    device: Device = "auto"
+
+
+def run(arguments: Arguments) -> int:
+    """Export, or serve until Ctrl-C."""
+    from neeco.raster.devices import device_of
+
+    if not arguments.runs:
+        raise NeecoError("view: no run given; give one, or two to compare")
+    if arguments.export is not None:
+        return _export(arguments, arguments.export)
+    from neeco.viewer.server import Viewer
+
+    device = device_of(arguments.device)
+    with Viewer(arguments.runs, arguments.host, arguments.port, device) as viewer:
+        try:
+            print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
+            if not arguments.no_browser:
+                import webbrowser
+
+                webbrowser.open(viewer.address)
+            viewer.wait()
+        except KeyboardInterrupt:
+            print()
+    return 0
+
+
+def _export(arguments: Arguments, output: Path) -> int:
+    from neeco.raster.devices import device_of
+    from neeco.viewer.export import export_page
+
+    if len(arguments.runs) != 1:
+        raise NeecoError(f"--export: {len(arguments.runs)} runs given; a file shows one")
+    print(export_page(arguments.runs[0], output, arguments.sh, device_of(arguments.device)))
+    return 0

@@ -1,0 +1,152 @@
+"""`neeco export`: a scene in one state, as files that other viewers of Gaussians open.
+
+They know neither hinges nor lamps nor labels: instruments stand still, and the light is baked into the colours as one
+camera has it. Coordinates are those of the capture's world (mm); viewers take their own view of which way is up.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from neeco.capture.model import Camera, State
+from neeco.capture.statefile import read_states
+from neeco.errors import NeecoError
+from neeco.files import write_atomically
+from neeco.raster import rasterize
+from neeco.raster.rotations import quat_to_matrix
+from neeco.raster.sh import brightened, headlight_factor, sh_basis
+from neeco.raster.shadow import shadowed
+from neeco.raster.types import Gaussians
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+
+Format = Literal["ply", "spz"]
+ASKED = 64  # directions by which harmonics are turned: four times their number
+SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
+SPZ_FRACTION = 12  # bits of a mm: positions reach 2 m
+SPZ_COLOR = 0.15  # of the first harmonic, per unit of what is stored
+SPZ_STEPS = (8, 16, 16)  # of 256, by which harmonics of degree 1, 2 and 3 are rounded
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians as other programs know them, float32."""
+
+    means: np.ndarray  # [N, 3] mm
+    quats: np.ndarray  # [N, 4] wxyz, unit
+    log_scales: np.ndarray  # [N, 3]
+    logits: np.ndarray  # [N] of the opacities
+    sh: np.ndarray  # [N, K, 3], world frame
+
+
+def standing(scene: Scene, frame: int, states: Path | None) -> tuple[State, Camera]:
+    """State and camera of a frame trained on; of the first line of a file of states where that is given, whose camera
+    is the frame's unless it names one. Raises NeecoError for a file that does not fit."""
+    state, camera = scene.recorded.states[frame], scene.recorded.cameras[frame]
+    if states is None:
+        return state, camera
+    line = read_states(states, scene.instruments)[0]
+    if line.world_from_camera is not None:
+        camera = replace(camera, world_from_camera=torch.from_numpy(line.world_from_camera))
+    return line.state, camera
+
+
+@torch.no_grad()
+def splats_of(scene: Scene, state: State, camera: Camera) -> Splats:
+    """The scene in `state`, lit as `camera` has it."""
+    posed = shadowed(scene.at(state), camera, rasterize)
+    sh = _in_world(posed)
+    if posed.headlight is not None:
+        view = camera.world_from_camera.to(posed.means)
+        seen = (posed.means - view[:3, 3]) @ view[:3, :3]
+        sh = brightened(sh, headlight_factor(posed.headlight, camera, seen)[:, None, None])
+    opacities = posed.opacities.clamp(1e-6, 1 - 1e-6)
+    tensors = (posed.means, normalize(posed.quats, dim=1), posed.scales.log(), torch.logit(opacities), sh)
+    return Splats(*(tensor.float().cpu().numpy() for tensor in tensors))
+
+
+def write_splats(splats: Splats, path: Path, format: Format) -> None:
+    """Write a file of that format. Raises NeecoError where the format cannot hold them, or the disk refuses."""
+    data = {"ply": ply_bytes, "spz": spz_bytes}[format](splats)
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(data)
+
+    write_atomically(path, write)
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """The file that 3D Gaussian splatting's own code writes (Kerbl et al. 2023), binary, little-endian."""
+    count, coefficients = splats.sh.shape[:2]
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)  # red's coefficients first, then green's, then blue's
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{k}" for k in range(3 * (coefficients - 1))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    columns = [splats.means, np.zeros_like(splats.means), splats.sh[:, 0], rest, splats.logits[:, None]]
+    table = np.concatenate([*columns, splats.log_scales, splats.quats], 1).astype("<f4")
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode() + table.tobytes()
+
+
+def spz_bytes(splats: Splats) -> bytes:
+    """Niantic's SPZ, version 2: about a tenth of the size of PLY. Raises NeecoError where positions leave its range."""
+    fixed = np.rint(splats.means.astype(np.float64) * 2**SPZ_FRACTION).astype(np.int64)
+    if fixed.size and np.abs(fixed).max() >= 2**23:
+        raise NeecoError("--format: spz holds positions within 2 m of the world's origin only; use ply")
+    degree = int(splats.sh.shape[1] ** 0.5) - 1
+    header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(splats.means), degree, SPZ_FRACTION, 0, 0)
+    positions = (fixed & 0xFFFFFF).astype("<u4")[..., None].view(np.uint8)[..., :3]
+    quats = np.where(splats.quats[:, :1] < 0, -splats.quats, splats.quats)[:, 1:]  # w is made of the rest, and positive
+    columns = (
+        positions,
+        _byte(255 / (1 + np.exp(-splats.logits.astype(np.float64)))),
+        _byte(splats.sh[:, 0] * (SPZ_COLOR * 255) + 127.5),
+        _byte((splats.log_scales + 10) * 16),
+        _byte(quats * 127.5 + 127.5),
+        _harmonics(splats.sh[:, 1:]),
+    )
+    body = header + b"".join(np.ascontiguousarray(column).tobytes() for column in columns)
+    return gzip.compress(body, mtime=0)
+
+
+def _harmonics(rest: np.ndarray) -> np.ndarray:
+    """uint8 [N, K - 1, 3], each coefficient's colours together."""
+    steps = np.repeat(SPZ_STEPS, (3, 5, 7))[: rest.shape[1], None]
+    whole = np.rint(rest * 128) + 128
+    return np.clip((whole + steps // 2) // steps * steps, 0, 255).astype(np.uint8)
+
+
+def _byte(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _in_world(posed: Gaussians) -> Tensor:
+    """[N, K, 3] harmonics turned out of the frames of their parts: those that agree with them in ASKED directions."""
+    count = posed.sh.shape[1]
+    if posed.sh_frames is None or count == 1:
+        return posed.sh
+    directions = _spread_directions(ASKED).to(posed.sh)  # [D, 3]
+    back = torch.linalg.pinv(sh_basis(directions, count))  # [K, D]
+    frames, which = torch.unique(posed.sh_frames, dim=0, return_inverse=True)  # most stand still, all alike
+    local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]
+    turned = back @ sh_basis(local.reshape(-1, 3), count).reshape(*local.shape[:2], count)  # [F, K, K]
+    return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
+
+
+def _spread_directions(count: int) -> Tensor:
+    """[count, 3] unit directions, evenly spread (a spiral by the golden angle)."""
+    k = torch.arange(count, dtype=torch.float64)
+    z, turn = 1 - (2 * k + 1) / count, k * torch.pi * (3 - 5**0.5)
+    ring = (1 - z * z).sqrt()
+    return torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)

@@ -1,0 +1,336 @@
+"""What a page, a program or a scene file may send to the server, and that it goes on serving the others."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from neeco.errors import NeecoError
+from neeco.viewer import serving
+from neeco.viewer.artist import Artist
+from neeco.viewer.server import Viewer
+
+viser = pytest.importorskip("viser")
+import msgspec  # noqa: E402
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.sync.client import ClientConnection, connect  # noqa: E402
+
+Serve = Callable[..., Viewer]
+PROTOCOL = f"viser-v{viser.__version__}"
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, 0.0],
+    "fov": 0.8,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 48,
+    "image_width": 64,
+    "look_at": [0.0, 0.0, 1.0],
+    "up_direction": [0.0, -1.0, 0.0],
+}
+
+
+def port_of(viewer: Viewer) -> int:
+    return int(viewer.address.split(":")[2].split("/")[0])
+
+
+def answer(port: int, *lines: bytes, wait: float = 20.0) -> bytes:
+    """The status line of what a raw request gets; empty: the connection was ended."""
+    with socket.create_connection(("127.0.0.1", port), timeout=wait) as raw:
+        raw.sendall(b"\r\n".join([*lines, b"", b""]))
+        return raw.recv(4096).partition(b"\r\n")[0]
+
+
+def opened(port: int) -> ClientConnection:
+    return connect(f"ws://127.0.0.1:{port}/", subprotocols=[PROTOCOL], max_size=None)
+
+
+def looks(connection: ClientConnection, **changed: Any) -> None:
+    """Say where the browser's camera stands."""
+    connection.send(msgspec.msgpack.encode(CAMERA | changed))
+
+
+def exhaust(connection: ClientConnection) -> None:
+    """Hear all that the server says. Raises ConnectionClosed when it ends that, TimeoutError when it falls silent."""
+    while True:
+        connection.recv(timeout=20)
+
+
+def client_of(viewer: Viewer, known: int = 0) -> Any:
+    """The newest of more than `known` browsers, once it has its panel."""
+    until = time.monotonic() + 20
+    while time.monotonic() < until:
+        if len(viewer.studio.artist.sitters) > known:
+            clients = viewer._server.get_clients()
+            return clients[max(clients)]
+        time.sleep(0.02)
+    raise AssertionError("no browser has come")
+
+
+def is_served(viewer: Viewer) -> bool:
+    """Does a new browser get a page, and a picture?"""
+    port = port_of(viewer)
+    assert answer(port, b"GET / HTTP/1.1", f"Host: 127.0.0.1:{port}".encode()) == b"HTTP/1.1 200 OK"
+    with opened(port) as connection:
+        before = set(viewer.studio.artist.sitters)
+        looks(connection)
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            if any(sitter._said_at > 0 for sitter in viewer.studio.artist.sitters if sitter not in before):
+                return True
+            time.sleep(0.02)
+    return False
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"Host: 127.0.0.1:%d\r\nHost: 127.0.0.1:%d",
+        b"Host: 127.0.0.1:%d\r\nHost: evil.example",
+        b"Host: evil.example",
+        b"Host: 127.0.0.1:%d@evil.example",
+        b"Host: 127.0.0.1; script-src *",
+        b"Host: 0.0.0.0:%d",
+        b"Host: [::1",
+        b"Host: [::ffff:7f00:1%%lo]:%d",
+        b"Host: \xff\xfe",
+        b"Host:",
+        b"X-Forwarded-Host: 127.0.0.1",
+        b"Host: 127.0.0.1:%d\r\nOrigin: http://[",
+        b"Host: 127.0.0.1:%d\r\nOrigin: \xff",
+        b"Host: 127.0.0.1:%d\r\nOrigin: http://127.0.0.1:%d\r\nOrigin: http://evil.example",
+        b"Host: 127.0.0.1:%d\r\nOrigin: null",
+        b"Host: 127.0.0.1:%d\r\nOrigin:",
+    ],
+)
+def test_odd_hosts_and_origins_are_refused(made_run: Path, serve: Serve, header: bytes, caplog) -> None:
+    port = port_of(serve(made_run))
+    sent = header.replace(b"%d", str(port).encode())
+    assert answer(port, b"GET / HTTP/1.1", sent).split(b" ")[1] == b"403"
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        b"/../../../../../../etc/passwd",
+        b"/..%2f..%2f..%2f..%2f..%2fetc/passwd",
+        b"/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+        b"/..\\..\\..\\..\\etc\\passwd",
+        b"//etc/passwd",
+        b"//[",
+        b"/%00",
+        b"/" + b"a" * 3000,
+        b"/assets",
+    ],
+)
+def test_only_the_pages_own_files_are_served(made_run: Path, serve: Serve, path: bytes, caplog) -> None:
+    port = port_of(serve(made_run))
+    status = answer(port, b"GET " + path + b" HTTP/1.1", f"Host: 127.0.0.1:{port}".encode())
+    assert status.split(b" ")[1] in (b"400", b"404")
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Serve) -> None:
+    port = port_of(serve(made_run, host="0.0.0.0"))
+    host = f"Host: 127.0.0.1:{port}".encode()
+    cookie = f"Cookie: neeco_{port}=".encode() + b"\xff\xfe"
+    assert answer(port, b"GET / HTTP/1.1", host, cookie).split(b" ")[1] == b"403"
+    assert answer(port, b"GET /?token=%ff%fe HTTP/1.1", host).split(b" ")[1] == b"403"
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "text",
+        b"",
+        b"\xc1",
+        b"\x91" * 100_000,  # lists in lists
+        msgspec.msgpack.encode([1, 2]),
+        msgspec.msgpack.encode({"no": "type"}),
+        msgspec.msgpack.encode({"type": "NoSuchMessage"}),
+        msgspec.msgpack.encode({"type": "ViewerCameraMessage", "wxyz": 1}),
+        b"\x00" * (serving.LARGEST_MESSAGE + 1),
+    ],
+)
+def test_what_is_not_understood_ends_that_connection_alone(
+    made_run: Path, serve: Serve, message: str | bytes, caplog, capfd
+) -> None:
+    viewer = serve(made_run)
+    with opened(port_of(viewer)) as other:
+        looks(other)
+        with opened(port_of(viewer)) as connection:
+            looks(connection)
+            connection.send(message)
+            with pytest.raises(ConnectionClosed):
+                exhaust(connection)
+        other.ping().wait(20)
+    assert is_served(viewer)
+    assert not [record for record in caplog.records if record.exc_info and record.levelno >= logging.WARNING]
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e300, 1e9])
+def test_a_place_that_is_none_does_not_end_the_others_pictures(made_run: Path, serve: Serve, value: float) -> None:
+    viewer = serve(made_run)
+    with opened(port_of(viewer)) as connection:
+        looks(connection)
+        panel = client_of(viewer).gui
+        handles = {handle._impl.props.label: handle for handle in panel._gui_input_handle_from_uuid.values()}
+        for label, said in (("frame", value), ("along shaft (mm)", value), ("play", True)):
+            update = {"type": "GuiUpdateMessage", "uuid": handles[label]._impl.uuid, "updates": {"value": said}}
+            connection.send(msgspec.msgpack.encode(update))
+        go = {
+            "type": "GuiUpdateMessage",
+            "uuid": handles["go to this frame's camera"]._impl.uuid,
+            "updates": {"value": 1},
+        }
+        connection.send(msgspec.msgpack.encode(go))
+        time.sleep(0.5)
+        assert viewer.studio.artist._thread.is_alive()
+        assert is_served(viewer)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position": [float("nan")] * 3},
+        {"position": [1e300, -1e300, 1e300]},
+        {"wxyz": [0.0] * 4},
+        {"wxyz": [1.0]},
+        {"fov": float("nan")},
+        {"fov": "wide"},
+        {"image_height": 1, "image_width": 10**12},
+        {"image_height": 10**12, "image_width": 10**12},
+        {"image_height": 0, "image_width": 0},
+    ],
+)
+def test_a_camera_that_is_none_does_not_end_the_others_pictures(
+    made_run: Path, serve: Serve, changed: dict[str, Any]
+) -> None:
+    viewer = serve(made_run)
+    with opened(port_of(viewer)) as connection:
+        looks(connection)
+        client_of(viewer)
+        looks(connection, **changed)
+        time.sleep(0.3)
+        assert is_served(viewer)
+
+
+def test_a_storm_of_messages_leaves_the_others_their_pictures(made_run: Path, serve: Serve) -> None:
+    viewer = serve(made_run)
+    with opened(port_of(viewer)) as connection:
+        for step in range(3000):
+            looks(connection, position=[0.001 * step, 0.0, 0.0])
+        assert is_served(viewer)
+
+
+def test_more_browsers_than_there_is_room_for_are_told_so(
+    made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serving, "MOST_BROWSERS", 2)
+    viewer = serve(made_run)
+    with opened(port_of(viewer)), opened(port_of(viewer)), pytest.raises(InvalidStatus) as refused:
+        opened(port_of(viewer))
+    assert refused.value.response.status_code == 503
+    assert is_served(viewer)
+
+
+def test_a_browser_for_which_time_cannot_go_on_does_not_end_the_others_pictures() -> None:
+    drawn: list[bool] = []
+
+    def fail(now: float) -> None:
+        raise RuntimeError("no time")
+
+    artist = Artist()
+    artist.start()
+    try:
+        artist.seat(SimpleNamespace(key=1, draw=lambda sharp: None, tick=fail))
+        time.sleep(0.2)
+        artist.seat(SimpleNamespace(key=2, draw=lambda sharp: drawn.append(sharp), tick=lambda now: None))
+        time.sleep(0.6)
+    finally:
+        artist.stop()
+    assert drawn == [False, True]
+
+
+def rewritten(run: Path, folder: Path, change: Callable[[dict[str, Any], dict[str, torch.Tensor]], None]) -> Path:
+    """A copy of a run, whose scene `change` has altered."""
+    copy = folder / "run"
+    shutil.copytree(run, copy)
+    path = copy / "scene.safetensors"
+    with safe_open(path, framework="pt") as stream:
+        header = json.loads(stream.metadata()["neeco"])
+        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    change(header, tensors)
+    save_file(tensors, path, {"neeco": json.dumps(header)})
+    return copy
+
+
+NAN = float("nan")
+ODD_SCENES: dict[str, Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]] = {
+    "counts beyond all": lambda header, _: header.update(counts=[10**15, 1]),
+    "counts below none": lambda header, _: header.update(counts=[-1, 1000]),
+    "counts of many": lambda header, _: header.update(counts=[850, *[0] * 10**5]),
+    "sh_degree beyond": lambda header, _: header.update(sh_degree=10**9),
+    "sh_degree below": lambda header, _: header.update(sh_degree=-1),
+    "endless words": lambda header, _: header.update(background="x" * 10**6),
+    "settings that are none": lambda header, _: header.update(deformation=[]),
+    "a method elsewhere": lambda header, _: header.update(method="../../evil"),
+    "a huge image": lambda header, _: header["recorded"][0].update(intrinsics=[60, 60, 32, 24, 10**9, 10**9, 0.01]),
+    "an image of nothing": lambda header, _: header["recorded"][0].update(intrinsics=[60, 60, 32, 24, 0, 48, 0.01]),
+    "a lens of nothing": lambda header, _: header["recorded"][0].update(intrinsics=[0, 0, 32, 24, 64, 48, 0.01]),
+    "a lens of NaN": lambda header, _: header["recorded"][0].update(intrinsics=[NAN, 60, 32, 24, 64, 48, 0.01]),
+    "a time of words": lambda header, _: header["recorded"][0].update(time="noon"),
+    "a name of none": lambda header, _: header["recorded"][0].update(name=5),
+    "a joint of words": lambda header, _: header["recorded"][0].update(joints={"grasper": {"jaw_angle": "<b>"}}),
+    "a joint beyond all": lambda header, _: header["recorded"][0].update(joints={"grasper": {"jaw_angle": 1e308}}),
+    "half a limit": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": [5]}),
+    "limits of words": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": ["a", "b"]}),
+    "limits beyond all": lambda header, _: header["instruments"][0].update(joints={"jaw_angle": [-1e308, 1e308]}),
+    "instruments without poses": lambda header, _: header.update(instruments=header["instruments"] * 1000),
+    "Gaussians at NaN": lambda _, tensors: tensors["canonical.means"].fill_(NAN),
+    "doubles": lambda _, tensors: tensors.update({"canonical.means": tensors["canonical.means"].double()}),
+    "cameras that are none": lambda _, tensors: tensors["recorded.cameras"].zero_(),
+    "poses at NaN": lambda _, tensors: tensors["recorded.poses"].fill_(NAN),
+}
+
+
+@pytest.mark.parametrize("change", ODD_SCENES.values(), ids=ODD_SCENES.keys())
+def test_a_scene_that_cannot_be_is_refused_in_one_short_line(
+    made_run: Path, tmp_path: Path, change: Callable[..., Any]
+) -> None:
+    run = rewritten(made_run, tmp_path, change)
+    with pytest.raises(NeecoError) as refused:
+        Viewer([run])
+    said = str(refused.value)
+    assert said.startswith(str(run / "scene.safetensors"))
+    assert "\n" not in said
+    assert len(said) < len(str(run)) + 300
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda header, _: header["recorded"][0].update(name="x" * 10**6),
+        lambda header, _: header.update(diagnostics={"<img src=x onerror=alert(1)>": "<img src=x onerror=alert(1)>"}),
+        lambda _, tensors: tensors["canonical.log_scales"].fill_(1e38),
+        lambda _, tensors: tensors["canonical.quats"].zero_(),
+        lambda _, tensors: tensors["canonical.means"].fill_(1e30),
+    ],
+)
+def test_an_odd_scene_is_still_served(made_run: Path, serve: Serve, tmp_path: Path, change: Callable[..., Any]) -> None:
+    assert is_served(serve(rewritten(made_run, tmp_path, change)))

@@ -1,0 +1,269 @@
+"""The server as programs meet it; what browsers do with it is in test_browser.py."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from neeco.cli import main
+from neeco.errors import NeecoError
+from neeco.viewer import serving
+from neeco.viewer.artist import Artist
+from neeco.viewer.pace import MOVING_PX, SHARP_PX, Pace
+from neeco.viewer.server import Viewer
+
+viser = pytest.importorskip("viser")
+from viser import _messages as messages  # noqa: E402
+from websockets.exceptions import InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+Serve = Callable[..., Viewer]
+PROTOCOL = f"viser-v{viser.__version__}"
+
+
+def status(url: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as refused:
+        return refused.code
+
+
+def socket_status(port: int, path: str = "/", **headers: str) -> int:
+    """101: the web socket was opened."""
+    try:
+        with connect(f"ws://127.0.0.1:{port}{path}", subprotocols=[PROTOCOL], additional_headers=headers):
+            return 101
+    except InvalidStatus as refused:
+        return refused.response.status_code
+
+
+def port_of(viewer: Viewer) -> int:
+    return int(viewer.address.split(":")[2].split("/")[0])
+
+
+def test_on_loopback_page_and_socket_open_and_other_sites_are_refused(made_run: Path, serve: Serve) -> None:
+    viewer = serve(made_run)
+    port = port_of(viewer)
+    assert viewer.token is None
+    assert viewer.address == f"http://127.0.0.1:{port}/"
+    assert status(viewer.address) == 200
+    assert socket_status(port) == 101
+    assert status(viewer.address, Host=f"evil.example:{port}") == 403
+    assert socket_status(port, Origin="http://evil.example") == 403
+    assert socket_status(port, Origin=f"http://127.0.0.1:{port}") == 101
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(urllib.request.Request(viewer.address, headers={"Host": "evil.example"}))
+    assert b"refused: open http://127.0.0.1" in refused.value.read()
+
+
+def test_it_listens_on_loopback_only(made_run: Path, serve: Serve) -> None:
+    port = port_of(serve(made_run))
+    with socket.socket() as other:  # the same port of every address is still free but for loopback's
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        other.bind(("127.0.0.2", port))
+
+
+def test_with_another_host_nobody_comes_without_the_token(made_run: Path, serve: Serve) -> None:
+    viewer = serve(made_run, host="0.0.0.0")
+    port = port_of(viewer)
+    assert viewer.token is not None
+    assert len(viewer.token) >= 32
+    assert viewer.address.endswith(f"/?token={viewer.token}")
+    page = f"http://127.0.0.1:{port}/"
+    assert [status(page), status(f"{page}?token=x"), status(f"{page}?token={viewer.token}")] == [403, 403, 200]
+    assert socket_status(port) == 403
+    assert socket_status(port, Cookie=f"neeco_{port}={viewer.token}") == 101
+    assert socket_status(port, f"/?token={viewer.token}", Origin="http://evil.example") == 403
+
+
+def test_every_server_has_a_token_of_its_own(made_run: Path, serve: Serve) -> None:
+    assert serve(made_run, host="0.0.0.0").token != serve(made_run, host="0.0.0.0").token
+
+
+def test_a_taken_port_gives_the_next_one(made_run: Path, serve: Serve) -> None:
+    first = port_of(serve(made_run))
+    assert port_of(serve(made_run, port=first)) > first
+
+
+def test_a_browser_that_asks_for_a_tunnel_gets_none(
+    made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
+    viewer = serve(made_run)
+    wish = messages.ShareUrlRequest()
+    with connect(f"ws://127.0.0.1:{port_of(viewer)}/", subprotocols=[PROTOCOL]) as wishing:
+        wishing.send(_packed(wish))
+        time.sleep(0.5)
+    assert asked == []
+
+
+def test_plain_viser_would_give_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the test above can fail."""
+    asked: list[object] = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *given: asked.append(given))
+    server = viser.ViserServer(host="127.0.0.1", port=18080, verbose=False)
+    try:
+        with connect(f"ws://127.0.0.1:{server.get_port()}/", subprotocols=[PROTOCOL]) as wishing:
+            wishing.send(_packed(messages.ShareUrlRequest()))
+            time.sleep(0.5)
+    finally:
+        server.stop()
+    assert len(asked) == 1
+
+
+def _packed(message: object) -> bytes:
+    import msgspec
+
+    return msgspec.msgpack.encode({"type": type(message).__name__})
+
+
+def test_a_server_that_the_guard_does_not_see_is_not_left_running(
+    made_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped: list[object] = []
+
+    class Other:
+        def __init__(self, **_: object) -> None: ...
+
+        def stop(self) -> None:
+            stopped.append(self)
+
+    monkeypatch.setattr("viser.ViserServer", Other)
+    with pytest.raises(NeecoError, match="opens its port in a way that is not known"):
+        Viewer([made_run])
+    assert len(stopped) == 1
+
+
+def test_without_viser_it_says_what_to_install(made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(made_run), "--no-browser"]) == 1
+    assert capsys.readouterr().err == f"neeco: error: {serving.MISSING}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "no run given"),
+        (["RUN", "RUN", "RUN"], "3 runs given"),
+        (["nowhere"], "nowhere: no such run folder"),
+        (["RUN", "--port", "70000"], "--port: 70000"),
+        (["RUN", "RUN", "--export", "x.html"], "--export: 2 runs given"),
+        (["RUN", "--export", "x.html", "--sh", "4"], "--sh: 4"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_line(arguments: list[str], told: str, made_run: Path, capsys) -> None:
+    given = [str(made_run) if word == "RUN" else word for word in arguments]
+    assert main(["view", *given, *([] if "--export" in given else ["--no-browser"])]) == 1
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+
+
+def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> None:
+    program = "import sys; from neeco.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "view", str(made_run), "--no-browser", "--device", "cpu"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("http://127.0.0.1:")
+        assert status(line.split()[0]) == 200
+        process.terminate()
+        rest, errors = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert (rest.strip(), errors) == ("", "")
+
+
+class Browser:
+    """A sitter that only notes what it is asked."""
+
+    def __init__(self, key: int, seconds: float = 0.0) -> None:
+        self.key, self.seconds, self.drawn = key, seconds, []
+
+    def draw(self, sharp: bool) -> None:
+        self.drawn.append(sharp)
+        time.sleep(self.seconds)
+
+    def tick(self, now: float) -> float | None:
+        return None
+
+
+@pytest.fixture
+def artist():
+    artist = Artist()
+    artist.start()
+    yield artist
+    artist.stop()
+
+
+def test_what_moves_is_drawn_coarsely_and_once_still_sharp(artist: Artist) -> None:
+    browser = Browser(1)
+    artist.seat(browser)
+    time.sleep(0.6)
+    assert browser.drawn == [False, True]
+
+
+def test_wishes_made_while_one_is_drawn_become_one(artist: Artist) -> None:
+    browser = Browser(1, seconds=0.2)
+    artist.seat(browser)
+    for _ in range(20):
+        artist.ask(1)
+        time.sleep(0.01)
+    time.sleep(1.0)
+    assert browser.drawn in ([False, False, True], [False, False, False, True])
+
+
+def test_browsers_take_turns(artist: Artist) -> None:
+    busy, other = Browser(1, seconds=0.02), Browser(2, seconds=0.02)
+    artist.seat(busy)
+    artist.seat(other)
+    for _ in range(40):
+        artist.ask(1)
+        artist.ask(2)
+        time.sleep(0.01)
+    assert abs(len(busy.drawn) - len(other.drawn)) <= 2
+    assert len(busy.drawn) > 4
+
+
+def test_one_browsers_trouble_does_not_end_the_others_pictures(artist: Artist) -> None:
+    class Broken(Browser):
+        def draw(self, sharp: bool) -> None:
+            raise RuntimeError("no picture")
+
+    healthy = Browser(2)
+    artist.seat(Broken(1))
+    artist.seat(healthy)
+    time.sleep(0.6)
+    assert healthy.drawn == [False, True]
+
+
+def test_who_has_gone_is_not_drawn_for(artist: Artist) -> None:
+    browser = Browser(1)
+    artist.seat(browser)
+    artist.leave(1)
+    time.sleep(0.4)
+    artist.ask(1)
+    time.sleep(0.4)
+    assert len(browser.drawn) <= 1
+
+
+def test_a_slow_scene_is_drawn_smaller_and_a_fast_one_as_large_as_the_window() -> None:
+    fast, slow = Pace(), Pace()
+    for _ in range(3):
+        fast.took(1e-3, 256 * 400)
+        slow.took(5.0, 256 * 400)
+    assert fast.height(False, 900, 1.6) == MOVING_PX
+    assert fast.height(True, 900, 1.6) == SHARP_PX
+    assert fast.height(True, 300, 1.6) == 300
+    assert slow.height(False, 900, 1.6) < slow.height(True, 900, 1.6) < 100
+    fast.took(60.0, 256 * 400)  # had to find something out first
+    assert fast.height(False, 900, 1.6) == MOVING_PX

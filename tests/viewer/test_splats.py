@@ -1,0 +1,152 @@
+"""A scene in one state as other programs read it: drawn again from the file, it looks the same."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from ball_world import ball_scene
+from scene_worlds import CAMERA, grasper_state, make_scene, pose_of
+from torch import Tensor
+
+from neeco.cli import main
+from neeco.errors import NeecoError
+from neeco.evaluation.image_metrics import psnr
+from neeco.raster import rasterize
+from neeco.raster.types import Gaussians
+from neeco.viewer.splats import ply_bytes, splats_of, spz_bytes, standing
+
+STATE = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), 0.5)
+
+
+def lit_scene():
+    """All that is baked: turned harmonics, a headlight, a lamp's shadow."""
+    scene = make_scene("kinematic")
+    scene.canonical.means[: scene.canonical.counts[0], 2] += 90
+    with torch.no_grad():
+        scene.falloff.copy_(torch.tensor([0.8, 1.2]))
+        scene.vignette.copy_(torch.tensor([-0.5, 0.1]))
+        scene.shadow_offsets[0] = torch.tensor([9.0, -5.0, 0.0])
+        scene.shadow_strengths[0] = 0.5
+    return scene.requires_grad_(False)
+
+
+def read_ply(data: bytes) -> dict[str, np.ndarray]:
+    header, body = data.split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property")]
+    table = np.frombuffer(body, "<f4").reshape(-1, len(names))
+    assert f"element vertex {len(table)}".encode() in header
+    return {name: table[:, k] for k, name in enumerate(names)}
+
+
+def gaussians_of_ply(data: bytes) -> Gaussians:
+    found = read_ply(data)
+
+    def columns(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([found[name] for name in names], 1).copy())
+
+    rest = len([name for name in found if name.startswith("f_rest_")])
+    sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    if rest:
+        sh = torch.cat([sh, columns(*(f"f_rest_{k}" for k in range(rest))).reshape(len(sh), 3, -1).transpose(1, 2)], 1)
+    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    scales, opacities = columns("scale_0", "scale_1", "scale_2").exp(), torch.sigmoid(columns("opacity")[:, 0])
+    return Gaussians(columns("x", "y", "z"), quats, scales, opacities, sh.contiguous())
+
+
+def gaussians_of_spz(data: bytes) -> Gaussians:
+    raw = gzip.decompress(data)
+    magic, version, count, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", raw[:16])
+    assert (magic.to_bytes(4, "little"), version, flags, reserved) == (b"NGSP", 2, 0, 0)
+    at = 16
+
+    def columns(width: int) -> np.ndarray:
+        nonlocal at
+        values = np.frombuffer(raw, np.uint8, count * width, at).reshape(count, width).astype(np.int64)
+        at += count * width
+        return values
+
+    thirds = columns(9).reshape(count, 3, 3)
+    whole = thirds[..., 0] | thirds[..., 1] << 8 | thirds[..., 2] << 16
+    means = np.where(whole >= 2**23, whole - 2**24, whole) / 2**bits
+    opacities, dc = columns(1)[:, 0] / 255, (columns(3) / 255 - 0.5) / 0.15
+    scales, xyz = np.exp(columns(3) / 16 - 10), columns(3) / 127.5 - 1
+    w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
+    rest = (columns(3 * ((degree + 1) ** 2 - 1)) - 128) / 128
+    assert at == len(raw)
+    sh = np.concatenate([dc[:, None], rest.reshape(count, -1, 3)], 1)
+    arrays = (means, np.concatenate([w, xyz], 1), scales, opacities, sh)
+    return Gaussians(*(torch.from_numpy(array).float() for array in arrays))
+
+
+def decibels(image: Tensor, truth: Tensor) -> float:
+    return psnr(image.clamp(0, 1), truth.clamp(0, 1))
+
+
+@torch.no_grad()
+def test_drawn_again_from_the_file_it_looks_as_the_scene_does_from_that_camera() -> None:
+    scene = lit_scene()
+    truth = scene.draw(STATE, CAMERA).color
+    splats = splats_of(scene, STATE, CAMERA)
+    assert float(truth.std()) > 0.05
+    assert decibels(rasterize(gaussians_of_ply(ply_bytes(splats)), CAMERA).color, truth) > 60
+    assert decibels(rasterize(gaussians_of_spz(spz_bytes(splats)), CAMERA).color, truth) > 25
+
+
+@torch.no_grad()
+def test_what_is_baked_matters() -> None:
+    scene = lit_scene()
+    drawn = rasterize(gaussians_of_ply(ply_bytes(splats_of(scene, STATE, CAMERA))), CAMERA).color
+    scene.sh_degree = 0
+    assert decibels(scene.draw(STATE, CAMERA).color, drawn) < 40  # the harmonics
+    scene.sh_degree = 2
+    scene.falloff.zero_()
+    assert decibels(scene.draw(STATE, CAMERA).color, drawn) < 40
+    other = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), -0.3)
+    assert decibels(lit_scene().draw(other, CAMERA).color, drawn) < 40
+
+
+def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None:
+    scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
+    state, camera = standing(scene, 0, None)
+    splats = splats_of(scene, state, camera)
+    truth = scene.draw(state, camera).color
+    small, large = spz_bytes(splats), ply_bytes(splats)
+    assert (small, large) == (spz_bytes(splats), ply_bytes(splats))
+    assert len(small) < len(large) / 5
+    assert decibels(rasterize(gaussians_of_spz(small), camera).color, truth) > 38
+
+
+def test_positions_that_spz_cannot_hold_are_refused() -> None:
+    scene = ball_scene("ball", [(0.0, 0.0, 3000.0)])
+    with pytest.raises(NeecoError, match=r"--format: spz .* use ply"):
+        spz_bytes(splats_of(scene, *standing(scene, 0, None)))
+
+
+def run_folder(path: Path, scene) -> Path:
+    from neeco.scene.io import save_scene
+
+    path.mkdir()
+    save_scene(scene, path / "scene.safetensors")
+    (path / "config.yaml").write_text(
+        "schema: neeco-run/1\nversion: 0.1.0\ncapture: /gone\ntransforms: transforms.json\nmethod: kinematic\nseed: 0\n"
+    )
+    return path
+
+
+def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0), (5.0, 0.0, 55.0)]))
+    assert main(["export", str(run), "--format", "spz", "--frame", "1"]) == 0
+    assert "3,165 Gaussians" in capsys.readouterr().out
+    assert gaussians_of_spz((run / "scene.spz").read_bytes()).means.shape == (3165, 3)
+    assert main(["export", str(run), "--frame", "2"]) == 1
+    assert "--frame: 2: the scene was trained on frames 0 to 1" in capsys.readouterr().err
+    states = tmp_path / "states.jsonl"
+    states.write_text('{"instruments": [{"name": "other", "pose": 1, "joints": {}}]}\n')
+    assert main(["export", str(run), "--states", str(states), "--output", str(tmp_path / "a.ply")]) == 1
+    assert "states.jsonl: line 1" in capsys.readouterr().err
+    assert not (tmp_path / "a.ply").exists()
