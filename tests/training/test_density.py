@@ -91,7 +91,7 @@ def test_adams_rows_follow_and_new_ones_start_at_zero() -> None:
     before, adam = two_bodies(0.5), Adam()
     means = before.means.requires_grad_()
     means.grad = torch.arange(1.0, 16.0)[:, None].repeat(1, 3)
-    adam.step("means", means, 0.0)
+    adam.step([("means", means, 0.0)])
     means.requires_grad_(False)
     expected = {float(x): float(m) for x, m in zip(means[:, 0], adam.first["means"][:, 0], strict=True)}
     before.opacity_logits[1] = -20.0
@@ -111,7 +111,7 @@ def test_an_opacity_reset_lowers_the_high_ones_keeps_the_low_ones_and_forgets_th
     for name in ("opacity_logits", "means"):
         tensor = canonical.tensors()[name].requires_grad_(True)
         tensor.grad = torch.ones_like(tensor)
-        adam.step(name, tensor, 0.0)
+        adam.step([(name, tensor, 0.0)])
     reset_opacity(canonical, adam)
     ceiling = math.log(0.01 / 0.99)
     assert torch.equal(canonical.opacity_logits.detach(), before.clamp(max=ceiling))

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.raster.rotations import rigid, rigid_from_vector, rotate_about
 from neeco.scene.hinges import Hinges
-from neeco.scene.rotations import rigid, rigid_from_vector, rotate_about
 from neeco.training.initial import gaussian_session, initial_scene
 from neeco.training.instruments import discovery
 from neeco.training.instruments.carving import CarvedShape, carve
-from neeco.training.instruments.discovery import at_middle, tissue_evidence
+from neeco.training.instruments.discovery import at_middle, shape_around_frame, tissue_evidence
 from neeco.training.instruments.evidence import Evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.options import training_config
@@ -199,3 +199,17 @@ def test_seeds_stand_at_the_middle_reading_where_offsets_are_nothing() -> None:
     assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=1e-4)
     assert torch.allclose(moved[:20], seeds[:20], atol=1e-5)
     assert (moved[20:] - seeds[20:]).norm(dim=1).max() > 0.1
+
+
+def test_the_search_makes_every_tensor_where_the_evidence_is() -> None:
+    """What is made without saying where would be on "meta" here, and meeting the evidence there would fail."""
+    evidence, shape, _ = found("straight")
+    guesses = search_hinge(evidence, "tool", "jaw", shape)
+    with torch.device("meta"):
+        again = carve(evidence, "tool", torch.Generator("cpu").manual_seed(0), 500)
+        assert again is not None
+        around = shape_around_frame(again, evidence.distance, torch.Generator("cpu").manual_seed(0))
+        assert search_hinge(evidence, "tool", "jaw", again) == guesses
+    tensors = (again.instrument_from_shaft, again.center_line, again.seeds, around.instrument_from_shaft, around.seeds)
+    assert not any(tensor.is_meta for tensor in tensors)
+    assert torch.equal(again.seeds, shape.seeds)

@@ -12,12 +12,15 @@ import pytest
 import torch
 from capture_files import write_capture
 from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 import neeco.files
 import neeco.training.session
 from neeco.capture import check
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.files import LOCK, TEMPORARY
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint
 from neeco.training.options import training_config
 from neeco.training.run import load_run
@@ -102,6 +105,11 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
     for opened in (lambda: load_run(run), lambda: train(capture, run, CONFIG, resume=True)):
         with pytest.raises(NeecoError, match=r"config.yaml: schema is 'neeco-run/9', this version reads 'neeco-run/1'"):
             opened()
+
+    for line in ("capture: [1]", "seed: x", "transforms: {}"):
+        (run / "config.yaml").write_text(config + line + "\n")  # the last one holds
+        with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not as neeco writes it"):
+            load_run(run)
 
     (run / "config.yaml").write_text(config + "warp_drive: true\n")
     with pytest.raises(NeecoError, match=r"config.yaml: .*warp_drive"):
@@ -193,3 +201,65 @@ def test_a_run_whose_capture_is_gone_says_where_to_write_its_new_place(
     config = run / "config.yaml"
     config.write_text(config.read_text().replace(str(capture), str(moved)))
     assert main(["render", str(run), "--output", str(tmp_path / "drawn"), "--split", "train"]) == 0
+
+
+def test_a_capture_that_changed_is_not_trained_on(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]
+    with monkeypatch.context() as patched:
+        patched.setattr(neeco.training.session.GaussianSession, "finish", lambda self: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            main(words)
+    image = capture / "images" / "000003.png"
+    content = image.read_bytes()
+    Image.new("RGB", (32, 24)).save(image)
+    assert main([*words, "--resume"]) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"config.yaml: capture: {capture} has changed since this run was begun; put its files back" in told
+    assert not (tmp_path / "run" / "scene.safetensors").exists()
+    image.write_bytes(content)
+    assert main([*words, "--resume"]) == 0
+
+
+def test_a_run_killed_before_its_first_whole_file_begins_again(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    for name in (LOCK, f"{TEMPORARY}abc.yaml"):
+        (tmp_path / "run" / name).touch()
+    run = train(capture, tmp_path / "run", CONFIG, resume=True)
+    assert hidden_files(run) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("window", "[1.5]"), ("window", "[[1, 2, 3]]"), ("window", "3"), ("window", '[["a", {}]]'), ("scene", '{"a": 1}')],
+)
+def test_a_checkpoint_whose_fields_do_not_fit_is_refused(
+    field: str, value: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(neeco.training.session.GaussianSession, "finish", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train(capture, tmp_path / "run", CONFIG)
+    path = checkpoint_path(tmp_path / "run")
+    with safe_open(path, framework="pt") as stream:
+        header = json.loads(stream.metadata()["neeco"])
+        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    header[field] = json.loads(value)
+    save_file(tensors, path, {"neeco": json.dumps(header)})
+    with pytest.raises(NeecoError, match=r"session.safetensors: cannot resume from this checkpoint"):
+        train(capture, tmp_path / "run", CONFIG, resume=True)
+
+
+def test_rows_that_a_full_disk_cut_off_are_written_again(capture: Path, tmp_path: Path) -> None:
+    def stop(row: ProgressRow) -> None:
+        if row.iteration == 30:
+            raise KeyboardInterrupt
+
+    whole = train(capture, tmp_path / "whole", CONFIG)
+    with pytest.raises(KeyboardInterrupt):
+        train(capture, tmp_path / "cut", CONFIG, progress=stop)
+    with (tmp_path / "cut" / "metrics.jsonl").open("a") as stream:
+        stream.write('{"iteration": 35, "loss": {}')
+    train(capture, tmp_path / "cut", CONFIG, resume=True)
+    rows = [(folder / "metrics.jsonl").read_text().count("\n") for folder in (whole, tmp_path / "cut")]
+    assert rows == [12, 12]

@@ -22,7 +22,7 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
     config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
     assert config_from_dict(yaml.safe_load(yaml.safe_dump(config_to_dict(config)))) == config
-    write_config(tmp_path, tmp_path / "capture", config)
+    write_config(tmp_path, tmp_path / "capture", config, "0" * 64)
     assert stored_config(tmp_path, read_config(tmp_path)) == config
     assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
@@ -152,3 +152,11 @@ def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
 def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
     with pytest.raises(NeecoError, match=f"^method: .*{named}"):
         variant_config(name, {})
+
+
+def test_views_per_step_are_for_gaussians_and_at_least_one() -> None:
+    assert training_config("3dgs", {"views_per_step": 4}).views_per_step == 4
+    with pytest.raises(NeecoError, match="--views-per-step: 0 is too small; give at least 1"):
+        training_config("3dgs", {}, ["views_per_step=0"])
+    with pytest.raises(NeecoError, match=r"--views-per-step: method nerfies draws rays .* deformation\.rays=NUMBER"):
+        training_config("nerfies", {"views_per_step": 2})

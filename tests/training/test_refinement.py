@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from neeco.capture.model import Frame, InstrumentState, State
@@ -49,3 +50,11 @@ def test_nothing_is_corrected_before_its_time() -> None:
     refinement.poses += 1
     assert refinement.apply(2, frames[2].state, CAMERA, 399)[0] is frames[2].state
     assert refinement.apply(2, frames[2].state, CAMERA, 400)[0] is not frames[2].state
+
+
+def test_corrections_of_another_shape_are_not_taken_up() -> None:
+    refinement = Refinement(RefineConfig(latency=True), sliding_frames(), ("rod",), CPU)
+    kept = refinement.tensors()
+    refinement.restore(kept)
+    with pytest.raises(ValueError, match=r"latency: \[2\], not \[1\]"):
+        refinement.restore(kept | {"latency": torch.zeros(2)})

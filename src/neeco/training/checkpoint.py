@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 
 from neeco.errors import NeecoError
+from neeco.files import require_file, require_like
 from neeco.scene.drawable import Learned
-from neeco.scene.io import pack_scene, save_tensors, unpack_scene
+from neeco.scene.io import DAMAGED, pack_scene, save_tensors, unpack_scene
 from neeco.scene.learning import Session, StepResult
 from neeco.training.session import members
 
 SCHEMA = "neeco-checkpoint/1"
+HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}
 
 
 def checkpoint_path(run: Path) -> Path:
@@ -52,19 +56,30 @@ def save_checkpoint(session: Session, run: Path) -> None:
 def read_checkpoint(run: Path) -> tuple[Learned, dict[str, Any], dict[str, Tensor]]:
     """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
     path = checkpoint_path(run)
-    try:
+    require_file(path, "a checkpoint of `neeco train`")
+    with telling_damage(path):
         with safe_open(path, framework="pt") as stream:
             header = json.loads((stream.metadata() or {})["neeco"])
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        require_like(header, HEADER, f"{path}: header", "train again without --resume")
         if header["schema"] != SCHEMA:
             raise ValueError(f"schema {header['schema']!r}, this version reads {SCHEMA!r}")
         parts = {name.removeprefix("scene/"): t for name, t in tensors.items() if name.startswith("scene/")}
-        scene = unpack_scene(parts, header["scene"])
-    except (SafetensorError, OSError, LookupError, ValueError, TypeError, RuntimeError) as error:
-        raise NeecoError(
-            f"{path}: cannot resume from this checkpoint ({error}); train again without --resume"
-        ) from None
+        try:
+            scene = unpack_scene(parts, header["scene"])
+        except NeecoError as error:  # which knows no file
+            raise ValueError(str(error)) from None
     return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+
+
+@contextmanager
+def telling_damage(path: Path) -> Iterator[None]:
+    """For a block that takes up the checkpoint in `path`: raises NeecoError where what it holds does not fit."""
+    try:
+        yield
+    except DAMAGED as error:
+        said = " ".join(str(error).split())
+        raise NeecoError(f"{path}: cannot resume from this checkpoint ({said}); train again without --resume") from None
 
 
 def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -83,5 +98,6 @@ def restore_session(session: Session, header: dict[str, Any], tensors: dict[str,
     torch.set_rng_state(tensors["random/torch"])
     if device.type == "cuda":
         torch.cuda.set_rng_state(tensors["random/cuda"], device)
-    session.window = [StepResult(loss, psnr) for loss, psnr in header.get("window", [])]  # not in older ones
+    window = header.get("window", [])  # not in older ones
+    session.window = [StepResult(float(loss), float(psnr)) for loss, psnr in window]
     session.iteration, session.seconds = header["iteration"], header["seconds"]

@@ -28,7 +28,8 @@ class TrainConfig:
     """Settings of one run. Zero or None means: as the method has it."""
 
     method: str = DEFAULT
-    iterations: int = 6000
+    iterations: int = 6000  # frames drawn and learned from
+    views_per_step: int = 1  # of them, between two updates
     minutes: float | None = None  # stop in time with a finished run
     seed: int = 0
     transforms: str = "transforms.json"

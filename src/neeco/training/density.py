@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neeco.raster.on_device import constant
 from neeco.raster.optimizer import Adam
+from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.rotations import quat_to_matrix
 
 MIN_OPACITY = 0.005
 SPLIT_SHRINK = 1.6
@@ -25,7 +26,7 @@ class GradientStatistics:
 
     def record(self, center_gradients: Tensor, width: int, height: int) -> None:
         """center_gradients [N, 2], d loss / d px."""
-        norm = (center_gradients * center_gradients.new_tensor([width / 2, height / 2])).norm(dim=1)
+        norm = (center_gradients * constant((width / 2, height / 2), center_gradients.device)).norm(dim=1)
         self.total += norm
         self.seen += norm > 0
 

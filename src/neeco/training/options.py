@@ -71,7 +71,12 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
     _check_published_steps(config)
     if config.initial_points is not None and config.initial_points < 1:
         raise NeecoError(f"--set initial_points: {config.initial_points} is too small; give at least 1")
-    for name, least in (("seed", 0), ("tissue_budget", 1), ("instrument_budget", 1)):
+    if config.views_per_step > 1 and not method_class(config.method).has_gaussians:
+        raise NeecoError(
+            f"--views-per-step: method {config.method} draws rays of all frames in every step; "
+            "use --set deformation.rays=NUMBER"
+        )
+    for name, least in (("seed", 0), ("views_per_step", 1), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
     return config

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.optimizer import adam_update
+from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
-from neeco.scene.rotations import rigid_from_vector, vector_from_rotation
 from neeco.training.config import RefineConfig
 
 RATES = torch.tensor([6e-4] * 3 + [4e-2] * 3)  # rad, mm
@@ -42,7 +42,7 @@ class Refinement:
         self.rates = {name: rate.to(device) for name, rate in self.rates.items()}
         self.prior_sigma = PRIOR_SIGMA.to(device)
         self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
-        self.frame_steps = torch.zeros(len(frames), device=device)
+        self.frame_steps = torch.zeros(len(frames))  # on the CPU: every step asks
         self._leaves: dict[str, Tensor] = {}
 
     def _moment_shapes(self) -> dict[str, Tensor]:
@@ -99,8 +99,8 @@ class Refinement:
     def center(self) -> None:
         """Take the mean correction out: a constant one belongs to the instrument's shape (and to
         `Scene.registration`)."""
-        seen = self.frame_steps > 0
-        if seen.any():
+        seen = (self.frame_steps > 0).nonzero()[:, 0].to(self.poses.device)
+        if len(seen):
             self.poses[seen] -= self.poses[seen].mean(0)
             self.cameras[seen] -= self.cameras[seen].mean(0)
 
@@ -110,9 +110,13 @@ class Refinement:
         return plain | self.moments
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """The inverse of `tensors`."""
+        """The inverse of `tensors`. Raises ValueError for those of other shapes."""
+        own = self.tensors()
+        for name, tensor in own.items():
+            if tensors[name].shape != tensor.shape:
+                raise ValueError(f"{name}: {list(tensors[name].shape)}, not {list(tensor.shape)}")
         for name in ("poses", "cameras", "latency", "frame_steps"):
-            setattr(self, name, tensors[name])
+            setattr(self, name, tensors[name].cpu() if name == "frame_steps" else tensors[name])
         self.moments = {name: tensors[name] for name in self.moments}
 
 

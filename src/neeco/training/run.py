@@ -15,12 +15,13 @@ import yaml
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import write_text
+from neeco.files import parse_yaml, read_text, require_like, write_text
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
 
 SCHEMA = "neeco-run/1"
+CAPTURE_DIGEST = "capture_sha256"
 
 
 @dataclass(frozen=True)
@@ -64,32 +65,40 @@ def read_config(path: Path) -> dict[str, Any]:
     file = Path(path) / "config.yaml"
     if not Path(path).is_dir():
         raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
-    try:
-        config = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: not a run folder (config.yaml is missing); make one with `neeco train`") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise NeecoError(f"{file}: cannot read: {str(error).splitlines()[0]}") from None
+    if not os.path.lexists(file):
+        raise NeecoError(f"{path}: not a run folder (config.yaml is missing); make one with `neeco train`")
+    config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")
     if not isinstance(config, dict) or config.get("schema") != SCHEMA:
         found = config.get("schema") if isinstance(config, dict) else None
         raise NeecoError(f"{file}: schema is {found!r}, this version reads {SCHEMA!r}; train again")
-    missing = [key for key in ("capture", "transforms", "method", "seed") if key not in config]
-    if missing:
-        raise NeecoError(f"{file}: {missing[0]} is missing; train again")
+    require_like(config, {"capture": str, "transforms": str, "method": str, "seed": int}, str(file), "train again")
     return config
 
 
-def write_config(path: Path, capture: Path, config: TrainConfig) -> None:
-    """Write config.yaml of run folder `path`."""
+def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: str) -> None:
+    """Write config.yaml of run folder `path`; `fingerprint`: the capture's."""
     values = {"schema": SCHEMA, "version": __version__, "capture": os.path.abspath(capture)}
+    values |= {CAPTURE_DIGEST: fingerprint}
     values |= config_to_dict(config)
     write_text(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+
+
+def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
+    """Raise NeecoError when a run was begun in `path` on the capture at `root` before it had this `fingerprint`."""
+    file = path / "config.yaml"
+    if not file.exists():
+        return
+    if read_config(path).get(CAPTURE_DIGEST, fingerprint) != fingerprint:  # older versions noted none
+        raise NeecoError(
+            f"{file}: capture: {root} has changed since this run was begun; put its files back as they were, or give "
+            "another --output"
+        )
 
 
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     """The settings that the run in `path` was started with, of what `read_config` read there. Raises NeecoError for a
     field that is unknown or does not fit."""
-    known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture")}
+    known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
     try:
         return config_from_dict(known)
     except NeecoError as error:

@@ -151,6 +151,11 @@ class Schedule:
         self.history = deque((tuple(pair) for pair in state["history"]), maxlen=2 * self.window)
 
 
+def due(interval: int, before: int, now: int) -> bool:
+    """Whether a multiple of `interval` iterations has been reached since iteration `before`."""
+    return now // interval > before // interval
+
+
 def order_by_pose(states: np.ndarray) -> np.ndarray:
     """Indices [F] of a walk through states [F, S] that always steps to the nearest one left (the paper's uniform
     motion).

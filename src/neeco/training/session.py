@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,14 +15,15 @@ from torch import Tensor
 from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
 from neeco.raster.losses import photometric_loss
+from neeco.raster.on_device import constant, quick_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
-from neeco.scene.learning import InstrumentSearch, Report, StepResult, check_finite
+from neeco.scene.learning import InstrumentSearch, Report, StepResult, check_finite, numbers
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig
 from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
-from neeco.training.schedule import Schedule, order_by_pose
+from neeco.training.schedule import Schedule, due, order_by_pose
 from neeco.training.views import TrainingViews
 
 POSITION_RATE = 1.6e-4  # times the scene's extent (3DGS)
@@ -34,7 +36,7 @@ GAUSSIAN_RATES = {
 }
 LIGHT_RATE = 3e-3
 SHADOW_RATES = {"shadow_offsets": 3e-2, "shadow_strengths": 2e-3, "shadow_width": 2e-5}  # mm, share, slope
-REGISTRATION_RATES = torch.tensor([1e-4] * 3 + [1e-2] * 3 + [1e-4])  # rad, mm, log scale
+REGISTRATION_RATES = (1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2, 1e-4)  # rad, mm, log scale
 SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings of the refinement
 
 
@@ -51,8 +53,9 @@ class GaussianSession:
     refinement: Refinement
     rng: np.random.Generator
     generator: torch.Generator
-    adam: Adam = field(default_factory=Adam)
+    adam: Adam = field(init=False)
     schedule: Schedule = field(init=False)
+    given: list[tuple[State, Camera]] = field(init=False)  # of every frame, as recorded, on the views' device
     statistics: GradientStatistics = field(init=False)
     instruments: InstrumentSearch = field(init=False)  # for hooks; a session without hooks to serve has none
     queue: list[int] = field(default_factory=list)
@@ -62,7 +65,10 @@ class GaussianSession:
     window: list[StepResult] = field(default_factory=list)  # steps since the last row of metrics.jsonl
 
     def __post_init__(self) -> None:
+        self.adam = Adam(self.config.views_per_step)
         self.schedule = Schedule(self.config.schedule, self.config.iterations)
+        device = self.views.device
+        self.given = [(frame.state.to(device), frame.camera.to(device)) for frame in self.views.frames]
 
     def start(self) -> None:
         """Make ready to step, once the canonical Gaussians are there: what is learned a leaf, no gradient counted."""
@@ -99,31 +105,51 @@ class GaussianSession:
         return self.schedule.forced
 
     def step(self) -> StepResult:
-        """Draw one frame, compare, learn, and from time to time add and remove Gaussians."""
-        self.iteration += 1
-        progress = self.progress
-        index = self._next_frame()
-        scene, frame, mask = self.scene, self.views.frames[index], self.views.masks[index]
+        """Draw `views_per_step` frames, compare, learn, and from time to time add and remove Gaussians.
+
+        Iterations count frames. Of the device's numbers a step asks once, when all its work has been handed over.
+        """
+        views = self.config.views_per_step
+        self.iteration += views
+        progress, scene = self.progress, self.scene
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
         scene.deformation.resting = progress < scene.deformation.warm_up
-        state, camera, penalty = self.refinement.apply(index, frame.state, frame.camera, self.iteration)
+        chosen = [self._next_frame() for _ in range(views)]
+        asked: list[Tensor] = []
+        for index, following in zip(chosen, [*chosen[1:], *self.queue[:1], None], strict=False):
+            asked += self._learn_from(index, progress, following)
+        self._update(progress)
+        values = numbers(*asked)
+        results = []
+        for index, total, loss, squared_error in zip(chosen, values[::3], values[1::3], values[2::3], strict=True):
+            check_finite(total, self.iteration, f", frame {self.views.frames[index].name}")
+            results.append(StepResult.of(loss, squared_error))
+            self.schedule.observe(self.iteration, loss, results[-1].psnr, progress)
+        self._control_density(progress)
+        return StepResult.mean(results)
+
+    def _learn_from(self, index: int, progress: float, following: int | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Add one frame's share to all gradients; returns what it minimises, the image's loss and squared error."""
+        scene, views = self.scene, self.config.views_per_step
+        state, camera, penalty = self.refinement.apply(index, *self.given[index], self.iteration)
         channels = scene.deformation.training_channels(scene.canonical, self.iteration)
         rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=channels)
-        target = self.views.target(index)
+        target, mask = self.views.target(index), self.views.mask(index)
+        if following is not None:
+            self.views.announce(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
-        check_finite(total, self.iteration, f", frame {frame.name}")
-        total.backward()
-        self._learn(rendering, index, progress)
-        result = StepResult.of(loss, _squared_error(rendering.color.detach(), target, mask))
-        self.schedule.observe(self.iteration, result.loss, result.psnr, progress)
-        self._control_density(progress)
-        return result
+        with quick_products(self.views.device) if scene.deformation.large_operations else nullcontext():
+            total.backward(torch.full_like(total, 1 / views))
+        gradient = rendering.center_offsets.grad
+        assert gradient is not None
+        self.statistics.record(gradient, views * camera.width, views * camera.height)  # of the frame's own loss
+        self.refinement.step(index, progress)
+        return total, loss, _squared_error(rendering.color.detach(), target, mask)
 
     def corrected(self, index: int) -> tuple[State, Camera]:
         """The state and camera of training frame `index` as refined so far."""
-        frame = self.views.frames[index]
-        return self.refinement.apply(index, frame.state, frame.camera, self.iteration)[:2]
+        return self.refinement.apply(index, *self.given[index], self.iteration)[:2]
 
     def _next_frame(self) -> int:
         phase = self.schedule.phase
@@ -145,36 +171,23 @@ class GaussianSession:
             own = deformation.regularisation(self.scene.canonical, rendering, self.iteration)
         return sum(term for term in (penalty, own) if term is not None)
 
-    def _learn(self, rendering: Rendering, index: int, progress: float) -> None:
-        """One optimiser step on everything that has a gradient."""
-        gradient = rendering.center_offsets.grad
-        assert gradient is not None
-        camera = self.views.frames[index].camera
-        self.statistics.record(gradient, camera.width, camera.height)
+    def _update(self, progress: float) -> None:
+        """One optimiser step on everything that has a gradient: of a shadow none until one was found."""
         scene, gaussian_rates = self.scene, self.gaussian_rates
-        position_rate = POSITION_RATE * self.extent * log_linear(1.0, FINAL_RATE, progress)
-        for name, tensor in scene.canonical.tensors().items():
-            rate = position_rate if name == "means" else gaussian_rates.get(name)
-            if rate is not None:
-                self.adam.step(name, tensor, rate)
+        rates = gaussian_rates | {"means": POSITION_RATE * self.extent * log_linear(1.0, FINAL_RATE, progress)}
+        learned = [(name, tensor, rates[name]) for name, tensor in scene.canonical.tensors().items() if name in rates]
         still = scene.deformation.resting or self.iteration < scene.deformation.learns_from
-        rates = scene.deformation.learning_rates(progress)
+        own_rates = scene.deformation.learning_rates(progress)
         for name, parameter in scene.deformation.named_parameters():
-            if rates[name] > 0 and not still:
-                self.adam.step(f"deformation.{name}", parameter, rates[name])
-            parameter.grad = None
-        self.adam.step("falloff", scene.falloff, LIGHT_RATE)
-        self.adam.step("vignette", scene.vignette, LIGHT_RATE)
-        self._learn_shadow(progress)
+            if own_rates[name] > 0 and not still:
+                learned.append((f"deformation.{name}", parameter, own_rates[name]))
+            else:
+                parameter.grad = None
+        learned += [("falloff", scene.falloff, LIGHT_RATE), ("vignette", scene.vignette, LIGHT_RATE)]
+        fall = floored_decay(progress)
+        learned += [(name, getattr(scene, name), rate * fall) for name, rate in SHADOW_RATES.items()]
+        self.adam.step(learned)
         self._learn_registration(progress)
-        self.refinement.step(index, progress)
-
-    def _learn_shadow(self, progress: float) -> None:
-        """Nothing until a shadow was found: without one there is no gradient."""
-        for name, rate in SHADOW_RATES.items():
-            parameter = getattr(self.scene, name)
-            if parameter.grad is not None:
-                self.adam.step(name, parameter, rate * floored_decay(progress))
 
     def _learn_registration(self, progress: float) -> None:
         """Adam on unit-free coordinates, so that radians and millimetres each move at their own rate."""
@@ -186,18 +199,20 @@ class GaussianSession:
             return
         with torch.no_grad():
             before = registration.detach().clone()
-            self.adam.step("registration", registration, 1.0)
+            self.adam.step([("registration", registration, 1.0)])
             change = registration.detach() - before
-            registration.copy_(before + change * REGISTRATION_RATES.to(change) * floored_decay(progress))
+            rates = constant(REGISTRATION_RATES, change.device)
+            registration.copy_(before + change * rates * floored_decay(progress))
 
     def _control_density(self, progress: float) -> None:
         settings, config, scene = self.schedule.density(), self.config, self.scene
-        if self.iteration % SETTLE_INTERVAL == 0:
+        settles = self._due(SETTLE_INTERVAL)
+        if settles:
             self.refinement.center()
         if self.iteration < self.schedule.scaled(config.density_start):
             return
-        grows = self.iteration % settings.interval == 0 and progress < config.density_stop
-        if grows or (self.iteration % SETTLE_INTERVAL == 0 and progress < 0.95):
+        grows = self._due(settings.interval) and progress < config.density_stop
+        if grows or (settles and progress < 0.95):
             scene.canonical = control_density(
                 scene.canonical,
                 self.adam,
@@ -205,12 +220,20 @@ class GaussianSession:
                 self._limits(),
                 settings.threshold if grows else math.inf,
                 self.generator,
-                scene.deformation.lost(scene.canonical, scene.recorded.cameras),
+                scene.deformation.lost(scene.canonical, [camera for _, camera in self.given]),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
-        if settings.opacity_reset and self.iteration % settings.opacity_reset == 0 and progress < config.density_stop:
+        if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.density_stop:
             reset_opacity(scene.canonical, self.adam)
+
+    def reached(self, iteration: int) -> bool:
+        """Was it this step that came to `iteration`, or past it?"""
+        return self.iteration - self.config.views_per_step < iteration <= self.iteration
+
+    def _due(self, interval: int) -> bool:
+        """Whether this step reached a multiple of `interval` iterations."""
+        return due(interval, self.iteration - self.config.views_per_step, self.iteration)
 
     def _limits(self) -> list[BodyLimit]:
         dense = 0.01 * self.extent
@@ -253,6 +276,7 @@ class GaussianSession:
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         scene.deformation.finish(self)
+        scene.seen()
 
 
 def new_session(
@@ -296,5 +320,5 @@ def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
 
 
 def _squared_error(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    squared = (image - target).square()
-    return squared.mean() if mask is None else squared[mask].mean()
+    squared = (image - target).square()  # [H, W, 3]
+    return squared.mean() if mask is None else (squared * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)

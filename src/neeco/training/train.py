@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import time
 from collections.abc import Callable
@@ -14,17 +15,19 @@ import torch
 
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
+from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.files import new_folder, write_text
+from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.learning import Session, Start
 from neeco.scene.methods import method_class, unmet_need
-from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint
+from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint, telling_damage
 from neeco.training.config import TrainConfig
 from neeco.training.initial import gaussian_session
 from neeco.training.interrupt import StopRequest, hearing_stops
-from neeco.training.run import read_config, stored_config, write_config
+from neeco.training.run import read_config, require_same_capture, stored_config, write_config
+from neeco.training.schedule import due
 from neeco.training.views import TrainingViews
 
 CHECKPOINT_INTERVAL = 500  # iterations
@@ -78,19 +81,24 @@ def train(
     if resume and (output / "config.yaml").exists():
         config = _stored_config(output, capture_path)
         if (output / "scene.safetensors").exists():
-            return output
-    elif output.is_dir() and any(output.iterdir()):
+            with own_folder(output):  # rid of what a process killed after its last step left
+                return output
+    elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
     capture = read_checked(capture_path, config.transforms) if capture is None else capture
+    digest = fingerprint(capture)
+    if resume:
+        require_same_capture(output, capture.root, digest)
     frames = _training_frames(capture, capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
-    with new_folder(output), method_class(config.method).torch_threads():
+    with own_folder(output), method_class(config.method).torch_threads():
         try:
             session = _begin(capture, frames, output, config, device, resume, log)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("before the first step; run the same command again") from None
-        write_config(output, capture_path, config)
+        if not (output / "config.yaml").exists():
+            write_config(output, capture_path, config, digest)
         with hearing_stops() as stop:
             _run(session, output, log, stop, go_on)
         try:
@@ -131,8 +139,9 @@ def _begin(
     method = method_class(config.method)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
-        session = method.session(start, scene)
-        restore_session(session, header, tensors)
+        with telling_damage(checkpoint_path(output)):
+            session = method.session(start, scene)
+            restore_session(session, header, tensors)
     else:  # interrupted before its first checkpoint, a resumed run begins again
         session = method.session(start, None)
     log.keep_until(session.iteration)
@@ -160,7 +169,7 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
     last = log.clock()
     try:
         while session.progress < 1:
-            before = session.progress
+            before, iteration = session.progress, session.iteration
             session.window.append(session.step())
             now = log.clock()
             session.seconds, last = session.seconds + now - last, now
@@ -168,16 +177,17 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
                 phase = session.phase
                 log.note(f"phase {phase} begins" + (" (forced)" if session.forced else ""))
             session.between_steps(before)
-            if session.iteration % ROW_INTERVAL == 0:
+            if due(ROW_INTERVAL, iteration, session.iteration):
                 log.row(session)
-            if stop.heard or session.iteration % CHECKPOINT_INTERVAL == 0:
-                save_checkpoint(session, output)
-            if stop.heard:
-                raise KeyboardInterrupt
             if log.watch:
+                # before the checkpoint: what it saw of a step is never missing when the run goes on behind it
                 began = log.clock()
                 log.watch(session)
                 last += log.clock() - began
+            if stop.heard or due(CHECKPOINT_INTERVAL, iteration, session.iteration):
+                save_checkpoint(session, output)
+            if stop.heard:
+                raise KeyboardInterrupt
         save_checkpoint(session, output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"at iteration {session.iteration}; {go_on}") from None
@@ -235,6 +245,16 @@ class _Log:
     def keep_until(self, iteration: int) -> None:
         """Drop rows beyond the checkpoint: they will be written again."""
         if self.path.exists():
-            lines = self.path.read_text(encoding="utf-8").splitlines()
-            kept = [line for line in lines if line.endswith("}") and json.loads(line)["iteration"] <= iteration]
+            lines = read_text(self.path, "one JSON object per line").splitlines()
+            kept = [line for line in lines if _iteration(line) <= iteration]
             write_text(self.path, "".join(line + "\n" for line in kept))
+
+
+def _iteration(line: str) -> float:
+    """Of a row of metrics.jsonl; infinite where it is damaged, as a full disk leaves the last one."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return math.inf
+    iteration = row.get("iteration") if isinstance(row, dict) else None
+    return iteration if isinstance(iteration, int) else math.inf

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,14 +11,21 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 
+FITS = 0.5  # of a CUDA device's free memory: what all pixels may take there
+
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Frames, and for each its image and its mask. Cameras and states stay where the frames have them."""
+    """Frames, and for each its image and its mask. Cameras and states stay where the frames have them.
+
+    `images` and `masks` are where `target` and `mask` are asked for, or, where that device is too small, in the host's
+    memory, from where `copies` brings them.
+    """
 
     frames: tuple[Frame, ...]
     images: tuple[Tensor, ...]  # [H, W, 3] uint8 each
     masks: tuple[Tensor | None, ...]  # [H, W] bool each, False where the loss does not look; None: it looks everywhere
+    copies: Copies | None = None
 
     @classmethod
     def read(cls, frames: Sequence[Frame]) -> TrainingViews:
@@ -30,14 +38,69 @@ class TrainingViews:
 
     @property
     def device(self) -> torch.device:
-        """Where the pixels are."""
-        return self.images[0].device
+        """Where targets and masks are given, and everything is computed."""
+        return self.images[0].device if self.copies is None else self.copies.device
 
     def to(self, device: torch.device) -> TrainingViews:
-        """The same views with their pixels on `device`."""
-        masks = tuple(None if mask is None else mask.to(device) for mask in self.masks)
-        return replace(self, images=tuple(image.to(device) for image in self.images), masks=masks)
+        """The same views on `device`; their pixels stay in the host's memory if they would take more than FITS of what
+        is free of a CUDA device's."""
+        if device.type == "cuda":
+            size = sum(pixels.nbytes for pixels in (*self.images, *self.masks) if pixels is not None)
+            if size > FITS * torch.cuda.mem_get_info(device)[0]:
+                return self.copied_to(device)
+        return self._with_pixels(lambda pixels: pixels.to(device))
+
+    def copied_to(self, device: torch.device) -> TrainingViews:
+        """The same views for `device`, their pixels in page-locked memory of the host."""
+        return replace(self._with_pixels(lambda pixels: pixels.cpu().pin_memory()), copies=Copies(device))
+
+    def _with_pixels(self, change: Callable[[Tensor], Tensor]) -> TrainingViews:
+        masks = tuple(None if mask is None else change(mask) for mask in self.masks)
+        return replace(self, images=tuple(change(image) for image in self.images), masks=masks)
 
     def target(self, index: int) -> Tensor:
         """The target image [H, W, 3] of one frame, float32 in [0, 1]."""
-        return self.images[index].float() / 255
+        return self._pixels(index)[0].float() / 255
+
+    def mask(self, index: int) -> Tensor | None:
+        """The mask [H, W] bool of one frame, or None."""
+        return self._pixels(index)[1]
+
+    def announce(self, index: int) -> None:
+        """Frame `index` is wanted next: where its pixels have to be copied, that begins now."""
+        if self.copies is not None:
+            self.copies.begin(index, self.images[index], self.masks[index])
+
+    def _pixels(self, index: int) -> tuple[Tensor, Tensor | None]:
+        image, mask = self.images[index], self.masks[index]
+        return (image, mask) if self.copies is None else self.copies.take(index, image, mask)
+
+
+class Copies:
+    """Pixels of one frame after another on their way to a device: on a CUDA device by a stream of their own, while it
+    computes."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._index = -1
+        self._pixels: tuple[Tensor, ...] = ()
+
+    def begin(self, index: int, image: Tensor, mask: Tensor | None) -> None:
+        """Start to copy frame `index`, unless that was the last."""
+        if index == self._index:
+            return
+        pixels = (image,) if mask is None else (image, mask)
+        with nullcontext() if self.stream is None else torch.cuda.stream(self.stream):
+            self._pixels = tuple(tensor.to(self.device, non_blocking=True) for tensor in pixels)
+        self._index = index
+
+    def take(self, index: int, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """The copies of frame `index`; the device waits for them, not the caller."""
+        self.begin(index, image, mask)
+        if self.stream is not None:
+            computing = torch.cuda.current_stream(self.device)
+            computing.wait_stream(self.stream)
+            for tensor in self._pixels:
+                tensor.record_stream(computing)  # or its memory would be given to the next copy too early
+        return self._pixels[0], None if mask is None else self._pixels[1]

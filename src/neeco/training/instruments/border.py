@@ -32,7 +32,7 @@ def color_boundary(session: GaussianSession, hinged: Hinged, index: int) -> floa
     count = int((float(hinges.hinge_depth[0].detach()) - rear) / (radius / BINS_PER_RADIUS))
     if not count > 2 * BINS_PER_RADIUS:
         return None
-    edges = rear + torch.arange(count + 1) * (radius / BINS_PER_RADIUS)
+    edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
     steps = torch.stack(
         [_steps(*_profile(session, hinged, index, frame, edges)) for frame in spread(session, LOOKED_AT)]
     )
@@ -75,12 +75,12 @@ def _profile(
     drawn = rasterize(scene.at(state), camera, channels=body).channels
     assert drawn is not None
     pose = scene.registered(state).instruments[scene.instruments[index].name].pose
-    along = _along_shaft(camera, pose.to(body), hinged.hinges_of(index)).cpu()  # [H, W]
-    chosen = (drawn[..., 0].cpu() > SURELY) & along.isfinite()
-    mask = session.views.masks[frame_index]
+    along = _along_shaft(camera, pose.to(body), hinged.hinges_of(index))  # [H, W]
+    chosen = (drawn[..., 0] > SURELY) & along.isfinite()
+    mask = session.views.mask(frame_index)
     if mask is not None:
-        chosen &= mask.cpu()
-    logs = (session.views.target(frame_index).cpu()[chosen] + DARKEST).log()  # [P, 3]
+        chosen &= mask
+    logs = (session.views.target(frame_index)[chosen] + DARKEST).log()  # [P, 3]
     colors = torch.stack([logs.mean(1), logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1]], 1)
     bins = torch.bucketize(along[chosen], edges) - 1
     held = (bins >= 0) & (bins < len(edges) - 1)

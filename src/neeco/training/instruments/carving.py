@@ -39,7 +39,7 @@ class CarvedShape:
 
 def camera_from_instrument(evidence: Evidence, name: str) -> Tensor:
     """[F, 4, 4] float32, the recorded poses of instrument `name` as each frame's camera sees them."""
-    poses = torch.stack([frame.state.instruments[name].pose.double() for frame in evidence.frames])
+    poses = torch.stack([frame.state.instruments[name].pose.double() for frame in evidence.frames]).to(evidence.device)
     return (evidence.camera_from_world.double() @ poses).float()
 
 
@@ -113,7 +113,7 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, seeds: int 
 def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
     """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
     the strictest of SOLID that ENOUGH of them have."""
-    ticks = torch.linspace(-reach, reach, side)
+    ticks = torch.linspace(-reach, reach, side, device=views.evidence.device)
     grid = torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     score, seen = views.scores(grid)
     score[seen <= 0.25] = 0
@@ -127,7 +127,7 @@ def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
     center = solid.mean(0)
     arm = (solid - center).double()
     covariance = (arm[:, :, None] * arm[:, None, :]).sum(0)  # [3, 3]
-    direction = torch.from_numpy(np.linalg.eigh(covariance.numpy())[1][:, -1].copy()).float()
+    direction = torch.from_numpy(np.linalg.eigh(covariance.cpu().numpy())[1][:, -1].copy()).to(solid)
     along = (solid - center) @ direction
     ends = torch.stack([center + along.min() * direction, center + along.max() * direction])
     _, seen = score_points(views.evidence, views.own, ends)
@@ -138,11 +138,11 @@ def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
 
 def _frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     """[4, 4] with z along `direction` and x as near as can be to the instrument frame's x (or y)."""
-    x = torch.tensor([1.0, 0.0, 0.0])
+    x = origin.new_tensor([1.0, 0.0, 0.0])
     if abs(float(direction @ x)) > 0.9:
-        x = torch.tensor([0.0, 1.0, 0.0])
+        x = origin.new_tensor([0.0, 1.0, 0.0])
     x = torch.nn.functional.normalize(x - (x @ direction) * direction, dim=0)
-    frame = torch.eye(4)
+    frame = torch.eye(4, device=origin.device)
     frame[:3, 0], frame[:3, 1], frame[:3, 2] = x, torch.linalg.cross(direction, x), direction
     frame[:3, 3] = origin
     return frame
@@ -151,11 +151,11 @@ def _frame_along(origin: Tensor, direction: Tensor) -> Tensor:
 def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) -> tuple[Tensor, Tensor, float]:
     """Fit the axis to the solid's centre in slices, thrice; returns (base, centre line [Z, 3], radius mm)."""
     half = 0.09 * views.evidence.distance
-    line, radius = torch.zeros(0, 3), spacing
+    line, radius = base.new_zeros(0, 3), spacing
     for _ in range(3):
         rows = _slice_centers(views.seen_from(base), spacing, half, level)
         if len(rows) < 4:
-            return base, torch.zeros(0, 3), radius
+            return base, base.new_zeros(0, 3), radius
         line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
         radius = max(float((area.median() / torch.pi).sqrt()), spacing / 4)
         near, tip = float(line[0, 0]), float(line[-1, 0])
@@ -164,8 +164,8 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
         if middle.sum() < 3:
             middle = line[:, 0] < near + 0.65 * (tip - near)
         slope = _robust_line(line[middle, 0], line[middle, 1:], (area * seen)[middle])
-        direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], torch.ones(1)]), dim=0)
-        origin = base[:3, :3] @ torch.cat([slope[1], torch.zeros(1)]) + base[:3, 3]
+        direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], slope.new_ones(1)]), dim=0)
+        origin = base[:3, :3] @ torch.cat([slope[1], slope.new_zeros(1)]) + base[:3, 3]
         base = _frame_along(origin, direction)
         half = max(min(half, 4 * radius), 2 * spacing)
     return base, line, radius
@@ -180,15 +180,16 @@ def center_line(evidence: Evidence, name: str, shape: CarvedShape) -> Tensor:
 def _slice_centers(views: PosedViews, spacing: float, half: float, level: float) -> Tensor:
     """[Z, 5]: position along the shaft, centre of the solid across it (x, y), its area mm^2, fraction of frames that
     see it."""
-    ticks = torch.linspace(-half, half, 21)
+    device = views.evidence.device
+    ticks = torch.linspace(-half, half, 21, device=device)
     cell = float(ticks[1] - ticks[0]) ** 2
     x, y = torch.meshgrid(ticks, ticks, indexing="ij")
     rows = []
     reach = 0.6 * views.evidence.distance
-    for z in torch.arange(-reach, reach, spacing):
-        plane = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), float(z))], -1)
+    for z in torch.arange(-reach, reach, spacing, device=device):
+        plane = torch.stack([x.flatten(), y.flatten(), z.expand(x.numel())], -1)
         score, seen = views.scores(plane)
-        score = torch.where(seen > 0.15, score, torch.zeros(()))
+        score = torch.where(seen > 0.15, score, 0.0)
         if score.max() < POSSIBLE:
             continue
         weight = (score - level).clamp_min(0)
@@ -196,7 +197,7 @@ def _slice_centers(views: PosedViews, spacing: float, half: float, level: float)
         center = (weight[:, None] * plane).sum(0) / weight.sum()
         area = (score > level).sum() * cell
         rows.append(torch.stack([z, center[0], center[1], area, seen.max()]))
-    return torch.stack(rows) if rows else torch.zeros(0, 5)
+    return torch.stack(rows) if rows else ticks.new_zeros(0, 5)
 
 
 def _robust_line(positions: Tensor, values: Tensor, weights: Tensor) -> Tensor:
@@ -228,14 +229,15 @@ def _sample_seeds(
 ) -> Tensor:
     """[count, 3] shaft-frame points around the shaft where the evidence allows an instrument."""
     length = tip - near
-    drawn = torch.rand(20 * count, 3, generator=generator)
+    device, here = generator.device, views.evidence.device
+    drawn = torch.rand(20 * count, 3, generator=generator, device=device).to(here)
     along = near - 0.1 * length + drawn[:, 2] * 1.2 * length
     points = torch.stack([(2 * drawn[:, 0] - 1) * width, (2 * drawn[:, 1] - 1) * width, along], -1)
     score, seen = views.scores(points)
     chosen = points[(score > POSSIBLE) & (seen > 0.05)]
     if len(chosen) < count:  # thin instruments: fill up with jittered copies
         source = chosen if len(chosen) else points
-        extra = torch.randint(len(source), (count - len(chosen),), generator=generator)
-        jitter = torch.randn(len(extra), 3, generator=generator) * width * 0.05
-        chosen = torch.cat([chosen, source[extra] + jitter])
+        extra = torch.randint(len(source), (count - len(chosen),), generator=generator, device=device)
+        jitter = torch.randn(len(extra), 3, generator=generator, device=device) * width * 0.05
+        chosen = torch.cat([chosen, source[extra.to(here)] + jitter.to(here)])
     return chosen[:count]

@@ -87,10 +87,9 @@ def judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedSha
 def shape_around_frame(shape: CarvedShape, distance: float, generator: torch.Generator) -> CarvedShape:
     """What to start from when carving cannot be trusted: seeds about the tracked frame, which is on the body."""
     spread = AROUND_FRAME * distance
-    seeds = torch.randn(SEEDS, 3, generator=generator) * spread
-    return replace(
-        shape, instrument_from_shaft=torch.eye(4), near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds
-    )
+    seeds = (torch.randn(SEEDS, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+    frame = torch.eye(4, device=seeds.device)
+    return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
 def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig) -> Evidence:
@@ -157,7 +156,7 @@ def at_middle(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
     they are set to: there a change of hinge or gains moves nothing."""
     weights = torch.softmax(logits[:, : hinges.part_count], -1)
     middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.joint_names)}
-    turned, _ = hinges.bend(seeds, weights, middle)
+    turned = hinges.bend(seeds, weights, middle)
     hinges.offsets.zero_()
     return turned
 

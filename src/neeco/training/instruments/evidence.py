@@ -22,7 +22,7 @@ FLOOR, RANGE = 0.04, 0.06  # residual at which evidence begins, and over which i
 
 @dataclass(frozen=True)
 class Evidence:
-    """F frames' residuals as soft masks, and what is needed to look points up in them.
+    """F frames' residuals as soft masks, and what is needed to look points up in them, on one device.
 
     H and W are the largest of the frames' heights and widths; beyond its own image a frame has no evidence.
     """
@@ -41,10 +41,17 @@ class Evidence:
     @cached_property
     def sizes(self) -> Tensor:
         """[F, 2] width and height px of each frame's image."""
-        return torch.tensor([[frame.camera.width, frame.camera.height] for frame in self.frames])
+        sizes = [[frame.camera.width, frame.camera.height] for frame in self.frames]
+        return torch.tensor(sizes, device=self.device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is looked up."""
+        return self.hits.device
 
     def subset(self, index: Tensor) -> Evidence:
         """The frames `index` [M] alone."""
+        index = index.to(self.device)
         frames = tuple(self.frames[i] for i in index.tolist())
         return Evidence(
             self.hits[index], self.depths[index], self.camera_from_world[index], self.intrinsics[index], frames
@@ -60,14 +67,15 @@ class Evidence:
         own_width, own_height = self.sizes[:, :1], self.sizes[:, 1:]
         inside = (z > 0.01 * self.distance) & (u >= 0) & (u < own_width) & (v >= 0) & (v < own_height)
         column, row = u.nan_to_num().clamp(0, width - 1).long(), v.nan_to_num().clamp(0, height - 1).long()
-        place = (torch.arange(len(self.frames))[:, None] * height + row) * width + column
+        place = (torch.arange(len(self.frames), device=self.device)[:, None] * height + row) * width + column
         inside &= z < 1.02 * self.depths.view(-1)[place]
         return self.hits.view(-1)[place], inside
 
 
 @torch.no_grad()
 def gather_evidence(scene: Scene, views: TrainingViews, most: int = 120) -> Evidence:
-    """Residuals of a tissue-only `scene` against at most `most` training images, evenly picked, on the CPU.
+    """Residuals of a tissue-only `scene` against at most `most` training images, evenly picked, on its
+    device.
 
     Where a mask is False there is no evidence.
     """
@@ -79,20 +87,18 @@ def gather_evidence(scene: Scene, views: TrainingViews, most: int = 120) -> Evid
         frame = frames[index]
         rendering = rasterize(scene.at(frame.state), frame.camera)
         residual = (rendering.color - views.target(index)).abs().mean(-1)
-        mask = views.masks[index]
+        mask = views.mask(index)
         if mask is not None:
             residual = residual * mask
         smooth = torch.nn.functional.avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
-        hits.append(((smooth - FLOOR) / RANGE).clamp(0, 1).cpu())
-        depths.append(
-            torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)).cpu()
-        )
-    cameras = [frames[i].camera for i in picked]
+        hits.append(((smooth - FLOOR) / RANGE).clamp(0, 1))
+        depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
+    cameras, device = [frames[i].camera for i in picked], views.device
     return Evidence(
         _stacked(hits, 0.0),
         _stacked(depths, torch.inf),
-        torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]),
-        torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras]),
+        torch.stack([torch.linalg.inv(camera.world_from_camera.double()).float() for camera in cameras]).to(device),
+        torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in cameras], device=device),
         tuple(frames[i] for i in picked),
     )
 
@@ -100,7 +106,7 @@ def gather_evidence(scene: Scene, views: TrainingViews, most: int = 120) -> Evid
 def _stacked(images: list[Tensor], beyond: float) -> Tensor:
     """Images [H_i, W_i] of any sizes as one [F, H, W], filled up with `beyond` at the right and below."""
     height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
-    stacked = torch.full((len(images), height, width), beyond)
+    stacked = images[0].new_full((len(images), height, width), beyond)
     for place, image in zip(stacked, images, strict=True):
         place[: image.shape[0], : image.shape[1]] = image
     return stacked

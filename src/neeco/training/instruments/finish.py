@@ -14,6 +14,7 @@ from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinged
 from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.extend import extend_shaft
+from neeco.training.instruments.hidden import drop_hidden
 from neeco.training.instruments.solid import ENOUGH, measure_tips, solid, solid_extent
 from neeco.training.session import GaussianSession
 
@@ -22,10 +23,12 @@ FOUND = 0.35  # share of the moving parts' error that the readings must explain:
 
 @torch.no_grad()
 def conclude(session: GaussianSession, hinged: Hinged) -> None:
-    """Set each instrument's extent, prolong its shaft and write the joints' verdicts into `scene.diagnostics`.
+    """Drop what is hidden of instruments, set the extent of each, prolong its shaft and write the joints' verdicts into
+    `scene.diagnostics`.
 
     Says so when hardly anything was learned of an instrument: nothing else would tell of labels that stay empty.
     """
+    session.scene.canonical = drop_hidden(session.scene)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = hinged.hinges_of(index)
@@ -76,7 +79,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
             for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
         ]
         covered = torch.maximum(*(d.channels[..., 0] for d in drawings if d.channels is not None)) > 0.3
-        mask = session.views.masks[frame_index]
+        mask = session.views.mask(frame_index)
         if mask is not None:
             covered &= mask
         errors = [float((d.color - target).abs().mean(-1)[covered].sum()) for d in drawings]

@@ -30,9 +30,8 @@ def close_gate(session: GaussianSession, gate: SweptVolume) -> None:
         if shape is None or not judge_evidence(scene, evidence, instrument.name, shape, report):
             report(f"warning: {instrument.name}: its shape cannot be carved; the network is evaluated everywhere")
             return
-        poses = torch.stack(
-            [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
-        )  # [F, 4, 4]
+        recorded = [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
+        poses = torch.stack(recorded).to(shape.seeds)  # [F, 4, 4]
         swept.append((shape.seeds @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3))
     gate.cover(torch.cat(swept).to(scene.canonical.means))
     inside = gate.contains(scene.canonical.means)

@@ -38,7 +38,8 @@ class HingeGuess:
 
 def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) -> list[HingeGuess]:
     """All hypotheses on the grid, best first. Empty when the reading hardly varies (less than 0.05 rad)."""
-    readings = torch.tensor([frame.state.instruments[name].joints[joint] for frame in evidence.frames]).float()
+    recorded = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
+    readings = torch.tensor(recorded, dtype=torch.float32, device=evidence.device)
     opening = readings - readings.min()
     if float(opening.max()) < 0.05:
         return []
@@ -47,7 +48,7 @@ def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) 
     if len(line) < 2:
         line = shape.center_line
     camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
-    angles = torch.arange(ANGLES) * (math.pi / ANGLES)
+    angles = torch.arange(ANGLES, device=evidence.device) * (math.pi / ANGLES)
     length = shape.tip - shape.near
     guesses = []
     for depth in np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, DEPTHS):
@@ -63,8 +64,8 @@ def search_hinge(evidence: Evidence, name: str, joint: str, shape: CarvedShape) 
             evident = torch.maximum((scores[gains[0]] + scores[gains[1]]) / 2, caution)
             opened = ((scores[gains[0]] + scores[gains[1]]) / 2 - scores[0.0]) * share
             guesses += [
-                HingeGuess(float(a), float(depth), gains, float(s), float(o))
-                for a, s, o in zip(angles, evident, opened, strict=True)
+                HingeGuess(a, float(depth), gains, s, o)
+                for a, s, o in zip(angles.tolist(), evident.tolist(), opened.tolist(), strict=True)
             ]
     return sorted(guesses, key=lambda guess: -guess.score)
 
@@ -91,10 +92,10 @@ def dominant_angle(guesses: list[HingeGuess]) -> float:
 def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
     """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the
     tip."""
-    known = line.numpy()
+    known = line.cpu().numpy()
     along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICK_POINTS)
     across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
-    return torch.from_numpy(np.stack([*across, along], -1)).float()
+    return torch.from_numpy(np.stack([*across, along], -1)).to(line)
 
 
 def _stick_scores(
@@ -109,7 +110,7 @@ def _stick_scores(
     """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by
     `weight` [F]."""
     axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
-    arm = (stick - torch.tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
+    arm = (stick - stick.new_tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
     cosine, sine = turns.cos()[None, :, None, None], turns.sin()[None, :, None, None]
     along = (arm * axis).sum(-1, keepdim=True) * axis
     across = torch.linalg.cross(axis.expand(-1, 1, arm.shape[2], 3), arm.expand(len(angles), 1, -1, 3))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from neeco.raster import rasterize
-from neeco.raster.shadow import GAMMA, blocked
+from neeco.raster.shadow import GAMMA, Casting, blocked
 from neeco.raster.types import Gaussians
 from neeco.scene.scene import LAMPS
 from neeco.training.instruments.solid import spread
@@ -139,7 +139,7 @@ def _ask(session: GaussianSession, offsets: Tensor) -> _Evidence:
     power, along, total = [], [], 0.0
     for index in spread(session, TRIED_FRAMES):
         color, dark, instrument = _drawn(session, index, offsets)
-        target, mask = session.views.target(index), session.views.masks[index]
+        target, mask = session.views.target(index), session.views.mask(index)
         counts = _beside(instrument) & (torch.maximum(color, target).amax(-1) < BRIGHT)
         if mask is not None:
             counts &= mask
@@ -167,7 +167,8 @@ def _drawn(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tenso
     instrument = scene.canonical.bodies > 0
     kept = ~instrument | (posed.opacities > OPAQUE)
     posed, instrument = posed.select(kept), instrument[kept]
-    missed = [blocked(posed, instrument, scene.shadow_width, offset, camera, rasterize) for offset in offsets]
+    among = Casting.of(posed, instrument, camera)
+    missed = [blocked(among, scene.shadow_width, offset, camera, rasterize) for offset in offsets]
     channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
     drawing = rasterize(posed, camera, channels=channels)
     assert drawing.channels is not None

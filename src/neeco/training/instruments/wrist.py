@@ -72,5 +72,5 @@ def _image_error(session: GaussianSession, index: int, perturbation: Perturbatio
     state, camera = session.corrected(index)
     rendering = rasterize(session.scene.at(state, perturbation), camera)
     error = (rendering.color - session.views.target(index)).abs()
-    mask = session.views.masks[index]
+    mask = session.views.mask(index)
     return float(error.mean() if mask is None else error[mask].mean())

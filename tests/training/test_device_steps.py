@@ -1,0 +1,132 @@
+"""A step on a device waits for it once, and copies nothing to it but pixels: shown on the device "meta", without a GPU.
+
+"meta" holds no numbers, so that asking a tensor for one raises; what is copied there, a dispatch mode sees. Drawing and
+comparing are the backends' own, and left out.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from neeco.capture.model import Frame
+from neeco.scene.methods import METHODS
+from neeco.training import session as module
+from neeco.training.options import training_config
+from neeco.training.refinement import Refinement
+from neeco.training.session import GaussianSession, pose_order
+from neeco.training.views import TrainingViews
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from scene_worlds import CAMERA, make_scene
+
+META = torch.device("meta")
+COPIES = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
+
+
+class Watched:
+    """What was copied to "meta": shapes of tensors from the CPU, and numbers that tensors were made of."""
+
+    def __init__(self) -> None:
+        self.copied: list[Any] = []
+        self.watching = True
+
+    def aside(self, function: Callable) -> Callable:
+        """`function`, unwatched."""
+
+        def unwatched(*args: Any, **kwargs: Any) -> Any:
+            self.watching = False
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.watching = True
+
+        return unwatched
+
+
+class SeenTensors(TorchDispatchMode):
+    def __init__(self, watched: Watched) -> None:
+        super().__init__()
+        self.watched = watched
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if self.watched.watching and func in COPIES and out.is_meta:
+            source = args[1] if func is torch.ops.aten.copy_.default else args[0]
+            if not source.is_meta:
+                self.watched.copied.append(source.shape)
+        return out
+
+
+class SeenNumbers(TorchFunctionMode):
+    def __init__(self, watched: Watched) -> None:
+        super().__init__()
+        self.watched = watched
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if self.watched.watching and func in (torch.tensor, torch.Tensor.new_tensor) and out.is_meta:
+            self.watched.copied.append(args)
+        return out
+
+
+def session_on_meta(method: str, views_per_step: int) -> GaussianSession:
+    """In mid-run, with everything refined that can be."""
+    scene = make_scene(method).to(META)
+    states = scene.recorded.states
+    frames = tuple(Frame(Path(f"{k}.png"), CAMERA, state, "train") for k, state in enumerate(states))
+    size = CAMERA.height, CAMERA.width
+    image, mask = torch.zeros(*size, 3, dtype=torch.uint8, device=META), torch.ones(size, dtype=torch.bool, device=META)
+    refine = [f"refine.{part}=true" for part in ("registration", "latency", "frame_poses", "cameras")]
+    config = training_config(method, {"iterations": 20_000, "views_per_step": views_per_step}, refine)
+    names = tuple(instrument.name for instrument in scene.instruments)
+    session = GaussianSession(
+        config,
+        scene,
+        TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
+        print,
+        pose_order(frames, names),
+        50.0,
+        Refinement(config.refine, frames, names, META),
+        np.random.default_rng(0),
+        torch.Generator(),  # "meta" has none of its own
+    )
+    session.start()
+    session.iteration = 5_000
+    return session
+
+
+@pytest.mark.parametrize(
+    ("method", "views_per_step"), [*((name, 1) for name, kind in METHODS.items() if kind.has_gaussians), ("neeco", 3)]
+)
+def test_a_step_asks_the_device_once_and_copies_nothing_there(
+    method: str, views_per_step: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def numbers(*scalars: Tensor) -> list[float]:
+        assert all(scalar.is_meta for scalar in scalars)
+        asked.append(len(scalars))
+        return [0.1] * len(scalars)
+
+    monkeypatch.setattr(module, "numbers", numbers)
+    session = session_on_meta(method, views_per_step)
+    session.step()  # what is kept is copied now
+    watched = Watched()
+    with SeenTensors(watched), SeenNumbers(watched):
+        monkeypatch.setattr(module, "rasterize", watched.aside(module.rasterize))
+        monkeypatch.setattr(module, "photometric_loss", watched.aside(module.photometric_loss))
+        session.step()
+    assert asked == [3 * views_per_step] * 2
+    assert watched.copied == []
+    assert session.iteration == 5_000 + 2 * views_per_step

@@ -1,0 +1,118 @@
+"""Several frames per step: the mean of their losses, the same frames in the same order, the same bits after a break."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.capture import read_capture
+from neeco.raster.optimizer import Adam
+from neeco.training.config import TrainConfig
+from neeco.training.initial import gaussian_session
+from neeco.training.options import training_config
+from neeco.training.schedule import due
+from neeco.training.session import GaussianSession
+from neeco.training.train import ProgressRow, train
+from neeco.training.views import TrainingViews
+
+NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0", "refine.start=0"]
+
+
+def config_of(views: int, method: str = "neeco", assignments: tuple[str, ...] = ()) -> TrainConfig:
+    small = [*(NEECO if method == "neeco" else []), "density_start=10", "density_stop=0.9", *assignments]
+    return training_config(method, {"iterations": 60, "views_per_step": views}, small)
+
+
+def begun(folder: Path, config: TrainConfig) -> GaussianSession:
+    capture = read_capture(folder)
+    torch.manual_seed(0)
+    return gaussian_session(capture, TrainingViews.read(capture.split("train")), config, print)
+
+
+def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: int) -> list[dict[str, Tensor]]:
+    """Of every tensor that is learned, step by step; nothing is."""
+    seen: list[dict[str, Tensor]] = []
+
+    def note(self: Adam, learned) -> None:
+        given = [(name, tensor) for name, tensor, _ in learned if tensor.grad is not None]
+        seen.append({name: tensor.grad.clone() for name, tensor in given})
+        for _, tensor in given:
+            tensor.grad = None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Adam, "step", note)
+        for _ in range(steps):
+            session.step()
+    return seen
+
+
+def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = ("schedule.compensation=off", "schedule.frame_order=off", "density_start=50", "refine.frame_poses=true")
+    one, two = (begun(capture, config_of(views, assignments=still)) for views in (1, 2))
+    torch.nn.init.normal_(one.scene.deformation.head.weight, std=0.1)
+    two.scene.load_state_dict(one.scene.state_dict())
+    single = gradients(one, monkeypatch, 2)
+    (both,) = gradients(two, monkeypatch, 1)
+    assert both.keys() == single[0].keys() > {"means", "sh_dc", "falloff", "deformation.head.weight"}
+    for name, gradient in both.items():
+        mean = (single[0][name] + single[1][name]) / 2
+        assert (gradient - mean).norm() <= 1e-5 * mean.norm() + 1e-9, name
+    assert not torch.equal(single[0]["means"], single[1]["means"])
+    assert torch.allclose(two.statistics.total, one.statistics.total, rtol=1e-5, atol=1e-9)
+    assert torch.equal(two.statistics.seen, one.statistics.seen)
+    assert torch.allclose(two.refinement.poses, one.refinement.poses, rtol=0.05)  # its rate falls with the progress
+    assert two.refinement.poses.any()
+    assert torch.equal(two.refinement.frame_steps, one.refinement.frame_steps)
+    assert (two.iteration, two.queue) == (one.iteration, one.queue)
+    histories = (torch.tensor(list(session.schedule.history)) for session in (one, two))
+    assert torch.allclose(*histories, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("short_intervals")
+@pytest.mark.parametrize(("method", "views"), [("3dgs", 2), ("neeco", 3)])
+def test_an_interrupted_run_ends_in_the_same_bytes(method: str, views: int, capture: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == 36 and not row.note:
+            raise KeyboardInterrupt
+
+    config = config_of(views, method)
+    whole = train(capture, tmp_path / "whole", config)
+    with pytest.raises(KeyboardInterrupt):
+        train(capture, tmp_path / "cut", config, progress=interrupt)
+    resumed = train(capture, tmp_path / "cut", config, resume=True)
+    assert (resumed / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
+    rows = [json.loads(line) for line in (resumed / "metrics.jsonl").read_text().splitlines()]
+    steps = range(views, 60 + views, views)
+    assert [row["iteration"] for row in rows] == [step for step in steps if due(5, step - views, step)]
+    assert rows[-1]["psnr"] > rows[0]["psnr"]
+
+
+def test_intervals_fall_due_once_whatever_the_step() -> None:
+    for views in (1, 2, 3, 7):
+        fell_due = [step for step in range(views, 100, views) if due(10, step - views, step)]
+        assert len(fell_due) == (100 - 1) // views * views // 10
+        assert all(step % 10 < views for step in fell_due)
+
+
+def test_rates_grow_with_the_root_and_memory_shrinks_with_the_number_of_frames() -> None:
+    """A first step is as long as its rate, whatever the gradient; so many steps later a moment is forgotten alike."""
+    one, four = Adam(), Adam(4)
+    moved = []
+    for adam, steps in ((one, 4), (four, 1)):
+        tensor = torch.zeros(3, requires_grad=True)
+        tensor.grad = torch.tensor([0.1, -2.0, 30.0])
+        adam.step([("tensor", tensor, 0.01)])
+        moved.append(tensor.detach().clone())
+        first = adam.first["tensor"] / (1 - adam.betas[0])  # the gradient itself
+        for _ in range(steps):
+            tensor.grad = torch.zeros(3)
+            adam.step([("tensor", tensor, 0.01)])
+        assert torch.allclose(adam.first["tensor"] / (1 - adam.betas[0]), first * 0.9**4)
+    assert torch.allclose(moved[1], 2 * moved[0])
+    assert torch.allclose(moved[0], 0.01 * torch.tensor([-1.0, 1.0, -1.0]))
