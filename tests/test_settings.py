@@ -33,7 +33,7 @@ class Outer:
 
 settings = st.builds(
     Outer,
-    st.builds(Inner, st.integers(), st.sampled_from(["on", "off"])),
+    st.builds(Inner, st.integers(-(2**63) + 1, 2**63 - 1), st.sampled_from(["on", "off"])),
     st.none() | st.floats(allow_nan=False, allow_infinity=False).filter(lambda value: value != 7),
     st.none() | st.lists(st.text()).map(tuple),
     st.booleans(),
@@ -56,6 +56,7 @@ def test_what_is_written_is_read_again(value: Outer) -> None:
         ({"inner": 3}, "group.inner: is a group of fields, each with a value of its own"),
         ({"share": "half"}, "group.share: 'half' is not a number"),
         ({"share": float("nan")}, "group.share: nan is not a finite number"),
+        ({"share": 10**400}, "group.share: a huge integer is out of range"),
         ({"share": 7}, "group.share: 7 is unlucky"),
         ({"names": "jaw"}, r"group.names: 'jaw' is not a list; write \[jaw\]"),
         ({"names": [1]}, "group.names: 1 is not a word"),

@@ -42,7 +42,7 @@ def joined(cores: int) -> Iterator[Any]:
     ends with the block. Raises NeecoError where there is none."""
     require_ray()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else it hides them: no job reserves one
+    os.environ.setdefault("RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES", "1")  # else Ray hides them
     import ray
 
     given = address()
@@ -54,8 +54,24 @@ def joined(cores: int) -> Iterator[Any]:
             told = " ".join(str(error).split()) or type(error).__name__
             raise NeecoError(f"RAY_ADDRESS: {given} is no cluster that can be joined: {told}") from None
     else:
-        ray.init(num_cpus=cores, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
+        _start_here(ray, cores, quiet)
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _start_here(ray: Any, cores: int, quiet: dict[str, Any]) -> None:
+    """Start Ray so that it listens on loopback alone: whoever reaches its ports can run programs."""
+    from ray._private import ray_constants
+
+    # where a machine may join a cluster, Ray takes its address in the network for 127.0.0.1, and listens on all
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        ray.init(num_cpus=cores, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+    if any(node["NodeManagerAddress"] != "127.0.0.1" for node in ray.nodes()):
+        ray.shutdown()
+        raise NeecoError(f"--workers: Ray {ray.__version__} listens to the network, too; install neeco[cluster] again")

@@ -5,12 +5,26 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from neeco.errors import NeecoError
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None  # type: ignore[assignment]
+
+TEMPORARY = ".unfinished-"  # begins the names of files and folders that are still being written
+LOCK = ".neeco.lock"
+MOST_VALUES = 1_000_000  # in a YAML file, aliases written out
+HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -23,7 +37,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # keep the suffix: some writers choose the format by it
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
     except OSError as error:
         raise NeecoError(f"{path}: cannot write here: {error.strerror or error}") from error
     os.close(handle)
@@ -61,6 +75,61 @@ def new_folder(path: Path) -> Iterator[None]:
     except BaseException:
         _remove_empty(made)
         raise
+
+
+@contextlib.contextmanager
+def own_folder(path: Path, told: Path | None = None) -> Iterator[None]:
+    """`new_folder` for this process alone, rid of what killed processes left half-written there.
+
+    Others that ask for the same folder meanwhile are refused (NeecoError naming `told`, by default the folder). The
+    lock goes with the process that holds it, however that ends; a file system without locks refuses nobody. On Windows
+    there is none: nobody is refused, and nothing is swept, which another may be writing.
+    """
+    path = Path(path)
+    if fcntl is None:
+        with new_folder(path):
+            yield
+        return
+    with new_folder(path), _locked(path, path if told is None else told):
+        for entry in list(path.rglob(f"{TEMPORARY}*")):
+            inside = entry.relative_to(path).parts[:-1]
+            if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):  # folders have owners
+                entry.unlink()
+        yield
+
+
+def is_vacant(path: Path) -> bool:
+    """Whether nothing whole is in folder `path`, or it is not there: at most what a killed process left."""
+    return not path.is_dir() or all(
+        entry.name == LOCK or (entry.name.startswith(TEMPORARY) and not entry.is_dir()) for entry in path.iterdir()
+    )
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, told: Path) -> Iterator[None]:
+    lock = folder / LOCK
+    while True:
+        try:
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise NeecoError(f"{lock}: cannot write: {error.strerror or error}") from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(handle)
+            raise NeecoError(
+                f"{told}: another neeco process is writing there; wait for its end, or give another folder"
+            ) from error
+        except OSError:
+            pass  # a file system without locks
+        if lock.exists() and os.path.samestat(os.fstat(handle), lock.stat()):
+            break
+        os.close(handle)  # the one before removed it between the two lines: nobody else would see this lock
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(handle)
 
 
 def _remove_empty(folders: list[Path]) -> None:
@@ -119,14 +188,74 @@ def read_text(path: Path, expected: str, missing: str = "no such file") -> str:
 
 def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
-    path = Path(path)
+    text = read_text(Path(path), "JSON")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise NeecoError(f"{path}: no such file") from None
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}; correct the path") from error
-    except UnicodeDecodeError:
-        raise NeecoError(f"{path}: not a text file; expected JSON") from None
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
+    except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
+        raise NeecoError(
+            f"{path}: not usable JSON: a number or the nesting is beyond all measure; write it anew"
+        ) from None
+
+
+def parse_yaml(path: Path, text: str, remedy: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """The document in the text of YAML file `path`. Raises NeecoError, with the line where it is no YAML, and for
+    aliases that make more of it than any file says."""
+    try:
+        value = yaml.load(text, Loader=loader)
+    except RecursionError:
+        raise NeecoError(f"{path}: not usable YAML: its nesting is beyond all measure; {remedy}") from None
+    # what is wrong inside a scalar is raised by whatever PyYAML builds it with
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}: " if mark else ""
+        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
+        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
+    if _unfolded(value, {}) > MOST_VALUES:
+        raise NeecoError(f"{path}: its aliases unfold without measure; write the values out")
+    return value
+
+
+def _unfolded(value: Any, known: dict[int, int]) -> int:
+    """How many values there are when every alias is written out; `known`: of those met already."""
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = MOST_VALUES + 1  # until it is known: it would contain itself
+        inner = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
+    return known[id(value)]
+
+
+def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:
+    """`value`, read from a file that neeco itself wrote, when it is built like `like`; else raises NeecoError naming
+    the field below `place`.
+
+    like: a type (float: a finite number), {name: like} for an object with at least these names, {str: like} for one
+    with any, [like] for a list, (like, None) for what may be null.
+    """
+    if isinstance(like, dict) and isinstance(value, dict):
+        for name, inner in ((name, like[str]) for name in value) if str in like else like.items():
+            if not _is_a(name, str):
+                raise NeecoError(f"{place}: holds a name that is no text; {remedy}")
+            if name not in value:
+                raise NeecoError(f"{place}: {name} is missing; {remedy}")
+            require_like(value[name], inner, f"{place}: {name}", remedy)
+    elif isinstance(like, list) and isinstance(value, list):
+        for index, item in enumerate(value):
+            require_like(item, like[0], f"{place}[{index}]", remedy)
+    elif isinstance(like, tuple):
+        if value is not None:
+            require_like(value, like[0], place, remedy)
+    elif not _is_a(value, like):
+        raise NeecoError(f"{place}: is not as neeco writes it; {remedy}")
+    return value
+
+
+def _is_a(value: Any, kind: Any) -> bool:
+    if kind is float and type(value) in (int, float):
+        return abs(value) < sys.float_info.max  # NaN compares false
+    if kind is str and type(value) is str:
+        return not HALVES.search(value)
+    return type(value) is kind

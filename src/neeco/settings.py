@@ -21,6 +21,7 @@ from neeco.errors import NeecoError
 
 Device = Annotated[str, tyro.conf.arg(help="cpu, cuda, cuda:N, or auto: a CUDA device where there is one.")]
 T = TypeVar("T")
+MOST = 2**63  # no whole number of ours is as large, and torch takes none that is
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
@@ -88,6 +89,8 @@ def _scalar(value: Any, kind: type[Any]) -> Any:
     allowed = (int, float) if kind is float else (kind,)  # a whole number is a number too
     if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(f"{value!r} is not {WORDS[kind]}")
+    if isinstance(value, int) and abs(value) >= MOST:
+        raise ValueError("a huge integer is out of range")
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{value!r} is not a finite number")
     return value

@@ -109,6 +109,13 @@ def test_damaged_poses_are_named(endonerf, damage, message):
     assert errors_only(check_capture(endonerf))
 
 
+def test_a_table_that_python_2_wrote_is_read_without_a_word(endonerf, recwarn):
+    file = endonerf / "poses_bounds.npy"
+    file.write_bytes(file.read_bytes().replace(f"({COUNT}, 17)".encode(), f"({COUNT}L,17)".encode(), 1))
+    assert read_capture(endonerf).frames
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("keep", [0, 5, 60, 128, 400])
 def test_a_truncated_file_is_refused_in_one_line(endonerf, keep):
     file = endonerf / "poses_bounds.npy"

@@ -26,6 +26,8 @@ WITH_BAD_PATH = {
     "score-masks": [MISSING, MISSING],
     "downstream": [MISSING, "--output", "taught"],
     "ablate": [MISSING, "--output", "ablated"],
+    "view": [MISSING, "--export", "page.html"],
+    "export": [MISSING],
     "demo": ["--output", "taken"],
 }
 
@@ -114,6 +116,18 @@ def test_ctrl_c_is_one_line_and_exit_130(monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setattr(cli, "_dispatch", raising(KeyboardInterrupt()))
     assert cli.main([]) == 130
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("error", [NeecoError("a\x1b[31mb\nc: \r is wrong"), OSError(2, "gone", "a\x1b[2Jb")])
+def test_names_in_damaged_files_do_not_reach_the_terminal_as_commands(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "_dispatch", raising(error))
+    assert cli.main([]) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.strip().isprintable()
+    assert "a\\x1b[" in told
 
 
 def test_a_reader_that_goes_away_makes_no_noise() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from neeco.capture import check_capture, errors_only
 from neeco.cli.demo import Arguments, run, sample_capture
@@ -28,4 +29,12 @@ def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path)
 def test_no_time_to_train_is_refused(minutes: float, tmp_path: Path) -> None:
     with pytest.raises(NeecoError, match="--minutes"):
         run(Arguments(output=tmp_path / "new", minutes=minutes))
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_device_that_is_not_there_is_told_before_anything_else(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(NeecoError, match="--device: cuda: PyTorch finds no CUDA device"):
+        run(Arguments(output=tmp_path / "new", device="cuda"))
+    assert capsys.readouterr().out == ""
     assert not (tmp_path / "new").exists()

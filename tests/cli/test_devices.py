@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -10,19 +11,29 @@ import torch
 from neeco.capture import Capture
 from neeco.capture.writer import write_capture
 from neeco.cli import main
+from neeco.cli._kept import kept
+from neeco.errors import NeecoError
 from neeco.experiments import jobs
 from neeco.raster import devices
+from neeco.scene.learning import StepResult
+from neeco.scene.scene import Scene
 from neeco.training.options import training_config
+from neeco.training.session import GaussianSession
 from neeco.training.train import train
+from neeco.training.views import TrainingViews
 
 OF_A_RUN = {
     "evaluate": [],
+    "annotate": ["--output", "out"],
+    "export": [],
+    "view": ["--export", "page.html"],
     "render": ["--output", "out"],
     "synthesize": ["--output", "out", "--count", "1", "--min-share", "0", "--labels", "threshold"],
 }
 OF_A_CAPTURE = {
     "train": ["--output", "out"],
     "compare": ["--output", "out", "--methods", "3dgs", "--iterations", "5"],
+    "downstream": ["--output", "out"],
     "ablate": ["--output", "out", "--tables", "joints", "--iterations", "5", "--kinematic-iterations", "5"],
 }
 
@@ -102,3 +113,74 @@ def noted_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(devices, "device_of", noting)
     monkeypatch.setattr(jobs, "device_of", noting)
     return words
+
+
+class TestADeviceThatFails:
+    """In the middle of a verb: one line, exit 1, and what was done is kept."""
+
+    @pytest.fixture
+    def steps(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+        """After how many steps of training the memory is full."""
+        left = {"steps": 3}
+        step = GaussianSession.step
+
+        def fails(session: GaussianSession) -> StepResult:
+            left["steps"] -= 1
+            if left["steps"] < 0:
+                raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0")
+            return step(session)
+
+        monkeypatch.setattr(GaussianSession, "step", fails)
+        return left
+
+    def test_training_says_how_to_go_on_and_does(self, made, steps, tmp_path: Path, capsys) -> None:
+        words = ["train", made["train"], "--output", "new", "--method", "3dgs", "--iterations", "5", "--device", "cpu"]
+        assert main(words) == 1
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line.startswith("neeco: error: --device: the GPU's memory is full (2.50 GiB more were asked for): ")
+        told, _, command = line.partition("; go on with: neeco ")
+        assert told
+        assert not Path("new/scene.safetensors").exists()
+        steps["steps"] = 100
+        assert main([*shlex.split(command), "--device", "cpu"]) == 0
+        assert Path("new/scene.safetensors").exists()
+
+    def test_before_the_first_step_nothing_is_left(self, made, monkeypatch, capsys) -> None:
+        def full(views: TrainingViews, device: torch.device) -> TrainingViews:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+        monkeypatch.setattr(TrainingViews, "to", full)
+        assert main(["train", made["train"], "--output", "new", "--device", "cpu"]) == 1
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line.startswith("neeco: error: --device: the GPU's memory is full: ")
+        assert "--resume" not in line
+        assert not Path("new").exists()
+
+    def test_a_job_of_a_comparison_fails_in_a_line_without_a_traceback(self, made, steps, capsys) -> None:
+        assert main(command("compare", made, "cpu")) == 1
+        output = capsys.readouterr()
+        told = " ".join((output.out + output.err).split())
+        assert "the GPU's memory is full (2.50 GiB more were asked for)" in told
+        assert not list(Path("out").rglob("*.error.txt"))
+
+    @pytest.mark.parametrize("verb", ["evaluate", "render"])
+    def test_drawing_verbs_end_in_a_line(self, verb: str, made, monkeypatch, capsys) -> None:
+        def lost(scene: Scene, *args: object, **named: object) -> None:
+            raise RuntimeError("CUDA error: unspecified launch failure\nCUDA kernel errors might be reported")
+
+        monkeypatch.setattr(Scene, "at", lost)
+        assert main(command(verb, made, "cpu")) == 1
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line.startswith("neeco: error: --device: the GPU gave up (CUDA error: unspecified launch failure): ")
+
+    def test_what_is_kept_is_told_once_there_is_something(self, tmp_path: Path) -> None:
+        begun = tmp_path / "config.yaml"
+        with pytest.raises(torch.cuda.OutOfMemoryError), kept("go on", begun):
+            raise torch.cuda.OutOfMemoryError
+        with pytest.raises(KeyboardInterrupt, match=r"^$"), kept("go on", begun):
+            raise KeyboardInterrupt
+        begun.touch()
+        with pytest.raises(NeecoError, match=r"memory is full: .*; go on$"), kept("go on", begun):
+            raise torch.cuda.OutOfMemoryError
+        with pytest.raises(KeyboardInterrupt, match=r"^go on$"), kept("go on", begun):
+            raise KeyboardInterrupt

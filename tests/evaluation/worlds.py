@@ -19,6 +19,10 @@ from neeco.scene.deformations.static import Static
 WIDTH, HEIGHT = 48, 40
 
 
+class Rest(Static):
+    """Not what moves the bar: the scene does so itself."""
+
+
 @dataclass
 class TinyScene:
     """What evaluation needs of a scene: tissue 100 to 110 mm away, a two-part bar at its instrument's origin."""
@@ -40,7 +44,7 @@ class TinyScene:
         self.colors = torch.rand(count, 1, 3, generator=random) * 2 - 1
         self.colors[len(self.tissue) :] += 1.2
         self.instruments = (Instrument("bar"),)
-        self.deformation = Static(self.instruments)
+        self.deformation = Rest(self.instruments)
         self.label_names = (("bar", "shaft"), ("bar", "jaw_left")) if self.labelled else ()
 
     def at(self, state: State) -> Gaussians:

@@ -12,15 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from neeco import cluster
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.experiments import jobs as module
+from neeco.experiments import running
 from neeco.experiments.jobs import UNLIMITED, Budget, run_job
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
-from neeco.experiments.running import run_jobs, threads_per_worker
+from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
 from neeco.experiments.watching import HeldOut
+from neeco.raster.threads import set_threads
 from neeco.training import train as train_module
 from neeco.training.options import training_config
 from neeco.training.session import GaussianSession
@@ -106,7 +109,38 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
     iterations = [row["iteration"] for row in curve_of(cut) if row["split"] == "test"]
     assert iterations == sorted(set(iterations))
     assert iterations[-1] == 12
-    assert [row["psnr"] for row in curve_of(cut)[-2:]] == [row["psnr"] for row in curve_of(whole)[-2:]]
+    assert [row["psnr"] for row in curve_of(cut)] == [row["psnr"] for row in curve_of(whole)]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not as neeco writes it"),
+        ("job.json", {"budget": None}, "budget: is not as neeco writes it"),
+        ("begun.json", {"seconds": []}, "seconds: is not as neeco writes it"),
+        ("begun.json", {"budget": {}}, "budget: minutes is missing"),
+        ("begun.json", {"budget": {"minutes": None, "iterations": None, "clock": "wall"}}, "budget: give minutes or"),
+    ],
+)
+def test_a_damaged_job_is_told_by_file_and_field(name: str, change: dict, told: str, make_job) -> None:
+    job = make_job()
+    run_job(job)
+    file = job.folder / name
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    if name == "begun.json":
+        (job.folder / "job.json").unlink()
+    with pytest.raises(NeecoError, match=f"{name}: {told}.*remove that run's folder"):
+        run_job(job)
+
+
+def test_a_damaged_curve_is_told_by_its_line(make_job) -> None:
+    job = make_job()
+    run_job(job)
+    (job.folder / "job.json").unlink()
+    with (job.folder / "curve.jsonl").open("a") as stream:
+        stream.write("[[[")
+    with pytest.raises(NeecoError, match=r"curve.jsonl: line \d+: not valid JSON"):
+        run_job(job)
 
 
 def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,6 +285,64 @@ def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{closed}")
     with pytest.raises(NeecoError, match=f"RAY_ADDRESS: no Ray cluster answers at 127.0.0.1:{closed}"):
         run_jobs([make_job()], workers=2)
+
+
+@pytest.mark.parametrize(
+    ("workers", "device", "told"),
+    [
+        (3, "cuda", r"--workers: 3 for 2 GPU\(s\); give at most 2"),
+        (2, "cuda:1", "each has a GPU of its own"),
+        (2, "cuda", ""),
+    ],
+)
+def test_workers_have_a_gpu_each(workers: int, device: str, told: str, monkeypatch) -> None:
+    monkeypatch.setattr(running, "require_ray", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    check_workers(workers, torch.device("cpu"))
+    check_workers(1, torch.device(device))
+    if told:
+        with pytest.raises(NeecoError, match=told):
+            check_workers(workers, torch.device(device))
+    else:
+        check_workers(workers, torch.device(device))
+
+
+class FakeRay:
+    """Two GPUs, and the one that a job was given."""
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 4.0, "GPU": 2.0}
+
+    def get_runtime_context(self) -> FakeRay:
+        return self
+
+    def get_accelerator_ids(self) -> dict[str, list[str]]:
+        return {"GPU": ["1"]}
+
+
+def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", FakeRay())
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.setattr(running, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
+    threads = torch.get_num_threads()
+    try:
+        assert running._run_there(make_job(), 1) == {"seen": "1"}
+    finally:
+        set_threads(0)
+        torch.set_num_threads(threads)
+
+
+def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
+    here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cpu"))
+    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 0]
+    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cuda"))
+    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cpu"))
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")  # whose machines may have what this one has not
+    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
 
 
 def test_workers_share_the_cores() -> None:

@@ -1,10 +1,14 @@
 """What is made beside its place appears there whole or not at all."""
 
+import os
+import shutil
+import signal
 from pathlib import Path
 
 import pytest
 
 from neeco.errors import NeecoError
+from neeco.files import TEMPORARY
 from neeco.ingest.staging import staged
 
 
@@ -40,3 +44,34 @@ def test_what_is_there_stays(tmp_path):
     with pytest.raises(NeecoError, match="exists already"), staged(tmp_path / "capture"):
         pass
     assert (tmp_path / "capture" / "file").exists()
+
+
+def test_what_a_killed_process_left_is_swept_when_the_same_is_made_again(tmp_path):
+    place = tmp_path / "output"
+    child = os.fork()
+    if child == 0:
+        with staged(place) as folder:
+            fill(folder)
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert [path.name.startswith(TEMPORARY) for path in tmp_path.iterdir()] == [True]
+    with staged(place) as folder:
+        assert not (folder / "capture").exists()
+        with pytest.raises(NeecoError, match="output: another neeco process is writing there"):
+            staged(place).__enter__()
+        fill(folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["output"]
+
+
+def test_what_a_process_killed_after_its_last_step_left_is_swept_too(tmp_path):
+    child = os.fork()
+    if child == 0:
+        with staged(tmp_path / "output") as folder:
+            fill(folder)
+            (folder / "raw").mkdir()
+            shutil.rmtree = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 2
+    with pytest.raises(NeecoError, match="exists already"):
+        staged(tmp_path / "output").__enter__()
+    assert [path.name for path in tmp_path.rglob("*")] == ["output", "file"]

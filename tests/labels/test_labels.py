@@ -9,7 +9,7 @@ from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
-from neeco.synthesis.acceptance import UNSEEN, Acceptance
+from neeco.synthesis.acceptance import UNSEEN, UNSEEN_SIDE, Acceptance
 
 
 def labelled(scene, state, camera, labeller=None):
@@ -54,25 +54,44 @@ def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
     assert label.keypoints["shaft_near"].visibility == 2
 
 
-def test_the_share_of_made_up_tissue_is_told(scene, state, camera):
-    drawing, _ = labelled(scene, state(), camera)
-    assert not drawing.made_up.any()
-    marks = torch.zeros(len(scene.canonical))
-    marks[: scene.canonical.counts[0]] = (scene.canonical.means[: scene.canonical.counts[0], 0] > 0).float()
-    plain = scene.canonical
-    scene.canonical = plain.with_extras(made_up=marks)
+def test_the_share_that_is_made_up_is_told(scene, state, camera):
+    recorded, plain = scene.recorded.states[0], scene.canonical
+    drawing, _ = labelled(scene, recorded, camera)
+    tissue = slice(0, plain.counts[0])
+    unseen = torch.zeros(len(plain), dtype=torch.bool)
+    unseen[tissue] = plain.means[tissue, 0] > 0
+    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
     try:
-        halved, _ = labelled(scene, state(), camera)
+        halved, _ = labelled(scene, recorded, camera)
     finally:
         scene.canonical = plain
+    assert not (drawing.made_up > 0.5).any()
     behind = 1 - float((drawing.parts > 0).float().mean())
-    assert float(halved.made_up.mean()) == pytest.approx(behind / 2, abs=0.02)
+    assert float((halved.made_up > 0.5).float().mean()) == pytest.approx(behind / 2, abs=0.02)
     shown = halved.parts > 0
     right = torch.arange(camera.width) > camera.width / 2 + 3
     assert bool(halved.ignored[~shown & right].all())
     assert torch.equal(halved.ignored[:, : camera.width // 2 - 3], drawing.ignored[:, : camera.width // 2 - 3])
     assert Acceptance(0.0, None).why_refused(scene, drawing) is None
     assert Acceptance(0.0, None).why_refused(scene, halved) == UNSEEN
+
+
+def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of_it_does(scene, camera):
+    recorded, plain = scene.recorded.states[0], scene.canonical
+    unseen = torch.zeros(len(plain), dtype=torch.bool)
+    unseen[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
+    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    try:
+        for labeller in (CompositedLabels(scene), ThresholdLabels(scene)):
+            drawing, _ = labelled(scene, recorded, camera, labeller)
+            instrument = drawing.parts > 0
+            share = float((drawing.made_up > 0.5)[instrument].float().mean())
+            assert 0.5 < share < 1.0
+            assert not (drawing.made_up > 0.5)[~instrument].float().mean() > 0.02
+            assert Acceptance(0.0, None, share).why_refused(scene, drawing) is None
+            assert Acceptance(0.0, None, 0.99 * share).why_refused(scene, drawing) == UNSEEN_SIDE
+    finally:
+        scene.canonical = plain
 
 
 def test_an_instrument_behind_the_tissue_is_not_seen_at_all(scene, state, camera):

@@ -39,6 +39,7 @@ def ablation() -> dict:
     return {
         "capture": "/data/a<b>&c",
         "seed": 3,
+        "machine": {"cpu": "a <processor>", "cores": 2, "gpu": "A GPU"},
         "iterations": {"neeco": 100},
         "settings": [],
         "splits": list(SPLITS),
@@ -58,6 +59,7 @@ def test_the_page_is_whole_and_fetches_nothing(ablation: dict, tmp_path: Path) -
     assert "script" not in page.tags
     assert page.tags.count("figure") == 2  # one learning curve, one PSNR over noise
     assert page.tags.count("svg") >= 2
+    assert "on A GPU, a &lt;processor&gt;, 2 cores." in text
     assert "a&lt;b&gt;&amp;c" in text
     assert "it &lt;failed&gt;" in text
     assert "too short" in text

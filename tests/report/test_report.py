@@ -71,6 +71,14 @@ def test_a_run_without_metrics_or_preview_still_has_a_page(reported, tmp_path):
     assert "Synthesised" not in text
 
 
+def test_a_page_to_play_with_stands_in_a_frame_of_its_own_that_may_do_nothing_here(reported, tmp_path):
+    _, capture, scene, evaluation, _ = reported
+    text = write_report(tmp_path, evaluation, capture, scene, playable="<p title='a'>\"b\" & c</p>").read_text()
+    assert 'sandbox="allow-scripts allow-downloads"' in text
+    assert 'srcdoc="&lt;p title=&#39;a&#39;&gt;&#34;b&#34; &amp; c&lt;/p&gt;"' in text
+    assert "<iframe" not in write_report(tmp_path, evaluation, capture, scene).read_text()
+
+
 def test_a_preview_that_cannot_be_read_is_named(reported, tmp_path):
     _, capture, scene, evaluation, _ = reported
     with pytest.raises(NeecoError, match=r"gone\.png"):

@@ -19,9 +19,9 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.raster.rotations import rigid_from_vector
 from neeco.report.annotated_page import write_annotated_page
 from neeco.scene import Scene
-from neeco.scene.rotations import rigid_from_vector
 from neeco.synthesis import trust
 from neeco.synthesis.annotated import annotate_capture
 from neeco.synthesis.trust import Usual, judge, usual_errors
@@ -207,3 +207,12 @@ def test_a_wrong_run_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["annotate", str(tmp_path / "nothing"), "--output", str(tmp_path / "output")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "output").exists()
+
+
+def test_a_recording_that_changed_is_not_gone_on_with(made: Path, recorded: RecordedRun, tmp_path: Path) -> None:
+    begun = shutil.copytree(made, tmp_path / "begun")
+    frames = list(recorded.recording.frames)
+    frames[2] = replace(frames[2], image_path=frames[1].image_path)
+    changed = replace(recorded, recording=replace(recorded.recording, frames=tuple(frames)))
+    with pytest.raises(NeecoError, match=r"dataset.json: settings.captures_sha256: begun with .*use a new folder"):
+        annotate_capture(changed, begun, resume=True)

@@ -11,6 +11,7 @@ from pycocotools.coco import COCO
 
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
+from neeco.files import LOCK, TEMPORARY
 from neeco.labels.composited import LABEL_THRESHOLD
 from neeco.synthesis import indexes
 from neeco.synthesis.acceptance import Acceptance
@@ -190,7 +191,7 @@ def test_interrupted_and_resumed_is_the_same_data_set(made, run, tmp_path, monke
     info = json.loads((output / "dataset.json").read_text())
     assert (info["complete"], info["images"]) == (False, 3)
     (output / "images/000001.png").write_bytes(b"cut short")
-    (output / "masks/.000003.abc.png").write_bytes(b"left over from a kill")
+    (output / f"masks/{TEMPORARY}abc.png").write_bytes(b"left over from a kill")
     summary = synthesize(run, output, SETTINGS, resume=True)
     assert summary.made_now == COUNT - 2
     assert contents(output) == contents(made)
@@ -203,6 +204,23 @@ def test_an_image_without_one_of_its_files_is_drawn_again(made, run, tmp_path, f
     (output / folder / "000001.png").unlink()
     assert synthesize(run, output, SETTINGS, resume=True).made_now == 1
     assert contents(output) == contents(made)
+
+
+@pytest.mark.parametrize("change", [{"image": "../../secret.png"}, {"labels": [3]}, {"split": "\x1b[31m"}])
+def test_an_image_whose_record_was_changed_is_drawn_again(made, run, tmp_path, change):
+    output = shutil.copytree(made, tmp_path / "set")
+    file = output / ".records" / "000002.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    assert synthesize(run, output, SETTINGS, resume=True).made_now == 1
+    assert contents(output) == contents(made)
+
+
+def test_a_data_set_killed_before_its_first_whole_file_begins_again(made, run, tmp_path):
+    (tmp_path / "set").mkdir()
+    for name in (LOCK, f"{TEMPORARY}abc.json"):
+        (tmp_path / "set" / name).touch()
+    synthesize(run, tmp_path / "set", SETTINGS, resume=True)
+    assert contents(tmp_path / "set") == contents(made)
 
 
 def test_a_data_set_from_before_soft_and_ignore_gets_them_for_every_image(made, run, tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from rod_world import CAMERA
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
@@ -58,7 +59,7 @@ def bars(request) -> Scene:
         counts=(WALL, BAR, BAR),
     )
     states = (at(60, 70), at(70, 60))
-    recorded = Recorded(("0", "1"), ("train",) * 2, states, ())
+    recorded = Recorded(("0", "1"), ("train",) * 2, states, (CAMERA,) * 2)
     instruments = (Instrument("upright"), Instrument("level"))
     return Scene("bars", canonical, TwoBars(), instruments, recorded, torch.zeros(3))
 

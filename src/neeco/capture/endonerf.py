@@ -6,6 +6,7 @@ row, then the nearest and farthest depth; the columns of R are the camera's down
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,7 +97,8 @@ def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
     remedy = "write an array of N x 17 numbers with numpy.save"
     try:
         # mapped, so that a lying header cannot make us allocate more than the file holds
-        table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
+        with warnings.catch_warnings(action="ignore"):  # that Python 2 wrote it, which is no matter
+            table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
     except NeecoError as error:
         report.refused(POSES_FILE, "", error)
         return None

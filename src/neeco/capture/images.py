@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,9 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
+
+# Pillow warns of images beyond 90 million pixels, and refuses them beyond twice that: both are refused here
+warnings.simplefilter("error", Image.DecompressionBombWarning)
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
@@ -45,10 +49,10 @@ def open_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """An image file, decoded, in its own mode. `size`: (width, height) it must have. Raises NeecoError."""
     path = Path(path)
     with _opened(path) as image:
+        if size is not None and image.size != tuple(size):  # before its pixels, of which there may be billions
+            found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
+            raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
         image.load()
-    if size is not None and image.size != tuple(size):
-        found, wanted = "x".join(map(str, image.size)), "x".join(map(str, size))
-        raise NeecoError(f"{path}: image is {found}, its camera says {wanted}; resize it or correct w and h")
     return image
 
 
@@ -92,6 +96,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         with Image.open(path) as image:
             yield image
+    except NeecoError:
+        raise
     except FileNotFoundError as error:
         raise NeecoError(f"{path}: no such file") from error
     except Image.UnidentifiedImageError as error:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
@@ -27,6 +28,11 @@ class State:
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
+
+    def to(self, device: torch.device | str) -> State:
+        """The same state, its poses on `device`."""
+        moved = {name: replace(given, pose=given.pose.to(device)) for name, given in self.instruments.items()}
+        return replace(self, instruments=moved)
 
 
 @dataclass(frozen=True)

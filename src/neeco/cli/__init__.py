@@ -27,6 +27,8 @@ VERBS = {
     "render": "Draw frames of a capture, or states from a file, with part ids and masks.",
     "compare": "Train and score several methods under the same budget; tables and a report.",
     "score-masks": "Score a folder of masks, whoever made them, against the truth.",
+    "view": "Look at a run and steer it, in a browser or as one file.",
+    "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ).",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
     "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
@@ -55,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except NeecoError as error:
-        print(f"neeco: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"neeco: error: {_printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 1
     except OSError as error:
         if isinstance(error, BrokenPipeError):
@@ -63,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return PIPE_CLOSED
         where = f"{error.filename}: " if error.filename else ""
-        print(f"neeco: error: {where}{error.strerror or error}; check that path and the disk", file=sys.stderr)
+        told = f"{where}{error.strerror or error}; check that path and the disk"
+        print(f"neeco: error: {_printable(told)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
         told = " ".join(map(str, interrupt.args)) or "run the same command again"
@@ -72,6 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
+
+
+def _printable(text: str) -> str:
+    """Text in which nothing moves a terminal's cursor or changes its colours, as names in damaged files may."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -89,10 +97,12 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
+    from neeco.raster.devices import failures_told
     from neeco.raster.threads import keep_freed_memory
 
     keep_freed_memory()
-    return run(parsed)
+    with failures_told():
+        return run(parsed)
 
 
 def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:

@@ -35,6 +35,7 @@ def run(arguments: Arguments) -> int:
     """Annotate, write the page, and say where both lie."""
     from neeco.capture.check import read_checked
     from neeco.cli._bars import counting
+    from neeco.cli._kept import kept
     from neeco.raster.devices import device_of
     from neeco.report.annotated_page import write_annotated_page
     from neeco.synthesis.annotated import annotate_capture
@@ -42,19 +43,16 @@ def run(arguments: Arguments) -> int:
 
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
-        with counting("annotate") as advance:
-            try:
-                annotated = annotate_capture(
-                    trained,
-                    arguments.output,
-                    capture=capture,
-                    min_trust=arguments.min_trust,
-                    formats=arguments.formats,
-                    resume=arguments.resume,
-                    on_progress=advance,
-                )
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt("what was done is kept; run the same command again with --resume") from None
+        with counting("annotate") as advance, kept("what was done is kept; run the same command again with --resume"):
+            annotated = annotate_capture(
+                trained,
+                arguments.output,
+                capture=capture,
+                min_trust=arguments.min_trust,
+                formats=arguments.formats,
+                resume=arguments.resume,
+                on_progress=advance,
+            )
         page = write_annotated_page(annotated.output, annotated.records, annotated.capture, arguments.min_trust)
     print(f"{annotated.written} of {len(annotated.records)} frames in {annotated.output}; worst first: {page}")
     return 0

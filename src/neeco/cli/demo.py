@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from neeco.settings import Device
+
 if TYPE_CHECKING:
     import torch
 
@@ -25,6 +27,7 @@ class Arguments:
     """Folder to write to; must be empty or absent."""
     minutes: float = 2.0
     """How long to train."""
+    device: Device = "auto"
 
 
 def run(args: Arguments) -> int:
@@ -38,11 +41,11 @@ def run(args: Arguments) -> int:
         raise NeecoError(f"--minutes: {args.minutes} is no time to train; give more than 0")
     if args.output.exists() and (not args.output.is_dir() or any(args.output.iterdir())):
         raise NeecoError(f"{args.output}: exists already; give another --output, or remove it")
+    device = device_of(args.device)
     start = time.monotonic()
     capture, dataset = sample_capture(), args.output / "dataset"
     try:
         _check(capture)
-        device = device_of("auto")
         run_path = _train(capture, args.output / "run", args.minutes, device)
         networks = find_lpips()
         with open_run(run_path, device) as trained:
@@ -114,6 +117,7 @@ def _synthesize(trained: Run, output: Path) -> None:
 def _evaluate(trained: Run, dataset: Path, networks: dict[str, Lpips]) -> Path:
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.report import write_report
+    from neeco.viewer.export import embedded_page
 
     print("4/4 evaluate on frames kept from training")
     capture = trained.capture()
@@ -122,4 +126,5 @@ def _evaluate(trained: Run, dataset: Path, networks: dict[str, Lpips]) -> Path:
         iou = "" if numbers["mask_iou"] is None else f", mask IoU {numbers['mask_iou']:.3f}"
         print(f"  {split}: PSNR {numbers['psnr']:.2f} dB{iou}")
     preview = dataset / "preview.png"
-    return write_report(trained.path, evaluation, capture, trained.scene, synthesis_preview=preview)
+    page = embedded_page(trained)
+    return write_report(trained.path, evaluation, capture, trained.scene, synthesis_preview=preview, playable=page)

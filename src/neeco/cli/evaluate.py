@@ -53,6 +53,7 @@ def run(args: Evaluate) -> int:
     from neeco.raster.devices import device_of
     from neeco.report import write_report
     from neeco.training.run import open_run
+    from neeco.viewer.export import embedded_page
 
     console = Console()
     networks = find_lpips(args.lpips_weights)
@@ -62,7 +63,7 @@ def run(args: Evaluate) -> int:
             evaluation = evaluate_run(
                 trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )
-        page = write_report(args.run, evaluation, capture, trained.scene)
+        page = write_report(args.run, evaluation, capture, trained.scene, playable=embedded_page(trained))
         if args.json is not None:
             write_json(args.json, evaluation)
     console.print(_table(evaluation))

@@ -127,7 +127,8 @@ def _recording(args: Ingest) -> Recording:
 
 
 def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
-    from neeco.capture.check import errors_only, inspect_capture
+    from neeco.capture import read_capture
+    from neeco.capture.check import Problem, errors_only, inspect_capture
     from neeco.ingest.pipeline import ingest
     from neeco.report.ingest_page import write_ingest_page
 
@@ -143,20 +144,25 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
                 tasks[what] = bar.add_task(what, total=total or None)
             bar.update(tasks[what], completed=done, total=total or None)
 
+        problems: list[Problem] = []
+
+        def complete(result: IngestResult, folder: Path) -> None:
+            report("writing the page", 0, 0)
+            checked = inspect_capture(folder)
+            problems.extend(checked.problems)
+            write_ingest_page(result, folder / PAGE, checked.capture or read_capture(folder))
+
         try:
-            result = ingest(recording, output, report)
+            result = ingest(recording, output, report, complete)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
-        report("writing the page", 0, 0)
-        checked = inspect_capture(output)
-        write_ingest_page(result, output / PAGE, checked.capture)
     if as_json:
         print(json.dumps(result.as_json(), indent=2))
         return 0
     _print(result)
-    for problem in errors_only(checked.problems):
+    for problem in errors_only(problems):
         print(f"wrong: {problem}")
-    print(f"capture: {output}  ({len(checked.problems)} remarks by `neeco check`)")
+    print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
     print(f"how good it is: {output / PAGE}")
     return 0
 

@@ -39,6 +39,7 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
     from neeco.cli._bars import counting
+    from neeco.cli._kept import kept
     from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
     from neeco.training.run import load_run, open_run
@@ -48,7 +49,8 @@ def run(arguments: Arguments) -> int:
     drawn, casts = _runs(arguments)
     device = device_of(arguments.device)
     with open_run(drawn, device) as trained, counting("synthesize", settings.count) as advance:
-        try:
+        others = [load_run(cast, device) for cast in casts]
+        with kept("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,
                 arguments.output,
@@ -57,10 +59,8 @@ def run(arguments: Arguments) -> int:
                 arguments.resume,
                 on_progress=advance,
                 workers=arguments.workers,
-                casts=[load_run(cast, device) for cast in casts],
+                casts=others,
             )
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt("what was drawn is kept; run the same command again with --resume") from None
     print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
     for reason, times in summary.refused.items():
         print(f"refused {times} states: instrument {reason}")

@@ -23,7 +23,9 @@ class Arguments:
     """kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
     adjustment."""
     iterations: int | None = None
-    """Optimisation steps; by default as the method has it."""
+    """Frames drawn and learned from; by default as the method has it."""
+    views_per_step: int | None = None
+    """Frames between two optimisation steps, whose mean loss is minimised; by default 1. More are for a GPU."""
     minutes: float | None = None
     """Stop in time with a finished run."""
     device: Device = "auto"
@@ -53,6 +55,7 @@ def run(args: Arguments) -> int:
         args.method,
         {
             "iterations": args.iterations,
+            "views_per_step": args.views_per_step,
             "minutes": args.minutes,
             "seed": args.seed,
             "transforms": args.transforms,

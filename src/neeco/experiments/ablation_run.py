@@ -19,11 +19,12 @@ from neeco.experiments.ablations import ABLATIONS, OURS, PAPER, Ablation, Varian
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
 from neeco.experiments.jobs import Budget, Job, check_settings, settings_for
+from neeco.experiments.machine import machine
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.plans import AblationPlan
 from neeco.experiments.running import check_workers, run_jobs
 from neeco.experiments.work import JobNews
-from neeco.files import new_folder, read_json, write_json
+from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.training.options import training_config
 from neeco.training.run import open_run
@@ -39,13 +40,13 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
     for unknown tables and settings, a capture without instruments, or an output that holds other runs.
     """
-    check_workers(plan.workers)
     device = device_of(plan.device)
+    check_workers(plan.workers, device)
     chosen = chosen_ablations(plan.tables)
     variants = distinct_variants(chosen)
     capture = _open_capture(plan, variants)
     splits = held_out_splits(capture)
-    with new_folder(plan.output):
+    with own_folder(plan.output):
         jobs = [_job(plan, variant) for variant in variants]
         for job in jobs:
             job.check()
@@ -64,6 +65,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None
         "capture": str(plan.capture.absolute()),
         "seed": plan.seed,
         "iterations": dict(sorted((family.method, _steps(plan, family)) for family in families)),
+        "machine": machine(device),
         "settings": list(plan.settings),
         "splits": list(splits),
         "tables": [table_of(table, folders, finished, labels, splits) for table in chosen],

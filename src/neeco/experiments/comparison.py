@@ -11,15 +11,18 @@ from typing import Any
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
+from neeco.capture.fingerprint import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.comparison_tables import write_tables
 from neeco.experiments.jobs import (
+    BUDGET,
     JOB_FILE,
     Budget,
     Job,
     check_settings,
+    read_result,
     settings_for,
 )
 from neeco.experiments.machine import machine
@@ -27,17 +30,18 @@ from neeco.experiments.masks import check_masks, score_folder, score_runs, split
 from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
 from neeco.experiments.speed import measure_speed
 from neeco.experiments.summary import distances_to_training, summarise
-from neeco.experiments.watching import CURVE_FILE, TOTALS, read_rows
+from neeco.experiments.watching import ANEW, CURVE_FILE, TOTALS, read_rows
 from neeco.experiments.work import JobNews, check_output
-from neeco.files import new_folder, read_json, write_json
+from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.training.config import TrainConfig
 from neeco.training.options import variant_config
-from neeco.training.run import load_run
+from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
 COMPARISON_FILE = "comparison.json"
+FRAME_SCORES = {"frame": str} | dict.fromkeys(("psnr", "psnr_instrument", "mask_iou"), (float, None))
 
 
 @dataclass(frozen=True)
@@ -74,17 +78,19 @@ class ComparisonPlan:
 def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
     spec.budget.check()
-    device_of(spec.device)
+    device = device_of(spec.device)
     if spec.seeds < 1:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
-    check_workers(spec.workers)
+    check_workers(spec.workers, device)
     configs = _configs(spec)
     capture = _open_capture(spec, configs)
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
     jobs = _jobs(spec, configs)
+    digest = fingerprint(capture)
     for job in jobs:
         job.check()
+        require_same_capture(job.folder, capture.root, digest)
     splits = held_out_splits(capture, spec.splits)
     check_masks(spec.masks, capture, splits, spec.methods)
     notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
@@ -107,7 +113,7 @@ def compare(
     """
     spec = plan.spec
     report = progress or (lambda what, done, total: None)
-    with new_folder(spec.output):
+    with own_folder(spec.output):
         finished = _finished_before(plan)
 
         def write() -> None:  # what is known is on disk at every moment
@@ -142,7 +148,7 @@ def failures(comparison: Mapping[str, Any]) -> list[str]:
 def _finished_before(plan: ComparisonPlan) -> dict[int, dict[str, Any]]:
     """What earlier starts left of these jobs, by the job's place."""
     files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
-    found = {index: read_json(file) for index, file in files.items() if file.exists()}
+    found = {index: read_result(file) for index, file in files.items() if file.exists()}
     return {index: job for index, job in found.items() if list(job["splits"]) == list(plan.splits)}
 
 
@@ -187,8 +193,12 @@ def _check_output(spec: ComparisonSpec) -> None:
     """Raises NeecoError when `output` holds something else, or the comparison of another capture or budget."""
     noun, about = "comparison", "compares methods on"
     stored = check_output(spec.output, COMPARISON_FILE, COMPARISON_SCHEMA, spec.capture, noun, about)
-    if stored is not None and stored["budget"] != asdict(spec.budget):
-        told = f"budget: compares after {Budget(**stored['budget'])}, not {spec.budget}"
+    if stored is None:
+        return
+    require_like(stored, {"budget": BUDGET}, str(spec.output / COMPARISON_FILE), "give another --output")
+    if stored["budget"] != asdict(spec.budget):
+        before = Budget(*(stored["budget"][key] for key in BUDGET))
+        told = f"budget: compares after {before}, not {spec.budget}"
         raise NeecoError(f"{spec.output / COMPARISON_FILE}: {told}; give another --output")
 
 
@@ -213,7 +223,7 @@ def _document(plan: ComparisonPlan, results: Sequence[dict[str, Any]]) -> dict[s
         "version": __version__,
         "complete": False,
         "capture": str(spec.capture.absolute()),
-        "machine": machine() | {"workers": spec.workers, "threads_per_worker": threads},
+        "machine": machine(device_of(spec.device)) | {"workers": spec.workers, "threads_per_worker": threads},
         "budget": asdict(spec.budget),
         "transforms": spec.transforms,
         "settings": list(spec.assignments),
@@ -247,7 +257,9 @@ def _distance(plan: ComparisonPlan, results: Sequence[Mapping[str, Any]]) -> lis
     rows = []
     for job in (job for job in results if "error" not in job):
         folder = job_folder(plan.spec.output, job["name"], job["seed"])
-        frames = read_json(folder / EVALUATION_FILE)["per_frame"]["given"]
+        file = folder / EVALUATION_FILE
+        like = {"per_frame": {"given": {split: [FRAME_SCORES] for split in plan.splits}}}
+        frames = require_like(read_json(file), like, str(file), ANEW)["per_frame"]["given"]
         for split in (split for split in plan.splits if split != "train"):
             for entry in frames[split]:
                 row = {"name": job["name"], "seed": job["seed"], "split": split, "frame": entry["frame"]}
@@ -267,5 +279,5 @@ def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> 
         scored = score_runs(runs, folder, plan.capture, told, device, partial(report, "scoring masks"))
         result["masks"] = [*plan.given_masks, *scored]
         opened = [(name, seed, load_run(path)) for name, seed, path in runs]
-        result["speed"] = measure_speed(opened, plan.capture, partial(report, "measuring speed"))
+        result["speed"] = measure_speed(opened, plan.capture, device, partial(report, "measuring speed"))
     result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])

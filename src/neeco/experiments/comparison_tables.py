@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neeco.experiments.machine import hardware_words
 from neeco.experiments.summary import MASK_METRICS, RUN_METRICS, SPLIT_METRICS
 from neeco.experiments.tables import (
     UNKNOWN,
@@ -136,7 +137,7 @@ def machine_words(comparison: Mapping[str, Any]) -> str:
     threads = machine["threads_per_worker"] or machine["threads"]
     workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
     drawing = f"{threads} drawing thread{'s' if threads > 1 else ''}"
-    return f"{machine['cpu']}, {machine['cores']} cores, {drawing}{workers}, torch {machine['torch']}"
+    return f"{hardware_words(machine)}, {drawing}{workers}, torch {machine['torch']}"
 
 
 def markdown_text(comparison: Mapping[str, Any]) -> str:

@@ -18,8 +18,8 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.truth import MASK_FOLDERS
 from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
-from neeco.files import read_json, write_atomically, write_json
-from neeco.scene.rotations import rotation_from_vector
+from neeco.files import is_vacant, read_json, write_atomically, write_json
+from neeco.raster.rotations import rotation_from_vector
 
 RECIPE_FILE = "derived.json"
 
@@ -41,7 +41,7 @@ def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: in
         _require_same(output / RECIPE_FILE, recipe)
         if (output / "transforms.json").exists():
             return output
-    elif output.is_dir() and any(output.iterdir()):
+    elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty, and not made by ablate; give another --output")
     changed = replace(capture, frames=_frames(capture, derived, seed))
     write_json(output / RECIPE_FILE, recipe)

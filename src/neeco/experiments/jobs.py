@@ -16,9 +16,9 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.lpips import find_lpips
 from neeco.experiments.machine import reset_peak_memory
-from neeco.experiments.watching import BEGUN_FILE, CLOCKS, HeldOut, Watcher
+from neeco.experiments.watching import ANEW, BEGUN_FILE, CLOCKS, HeldOut, Watcher
 from neeco.experiments.work import JobProgress
-from neeco.files import read_json, write_json
+from neeco.files import read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
@@ -30,6 +30,18 @@ JOB_FILE = "job.json"
 UNLIMITED = 1_000_000_000  # iterations: minutes end the run long before
 OWN_OPTION = {"transforms": "--transforms", "iterations": "the budget's option", "minutes": "the budget's option"}
 SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames")
+BUDGET = {"minutes": (float, None), "iterations": (int, None), "clock": str}
+IDENTITY = {"name": str, "method": str, "seed": int, "capture": str, "budget": BUDGET}
+RESULT = IDENTITY | {
+    "iterations": int,
+    "seconds": float,
+    "processor_seconds": float,
+    "peak_memory_mb": (float, None),
+    "num_gaussians": (int, None),
+    "fps": float,
+    "lpips_networks": [str],
+    "splits": {str: dict.fromkeys(SPLIT_SCORES, (float, None))},
+}
 
 
 @dataclass(frozen=True)
@@ -131,7 +143,7 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
     splits = held_out_splits(capture, job.splits)
     networks, device = find_lpips(job.lpips_weights), device_of(job.device)
     if file.exists():
-        stored = read_json(file)
+        stored = read_result(file)
         if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == sorted(networks):
             return dict(stored)
         totals = {key: stored[key] for key in ("seconds", "processor_seconds", "peak_memory_mb")}
@@ -158,6 +170,12 @@ def run_job(job: Job, progress: JobProgress | None = None, capture: Capture | No
     return result
 
 
+def read_result(file: Path) -> dict[str, Any]:
+    """What a finished job wrote. Raises NeecoError when the file is damaged."""
+    result: dict[str, Any] = require_like(read_json(file), RESULT, str(file), ANEW)
+    return result
+
+
 def check_folder(job: Job) -> None:
     """Raises NeecoError when `job.folder` holds a run of other settings, another capture or another budget."""
     folder, differs = job.folder, "give another --output"
@@ -168,11 +186,15 @@ def check_folder(job: Job) -> None:
         raise NeecoError(f"{folder}: capture: this run was trained on {stored['capture']}; {differs}")
     identity = job.identity()
     for name in (JOB_FILE, BEGUN_FILE):
-        values = read_json(folder / name) if (folder / name).exists() else identity
+        file = folder / name
+        values = require_like(read_json(file), IDENTITY, str(file), ANEW) if file.exists() else identity
         if values["budget"] != identity["budget"]:
-            raise NeecoError(
-                f"{folder}: budget: this run has {Budget(**values['budget'])}, not {job.budget}; {differs}"
-            )
+            before = Budget(*(values["budget"][key] for key in BUDGET))
+            try:
+                before.check()
+            except NeecoError as error:
+                raise NeecoError(f"{file}: {error}; {ANEW}") from None
+            raise NeecoError(f"{folder}: budget: this run has {before}, not {job.budget}; {differs}")
         for key in (key for key in identity if values[key] != identity[key]):
             raise NeecoError(f"{folder / name}: {key}: is {values[key]}, not {identity[key]}; {differs}")
     try:

@@ -6,11 +6,13 @@ import ctypes
 import gc
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from neeco.raster.devices import cuda_backend
 from neeco.raster.threads import simd, threads
 
 STATUS = Path("/proc/self/status")
@@ -18,8 +20,9 @@ CLEAR = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"  # proc(5): resets the high-water mark of the resident memory
 
 
-def machine() -> dict[str, Any]:
-    """Processor, cores this process may use, threads, and versions."""
+def machine(device: torch.device) -> dict[str, Any]:
+    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one."""
+    on_gpu = device.type == "cuda"
     return {
         "cpu": processor_name(),
         "cores": usable_cores(),
@@ -28,9 +31,15 @@ def machine() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "backend": f"cpu ({simd()})",
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "backend": f"{cuda_backend()} (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
+        "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
     }
+
+
+def hardware_words(machine: Mapping[str, Any]) -> str:
+    """What computed, of what `machine` told: the GPU, if it was one, and the processor."""
+    gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
+    return f"{gpu}{machine['cpu']}, {machine['cores']} cores"
 
 
 def processor_name() -> str:

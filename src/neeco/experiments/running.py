@@ -4,15 +4,19 @@ RAY_ADDRESS names."""
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from neeco.capture import Capture
-from neeco.cluster import joined, require_ray
+from neeco.cluster import address, joined, require_ray
 from neeco.errors import NeecoError
 from neeco.experiments.machine import usable_cores
 from neeco.experiments.work import JobNews, Work, attempt_job, ended
+from neeco.raster.devices import device_of
 
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
@@ -31,7 +35,7 @@ def run_jobs(
     written, so that the next start tries again. Raises NeecoError before any work when a job's folder is another job's
     or Ray is not there, and KeyboardInterrupt saying which job was stopped.
     """
-    check_workers(workers)
+    check_workers(workers, _device_of(jobs))
     report = progress or (lambda news: None)
     for job in jobs:
         job.check()
@@ -68,31 +72,58 @@ def threads_per_worker(workers: int, cores: int | None = None) -> int:
     return max(1, (cores or usable_cores()) // workers)
 
 
-def check_workers(workers: int) -> None:
-    """Raises NeecoError for fewer than one, or for several where Ray cannot be had."""
+def check_workers(workers: int, device: torch.device) -> None:
+    """Raises NeecoError for fewer than one, for several where Ray cannot be had, or for more than have a GPU of this
+    machine each, where `device` is one."""
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
     if workers > 1:
         require_ray()
+    if workers > 1 and device.type == "cuda" and not address():
+        if device.index is not None:
+            raise NeecoError(f"--device: {device}: of several --workers each has a GPU of its own; give --device cuda")
+        _check_gpus(workers, torch.cuda.device_count())
+
+
+def _check_gpus(workers: int, gpus: int) -> None:
+    """Each job has one to itself: two would share its memory and its time."""
+    if workers > gpus:
+        raise NeecoError(f"--workers: {workers} for {gpus} GPU(s); give at most {gpus}, or --device cpu")
 
 
 def _run_on_cluster(jobs: Sequence[Work], workers: int, report: Callable[[JobNews], None]) -> list[dict[str, Any]]:
     """`run_jobs` with `workers` jobs at once, each in a process of its own.
 
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
-    device is opened in its worker; jobs that name the same one share it.
+    device is opened in its worker, who sees one GPU, that no other has.
     """
     threads = threads_per_worker(workers)
     with joined(threads * workers) as ray:
-        return _run_remotely(ray, jobs, workers, threads, report)
+        gpus = _gpus(ray, jobs)
+        if gpus:
+            _check_gpus(workers, gpus)
+        return _run_remotely(ray, jobs, workers, (threads, min(gpus, 1)), report)
+
+
+def _gpus(ray: Any, jobs: Sequence[Work]) -> int:
+    """How many GPUs there are for jobs that compute on one; 0: they do not."""
+    if not jobs or jobs[0].device == "cpu" or (not address() and _device_of(jobs).type == "cpu"):
+        return 0
+    return int(ray.cluster_resources().get("GPU", 0))
+
+
+def _device_of(jobs: Sequence[Work]) -> torch.device:
+    """What their word means here; they share it."""
+    return device_of(jobs[0].device if jobs else "cpu", drawing=False)
 
 
 def _run_remotely(
-    ray: Any, jobs: Sequence[Work], workers: int, threads: int, report: Callable[[JobNews], None]
+    ray: Any, jobs: Sequence[Work], workers: int, share: tuple[int, int], report: Callable[[JobNews], None]
 ) -> list[dict[str, Any]]:
-    """Keep `workers` jobs going until all are done."""
+    """Keep `workers` jobs going until all are done; `share`: cores and GPUs of each."""
+    threads, gpus = share
     # a process serves one job: its peak memory is the job's own, and no thread setting outlives it
-    remote = ray.remote(num_cpus=threads, max_calls=1, max_retries=0)(_run_there)
+    remote = ray.remote(num_cpus=threads, num_gpus=gpus, max_calls=1, max_retries=0)(_run_there)
     results: list[dict[str, Any] | None] = [None] * len(jobs)
     waiting = list(range(len(jobs)))
     running: dict[Any, int] = {}
@@ -127,11 +158,13 @@ def _result(ray: Any, reference: Any, job: Work) -> dict[str, Any]:
 
 
 def _run_there(job: Work, threads: int) -> dict[str, Any]:
-    """In the worker: use no more threads than its share, then run the job."""
-    import torch
+    """In the worker: use no more than its share of cores and GPUs, then run the job."""
+    import ray
 
     from neeco.raster.threads import keep_freed_memory, set_threads
 
+    if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time
     set_threads(threads)
     torch.set_num_threads(threads)
     keep_freed_memory()

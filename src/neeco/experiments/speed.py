@@ -11,7 +11,6 @@ import torch
 
 from neeco.capture.model import Capture, Frame
 from neeco.experiments.machine import machine
-from neeco.raster.devices import device_of
 from neeco.raster.threads import synchronise
 from neeco.training.run import Run
 
@@ -21,23 +20,23 @@ DRAWS = 7  # timed per run and round
 PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer draws
 
 
-def devices() -> tuple[torch.device, ...]:
-    """Those that this machine can draw with at speed: its processor, and the CUDA device that `auto` means."""
-    return tuple(dict.fromkeys((torch.device("cpu"), device_of("auto"))))
-
-
 @torch.no_grad()
 def measure_speed(
-    runs: Sequence[tuple[str, int, Run]], capture: Capture, progress: Callable[[int, int], None] | None = None
+    runs: Sequence[tuple[str, int, Run]],
+    capture: Capture,
+    device: torch.device,
+    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Frames per second of every (name, seed, run) on each of `devices`, posing included, in one go. Moves the scenes.
+    """Frames per second of every (name, seed, run) on the processor and, if it is another, on `device`, posing
+    included, in one go. Moves the scenes.
 
     Returns {"rows": [{name, seed, method, backend, fps, milliseconds, draws, num_gaussians}], "image": [width, height],
     "frames": how many states were drawn in turn, "machine", "how"}. fps is 1 / the median.
     """
     frames = [frame for frame in capture.frames if frame.split != "train"] or list(capture.frames)
     report = progress or (lambda done, total: None)
-    cases = [(index, device) for device in devices() for index in range(len(runs))]
+    devices = dict.fromkeys((torch.device("cpu"), device))
+    cases = [(index, device) for device in devices for index in range(len(runs))]
     times: dict[tuple[int, torch.device], list[float]] = {case: [] for case in cases}
     for step in range(ROUNDS):
         for number, case in enumerate(cases):
@@ -50,7 +49,7 @@ def measure_speed(
         "rows": rows,
         "image": [camera.width, camera.height],
         "frames": len(frames),
-        "machine": machine(),
+        "machine": machine(device),
         "how": f"Posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
         f"run after up to {WARM_UP} to warm up",
     }

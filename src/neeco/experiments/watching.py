@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
+from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.experiments.machine import peak_memory_mb
-from neeco.files import read_json, write_json, write_text
+from neeco.files import read_json, read_text, require_like, write_json, write_text
 from neeco.labels.drawing import draw
 
 if TYPE_CHECKING:
@@ -30,14 +31,32 @@ CURVE_FRAMES = 4  # of each split, evenly spaced: the whole split is scored at t
 FIELD_MOMENTS = (0.1, 0.4, 1.0)  # a field takes seconds for a drawing
 FIELD_CURVE_FRAMES = 2
 CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "processor": time.process_time}
+ANEW = "give another --output, or remove that run's folder"
+TOTALS_LIKE = {"iteration": int, "seconds": float, "processor_seconds": float, "peak_memory_mb": (float, None)}
+CURVE_ROW = {
+    "iteration": int, "seconds": float, "processor_seconds": float, "progress": float, "split": str,
+    "psnr": (float, None),
+}  # fmt: skip
 TOTALS = {"wall": "seconds", "processor": "processor_seconds"}  # their names in files
 
 Row = dict[str, Any]
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a run's JSON-lines file; none where it ended before it wrote the first."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    """The rows of a run's JSON-lines file; none where it ended before it wrote the first. Raises NeecoError for a file
+    that is damaged."""
+    if not path.exists():
+        return []
+    like = CURVE_ROW if path.name == CURVE_FILE else {"iteration": int}
+    rows = []
+    for number, line in enumerate(read_text(path, "one JSON object per line").splitlines(), 1):
+        place = f"{path}: line {number}"
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            raise NeecoError(f"{place}: not valid JSON; {ANEW}") from None
+        rows.append(require_like(row, like, place, ANEW))
+    return rows
 
 
 class HeldOut:
@@ -79,7 +98,7 @@ class Watcher:
         self.due: list[float] = []
         self.started = False
         if (folder / BEGUN_FILE).exists():
-            stored = read_json(folder / BEGUN_FILE)
+            stored = require_like(read_json(folder / BEGUN_FILE), TOTALS_LIKE, str(folder / BEGUN_FILE), ANEW)
             self.totals = {key: stored[key] for key in self.totals}
         self.earlier_peak = self.totals["peak_memory_mb"]
         self.clocks = self._read_clocks()

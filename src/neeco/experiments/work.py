@@ -10,7 +10,8 @@ from typing import Any, Protocol
 
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.files import read_json, write_text
+from neeco.files import is_vacant, read_json, write_text
+from neeco.raster.devices import failures_told
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
 
@@ -26,6 +27,11 @@ class Work(Protocol):
     @property
     def folder(self) -> Path:
         """Where it writes."""
+        ...
+
+    @property
+    def device(self) -> str:
+        """A word for `device_of`."""
         ...
 
     @property
@@ -71,7 +77,7 @@ def check_output(output: Path, file: str, schema: str, capture: Path, noun: str,
     """
     if output.exists() and not output.is_dir():
         raise NeecoError(f"{output}: is a file; give another --output")
-    if not output.is_dir() or not any(output.iterdir()):
+    if is_vacant(output):
         return None
     if not (output / file).exists():
         raise NeecoError(f"{output}: not empty, and no {noun}; give another --output")
@@ -94,7 +100,8 @@ def attempt_job(job: Work, progress: JobProgress | None = None, capture: Capture
     folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
-        result = job.run(progress, capture)
+        with failures_told():
+            result = job.run(progress, capture)
     except NeecoError as error:
         return job.identity() | {"error": " ".join(str(error).split()), "splits": {}}
     except Exception as error:

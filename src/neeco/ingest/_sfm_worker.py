@@ -8,7 +8,9 @@ This module imports nothing of neeco.
 from __future__ import annotations
 
 import json
+import os
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -212,5 +214,16 @@ def build(job: dict[str, Any], work: Path) -> pycolmap.Reconstruction | None:
     return model
 
 
+def end_with_parent() -> None:
+    """End this process once the one that started it has gone and so closed our stdin, however it ended."""
+
+    def wait() -> None:
+        os.read(sys.stdin.fileno(), 1)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 if __name__ == "__main__":
+    end_with_parent()
     raise SystemExit(main(sys.argv[1]))

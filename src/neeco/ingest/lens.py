@@ -17,8 +17,7 @@ import yaml
 from neeco.capture.nodes import as_float
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json, read_text, require_file
-from neeco.ingest.sections import parse_yaml
+from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.raster.types import Camera
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
@@ -232,14 +231,14 @@ def _read_opencv_yaml(path: Path) -> Any:
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
-    return parse_yaml(path, "\n".join(lines), _Loader, "save the calibration again")
+    return parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
 
 
 def _first(document: dict[Any, Any], names: Sequence[str]) -> Any:
     return next((document[name] for name in names if document.get(name) is not None), None)
 
 
-def _numbers(path: Path, value: Any, field: str) -> list[Any]:
+def _numbers(path: Path, value: Any, field: str) -> list[float]:
     """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
     if isinstance(value, dict):
         value = value.get("data")
@@ -247,7 +246,11 @@ def _numbers(path: Path, value: Any, field: str) -> list[Any]:
         raise NeecoError(f"{path}: {field}: missing; expected it as OpenCV writes it")
     if not isinstance(value, list):
         raise NeecoError(f"{path}: {field}: expected numbers, found {shown(value)}; write it as OpenCV does")
-    flat: list[Any] = []
+    flat: list[float] = []
     for item in value:
-        flat.extend(item if isinstance(item, list) else [item])
+        for entry in item if isinstance(item, list) else [item]:
+            number = as_float(entry)
+            if number is None:
+                raise NeecoError(f"{path}: {field}: {shown(entry)} is not a usable number; write it as OpenCV does")
+            flat.append(number)
     return flat

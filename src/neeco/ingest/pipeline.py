@@ -41,11 +41,16 @@ MOST_FRAMES = 400  # kept unless the recording asks for another number
 SCENE_MM = 100.0  # from the cameras to the tissue, taken when nothing measures it
 
 
-def ingest(recording: Recording, output: Path, progress: StageProgress) -> IngestResult:
+def ingest(
+    recording: Recording,
+    output: Path,
+    progress: StageProgress,
+    complete: Callable[[IngestResult, Path], None] = lambda result, folder: None,
+) -> IngestResult:
     """Make the capture `output` from a recording and say how good it is.
 
-    Nothing appears at `output` before the capture is whole. Raises NeecoError for unusable input: file, row or key, and
-    what to do.
+    Nothing appears at `output` before the capture is whole: `complete` may add files to its `folder` before. Raises
+    NeecoError for unusable input: file, row or key, and what to do.
     """
     with staged(output) as folder:
         work = begin(recording, folder, progress)
@@ -72,7 +77,9 @@ def ingest(recording: Recording, output: Path, progress: StageProgress) -> Inges
         doubtful, shapes = _on_instruments(work, motion, sfm, pinhole, registration)
         sfm = motion.adjust(sfm, doubtful, progress)
         registration = _register(work, sfm)
-        return _finish(work, output, sfm, pinhole, registration, shapes, visible)
+        result = _finish(work, output, sfm, pinhole, registration, shapes, visible)
+        complete(result, folder / "capture")
+        return result
 
 
 def _read_lens(recording: Recording, size: tuple[int, int]) -> Lens | None:

@@ -12,9 +12,9 @@ import yaml
 from neeco.capture.nodes import as_float
 from neeco.capture.problems import shown
 from neeco.errors import NeecoError
-from neeco.files import read_json, read_text, require_file
+from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, parse_yaml, pose_columns
+from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, pose_columns
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 TRACKER_CLOCK = "em"
@@ -172,7 +172,7 @@ class _Loader(yaml.SafeLoader):
 def _load(path: Path) -> Any:
     missing = "no such file; `neeco ingest --init` writes one by looking at the files"
     text = read_text(path, "a recording as YAML", missing)
-    document = parse_yaml(path, text, _Loader, "repair it")
+    document = parse_yaml(path, text, "repair it", _Loader)
     if document is None:
         raise NeecoError(f"{path}: the file is empty; `neeco ingest --init` writes one by looking at the files")
     return document

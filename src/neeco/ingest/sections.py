@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from neeco.capture.nodes import Node
 from neeco.capture.problems import Refusal, shown
 from neeco.errors import NeecoError
@@ -24,17 +22,6 @@ def close_match(name: str, names: Iterable[str]) -> str | None:
     """The name that a misspelt one probably means."""
     matches = difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)
     return matches[0] if matches else None
-
-
-def parse_yaml(path: Path, text: str, loader: type[yaml.SafeLoader], remedy: str) -> Any:
-    """The document in a file's text. Raises NeecoError with the line where it is no YAML."""
-    try:
-        return yaml.load(text, Loader=loader)
-    except (yaml.YAMLError, ValueError, RecursionError, TypeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}: " if mark else ""
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())[:100]
-        raise NeecoError(f"{path}: {place}not valid YAML ({reason}); {remedy}") from None
 
 
 class Section:

@@ -136,7 +136,11 @@ def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
     with (
         log_file.open("w") as log,
         subprocess.Popen(
-            [sys.executable, str(WORKER), str(job_file)], stdout=subprocess.PIPE, stderr=log, text=True
+            [sys.executable, str(WORKER), str(job_file)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
         ) as process,
     ):
         try:

@@ -2,34 +2,59 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from neeco.errors import NeecoError
-from neeco.files import new_folder
+from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 
 
 @contextmanager
 def staged(output: Path) -> Iterator[Path]:
-    """A temporary folder beside `output`, on the same disk, gone afterwards whatever happens. What the block leaves in
-    its `capture` becomes `output`.
+    """A temporary folder beside `output`, on the same disk, gone afterwards whatever happens (after SIGKILL: when
+    the same `output` is asked for again). What the block leaves in its `capture` becomes `output`.
 
-    Raises NeecoError when something other than an empty folder is at `output`, and when the disk refuses.
+    Raises NeecoError when something other than an empty folder is at `output`, when another process is making it, and
+    when the disk refuses.
     """
-    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
-        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
     place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
-    with new_folder(place.parent):
-        folder = Path(tempfile.mkdtemp(prefix=f".{place.name[:80]}-", dir=place.parent))
-        try:
-            yield folder
-            _move(folder / "capture", place)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+    folder = place.parent / f"{TEMPORARY}{hashlib.sha256(os.fsencode(place.name)).hexdigest()[:12]}"
+    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
+        if folder.is_dir():  # of a process killed after its last step
+            with _emptied(folder, place):
+                pass
+        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
+    with new_folder(place.parent), _emptied(folder, place):
+        yield folder
+        _move(folder / "capture", place)
+
+
+@contextmanager
+def _emptied(folder: Path, place: Path) -> Iterator[None]:
+    """An empty folder of this process's own, gone afterwards, to make `place` in."""
+    try:
+        with own_folder(folder, place):
+            _clear(folder)
+            try:
+                yield
+            finally:
+                _clear(folder)
+    finally:
+        with suppress(OSError):  # another process's, or gone
+            folder.rmdir()
+
+
+def _clear(folder: Path) -> None:
+    """Remove what is in a folder, but not its lock."""
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        elif entry.name != LOCK:
+            entry.unlink()
 
 
 def _move(capture: Path, place: Path) -> None:

@@ -5,6 +5,7 @@ Occlusion by tissue and by other instruments is right by construction. The defau
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -84,7 +85,12 @@ class CompositedLabels:
         """[N] the instrument that holds most of a Gaussian, -1 when the tissue holds half of it or more."""
         return self._owners
 
-    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor, Tensor]:
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
         """One pass: colour and label channels together."""
-        rendering = rasterize(gaussians, camera, channels=self.channels)
-        return rendering, *composited_labels(rendering, self.threshold)
+        channels = self.channels if made_up is None else torch.cat([self.channels, made_up[:, None]], 1)
+        rendering = rasterize(gaussians, camera, channels=channels)
+        assert rendering.channels is not None
+        labels = replace(rendering, channels=rendering.channels[..., : len(self.names)])
+        return rendering, *composited_labels(labels, self.threshold)

@@ -55,7 +55,7 @@ class LayeredDrawing(Drawing):
     tissue_depth: np.ndarray  # of the tissue drawn alone
     tissue_image: Tensor | None  # [H, W, 3] in [0, 1], the same, where it was asked for
     alone: dict[str, Alone]  # by instrument
-    made_up: Tensor  # [H, W] in [0, 1]: how much of a pixel is tissue that no training frame saw
+    made_up: Tensor  # [H, W] in [0, 1]: how much of a pixel no training frame saw, or not from about there
 
     @property
     def ignored(self) -> Tensor:
@@ -74,8 +74,11 @@ class Labeller(Protocol):
         """[N] int64: index of each Gaussian's instrument in `instruments_of(names)`, -1 for tissue."""
         ...
 
-    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor, Tensor]:
-        """The whole scene drawn, its part ids [H, W] uint8, and how much of each pixel is instrument [H, W]."""
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
+        """The whole scene drawn, its part ids [H, W] uint8, and how much of each pixel is instrument [H, W]. Where
+        `made_up` [N] is given, the rendering's last channel is that."""
         ...
 
 
@@ -99,7 +102,9 @@ def draw_layers(
     gaussians = scene.at(state)
     learned_camera = scene.camera(camera)
     owners = labeller.owners(state, gaussians)
-    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners)
+    made_up = scene.made_up(gaussians, learned_camera)
+    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, made_up)
+    assert rendering.channels is not None
     parts, share = _without_speckle(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, speckle)
     bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)  # colour takes time, and depth knows none
     alone = {}
@@ -109,8 +114,7 @@ def draw_layers(
             alone[name] = Alone((single.alpha > threshold_of(scene)).cpu().numpy(), surface_depth(single))
     behind = owners < 0
     looked_at = gaussians if tissue_image else bare
-    tissue = rasterize(looked_at.select(behind), learned_camera, channels=scene.made_up[behind][:, None])
-    assert tissue.channels is not None
+    tissue = rasterize(looked_at.select(behind), learned_camera)
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
         parts=parts,
@@ -121,7 +125,7 @@ def draw_layers(
         tissue_depth=surface_depth(tissue),
         tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
         alone=alone,
-        made_up=tissue.channels[..., 0].cpu() * (1 - share),
+        made_up=rendering.channels[..., -1].cpu(),
     )
 
 

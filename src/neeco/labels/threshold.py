@@ -73,7 +73,9 @@ class ThresholdLabels:
         )
         return torch.where(moved, torch.cdist(means, origins).argmin(dim=1), -1)
 
-    def draw(self, gaussians: Gaussians, camera: Camera, owners: Tensor) -> tuple[Rendering, Tensor, Tensor]:
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
         """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
@@ -81,7 +83,8 @@ class ThresholdLabels:
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
         lit = alone.color.norm(dim=2) > self.black
-        return rasterize(gaussians, camera), torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
+        rendering = rasterize(gaussians, camera, channels=None if made_up is None else made_up[:, None])
+        return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
 
 
 @torch.no_grad()

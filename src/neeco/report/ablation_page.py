@@ -10,6 +10,7 @@ from neeco.experiments.ablation_results import EVEN_DB, primary_split
 from neeco.experiments.ablation_tables import agreement, csv_text, grid
 from neeco.experiments.ablations import ABLATIONS
 from neeco.experiments.families import NEECO_RUNS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.machine import hardware_words
 from neeco.experiments.tables import csv_text as csv_of
 from neeco.report.charts import Series, legend, line_chart
 from neeco.report.render import REPORT_FILE, write_page
@@ -29,6 +30,7 @@ def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
         name=name,
         subtitle="ablations",
         steps=steps + f", seed {ablation['seed']}",
+        hardware=hardware_words(ablation["machine"]),
         settings=", ".join(ablation["settings"]),
         scaled=NEECO_RUNS.method in ablation["iterations"],
         published=f"{PUBLISHED_STEPS:,}",

@@ -24,6 +24,7 @@ from neeco.experiments.downstream.results import (
     verdict,
 )
 from neeco.experiments.downstream.tables import KEYS, budget_words, data_files, summary_csv, tables_of
+from neeco.experiments.machine import hardware_words
 from neeco.experiments.tables import Table, csv_text
 from neeco.files import write_text
 from neeco.report.downstream_figures import (
@@ -249,9 +250,8 @@ def machine_words(experiment: Experiment) -> str:
     machine = experiment["machine"]
     threads = machine["threads_per_worker"] or machine["torch_threads"]
     workers = f", {machine['workers']} trainings at once" if machine["workers"] > 1 else ""
-    gpu = f"{machine['gpu']}, " if machine["gpu"] and experiment["teaching"]["device"] != "cpu" else ""
-    told = f"{machine['cpu']}, {machine['cores']} cores, {threads} thread{'s' if threads > 1 else ''}"
-    return f"{gpu}{told}{workers}, torch {machine['torch']}"
+    told = f"{hardware_words(machine)}, {threads} thread{'s' if threads > 1 else ''}"
+    return f"{told}{workers}, torch {machine['torch']}"
 
 
 def command_of(experiment: Experiment) -> str:

@@ -49,8 +49,8 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
     write_page(
         path,
         "ingest.html",
-        title=f"{capture.root.name}: ingest",
-        name=capture.root.name,
+        title=f"{result.capture.name}: ingest",
+        name=result.capture.name,
         subtitle=f"from {result.recording}",
         stamps=[result.capture],
         result=result,

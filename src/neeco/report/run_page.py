@@ -56,12 +56,13 @@ def write_report(
     scene: Drawable,
     *,
     synthesis_preview: Path | None = None,
+    playable: str | None = None,
 ) -> Path:
     """Write `report.html` into the run folder and return its path. One file: style, pictures and curves are inside it.
 
-    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. How many threads
-    torch takes is the caller's to set (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot
-    be written.
+    evaluation: what `evaluate_run` returned. synthesis_preview: an image of synthesised data to show. playable: a page
+    of its own that draws the scene, shown in a frame of this one. How many threads torch takes is the caller's to set
+    (`open_run`). Raises NeecoError when a picture cannot be read or the page cannot be written.
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
@@ -90,6 +91,7 @@ def write_report(
         curves=_curves(rows),
         **_diagnostics(getattr(scene, "diagnostics", {})),
         preview=synthesis_preview and file_uri(synthesis_preview),
+        playable=playable,
         facts=_facts(capture, scene, rows),
         config=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
     )
@@ -208,7 +210,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(row, dict) and isinstance(row.get("iteration"), int | float):
             rows.append(row)

@@ -27,6 +27,7 @@ CROSSING = 5  # px nearer than that: instruments are taken to be in each other
 MOST_MADE_UP = 0.25  # of an image's pixels
 LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
 UNSEEN = "stands before tissue that no frame saw"
+UNSEEN_SIDE = "shows sides that no frame saw"
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,13 @@ class Acceptance:
 
     min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
     lie behind the tissue surface, as this camera sees it (see `buried_depth`); None asks nothing. A single view cannot
-    tell "inside the tissue" from "behind a fold of it": both are refused. casts: instruments that were recorded
-    together, which alone may touch; empty: all were.
+    tell "inside the tissue" from "behind a fold of it": both are refused. max_unseen: share of the instruments' pixels
+    that may be mostly made up. casts: instruments that were recorded together, which alone may touch; empty: all were.
     """
 
     min_share: float
     tolerance_mm: float | None
+    max_unseen: float = 1.0
     casts: tuple[frozenset[str], ...] = ()
 
     def why_refused(self, scene: Scene, drawing: LayeredDrawing) -> str | None:
@@ -53,8 +55,11 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        if float((drawing.made_up > MOSTLY).float().mean()) > MOST_MADE_UP:
+        made_up = drawing.made_up > MOSTLY
+        if float(made_up.float().mean()) > MOST_MADE_UP:
             return UNSEEN
+        if float(made_up[drawing.parts > 0].float().mean()) > self.max_unseen:
+            return UNSEEN_SIDE
         if any(_crossing(drawing, a, b) for a, b in combinations(self.casts, 2)):
             return ENTERS_ANOTHER
         return None

@@ -12,25 +12,26 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
-from neeco.files import new_folder, write_json
+from neeco.files import own_folder, write_json
 from neeco.labels.annotation import annotate
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.indexes import INFO, check_output, description, drawn, keeping, write_indexes
 from neeco.synthesis.settings import MIN_TRUST, Format, Settings
-from neeco.synthesis.trust import Usual, judge, usual_errors
-from neeco.synthesis.writers.folder import Record, load_record, remove_leftovers, write_sample, write_skipped
+from neeco.synthesis.trust import Trust, Usual, judge, usual_errors
+from neeco.synthesis.writers.folder import Record, load_record, write_sample, write_skipped
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
     from neeco.training.run import Run
 
 LOOKED_AT = 16  # frames trained on that say how well pixels are usually explained
-STEPS = (2, 2, 1)  # of the fit at its three resolutions: a neighbour's fit is the start
+FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # its fit is near: no coarse look for the place
 NOT_TRUSTED = "not trusted"
 
 
@@ -75,13 +76,12 @@ def annotate_capture(
     capture = trained_on if capture is None else capture
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
+    settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
     write = partial(write_indexes, output, info=info, scene=scene, labeller=labeller, formats=formats)
-    with new_folder(output):
-        if begun:
-            remove_leftovers(output)
+    with own_folder(output):
         with keeping(output, len(capture.frames), begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
             usual = usual_of(scene, labeller, trained_on)
@@ -121,9 +121,11 @@ class _Annotator:
             yield index, record
 
     def _one(self, index: int, frame: Frame, start: Tensor | None) -> Record:
-        photograph, mask = frame.load_image(), frame.load_mask()
-        fit, drawing = fitted(self.scene, self.labeller, frame, photograph, start)
-        trust = judge(drawing, photograph, mask, self.usual)
+        photograph = frame.load_image()
+        fit, drawing, trust = self._fitted(frame, photograph, start)
+        if start is not None and trust.value < self.min_trust:  # the neighbour's may have led astray
+            again = self._fitted(frame, photograph, None)
+            fit, drawing, trust = max((again, (fit, drawing, trust)), key=lambda found: found[2].value)
         facts: dict[str, Any] = {
             "frame": frame.name,
             "recorded_split": frame.split,
@@ -137,13 +139,17 @@ class _Annotator:
             return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
         return write_sample(self.output, index, replace(drawing, image=photograph), labels, {}, facts)
 
+    def _fitted(self, frame: Frame, photograph: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
+        fit, drawing = fitted(self.scene, self.labeller, frame, photograph, start)
+        return fit, drawing, judge(drawing, photograph, frame.load_mask(), self.usual)
+
 
 def fitted(
     scene: Scene, labeller: CompositedLabels, frame: Frame, photograph: Tensor, start: Tensor | None
 ) -> tuple[Fit, LayeredDrawing]:
     """The poses of `frame` fitted to its photograph [H, W, 3], and what the scene draws there; `start`: a neighbour's
-    increments."""
-    fit = fit_frame(scene, frame, photograph, start, AlignConfig(steps=STEPS))
+    increments, without which it is looked for from afar."""
+    fit = fit_frame(scene, frame, photograph, start, None if start is None else FROM_NEIGHBOUR)
     return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.speckle, tissue_image=True)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from neeco.cluster import joined
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
+from neeco.raster.devices import failures_told
 from neeco.synthesis.making import Maker
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
@@ -109,8 +110,8 @@ def _kept(output: Path, record: Record, files: Mapping[str, bytes]) -> Record:
 def _make_there(parcel: Parcel, indices: tuple[int, ...]) -> Made | str:
     """In the worker: the images, or in a line what is wrong."""
     try:
-        maker = _maker(parcel)
-        with tempfile.TemporaryDirectory() as folder:
+        with failures_told(), tempfile.TemporaryDirectory() as folder:
+            maker = _maker(parcel)
             made = []
             for index in indices:
                 maker.make(Path(folder), index)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from neeco import cluster
 from neeco.errors import NeecoError
-from neeco.files import new_folder, write_json
+from neeco.files import own_folder, write_json
 from neeco.raster.threads import threads
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE, UNSEEN
@@ -34,7 +34,7 @@ from neeco.synthesis.settings import Format, Settings
 from neeco.synthesis.source import VERB, Source
 from neeco.synthesis.views import SIMILAR
 from neeco.synthesis.workers import make_in_processes
-from neeco.synthesis.writers.folder import Record, load_record, record_path, remove_leftovers
+from neeco.synthesis.writers.folder import Record, load_record, record_path
 
 if TYPE_CHECKING:
     from neeco.training.run import Run
@@ -102,9 +102,7 @@ def synthesize(
     if maker.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in maker.gains]
     write = partial(write_indexes, output, info=info, scene=maker.scene, labeller=maker.labeller, formats=formats)
-    with new_folder(output):
-        if begun:
-            remove_leftovers(output)
+    with own_folder(output):
         with keeping(output, settings.count, begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
             records = {k: record for k in range(settings.count) if begun and (record := load_record(output, k))}

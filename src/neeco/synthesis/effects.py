@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from numpy.random import Generator
 
+from neeco.capture.nodes import as_float
 from neeco.errors import NeecoError
-from neeco.files import read_text
+from neeco.files import parse_yaml, read_text
 
 SoftMasks = Literal["mid", "mean"]
 SOFT_MASKS = "soft_masks"
@@ -88,10 +88,7 @@ def read_effects(path: Path) -> CameraEffects:
     """Read an effects file: YAML, a line per effect, each a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}.
     Raises NeecoError naming file and field."""
     text = read_text(path, "a YAML file of camera effects; docs/synthesis.md shows one")
-    try:
-        given = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise NeecoError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    given = parse_yaml(path, text, "repair it")
     if not isinstance(given, dict) or not given:
         raise NeecoError(f"{path}: names no effect; give some of {', '.join(EFFECTS)}")
     soft = given.pop(SOFT_MASKS, "mid")
@@ -110,18 +107,15 @@ def _range(value: Any, effect: Effect, where: str) -> Range:
             raise NeecoError(f"{where}: give a number, [LOW, HIGH], or {{range: [LOW, HIGH], share: S}}")
         value, share = value["range"], value.get("share", 1.0)
     ends = value if isinstance(value, list) else [value, value]
-    if len(ends) != 2 or not all(_is_number(number) for number in (*ends, share)):
+    numbers = [number for number in map(as_float, (*ends, share)) if number is not None]
+    if len(ends) != 2 or len(numbers) != 3:
         raise NeecoError(f"{where}: {value!r} is no range; give a number or [LOW, HIGH]")
-    low, high = map(float, ends)
+    low, high, share = numbers
     if not effect.lowest <= low <= high <= effect.highest:
         raise NeecoError(
             f"{where}: {value} is out of range; give LOW <= HIGH within {effect.lowest:g} to {effect.highest:g} "
             f"({effect.meaning})"
         )
     if not 0 <= share <= 1:
-        raise NeecoError(f"{where}: share: {share} is not a share of the images; give 0 to 1")
-    return Range(low, high, float(share))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+        raise NeecoError(f"{where}: share: {share:g} is not a share of the images; give 0 to 1")
+    return Range(low, high, share)

@@ -15,7 +15,7 @@ import torch
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.files import read_json, write_json
+from neeco.files import is_vacant, read_json, write_json
 from neeco.labels.annotation import KEYPOINTS
 from neeco.labels.composited import CLEAR_SHARES, instruments_of
 from neeco.labels.drawing import Labeller
@@ -77,7 +77,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
     if output.exists() and not output.is_dir():
         raise NeecoError(f"{output}: is a file; give a folder")
-    if not output.exists() or not any(output.iterdir()):
+    if is_vacant(output):
         return False
     if not resume:
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")

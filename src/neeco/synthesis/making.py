@@ -138,10 +138,10 @@ def make_labeller(scene: Scene, settings: Settings) -> Labeller:
 
 def make_acceptance(scene: Scene, labeller: Labeller, settings: Settings) -> Acceptance:
     """What the settings ask of a drawn state; the tolerance is found from the recording where it is not given."""
-    if not settings.tissue_check:
-        return Acceptance(settings.min_share, None)
     tolerance = settings.tissue_tolerance_mm
-    return Acceptance(settings.min_share, find_tolerance(scene, labeller) if tolerance is None else tolerance)
+    if tolerance is None and settings.tissue_check:
+        tolerance = find_tolerance(scene, labeller)
+    return Acceptance(settings.min_share, tolerance if settings.tissue_check else None, settings.max_unseen)
 
 
 def _motion(scene: Scene, casts: Sequence[Scene], settings: Settings) -> RecordedMotion | MixedMotion:

@@ -23,14 +23,14 @@ from neeco.evaluation.resize import resize_camera
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project
-from neeco.raster.sh import SH_C0
+from neeco.raster.sh import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.hinges import PART_LOGITS
 from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP
 from neeco.scene.scene import Scene
+from neeco.scene.seen import SEEN
 from neeco.synthesis.acceptance import ends_or_origins
 from neeco.synthesis.samplers import make_sampler
 
@@ -217,20 +217,19 @@ def _kinematic(scene: Scene) -> Kinematic:
 
 
 def _body(scene: Scene, index: int, columns: int) -> CanonicalGaussians:
-    """One body alone, with as many part logits as the mixed scene has, and what of the tissue is made up."""
+    """One body alone, with as many part logits as the mixed scene has, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
     logits = canonical.extras[PART_LOGITS][rows]
-    made_up = scene.made_up[rows]
+    seen = scene.seen()[rows]
     padded = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
-    alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (made_up.shape[0],))
-    return alone.with_extras(**{PART_LOGITS: padded, MADE_UP: made_up})
+    alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
+    return alone.with_extras(**{PART_LOGITS: padded, SEEN: seen})
 
 
 def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:
     """The same Gaussians, their colours multiplied."""
     factor = body.sh_dc.new_tensor(gain)
-    dc = body.sh_dc * factor + (factor - 1) * (0.5 / SH_C0)
-    return dataclasses.replace(body, sh_dc=dc, sh_rest=body.sh_rest * factor)
+    return dataclasses.replace(body, sh_dc=brightened(body.sh_dc, factor), sh_rest=body.sh_rest * factor)
 
 
 def _gain(tissue: Scene, cast: Scene) -> tuple[float, float, float]:

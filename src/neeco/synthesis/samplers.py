@@ -14,6 +14,7 @@ from numpy.random import Generator
 from neeco.capture.model import State
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
+from neeco.files import read_bytes
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
@@ -105,14 +106,8 @@ def states_fingerprint(states: str) -> str | None:
     if states in SAMPLERS:
         return None
     path = states_file(states)
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except FileNotFoundError:
-        raise NeecoError(
-            f"{path}: no such file; --states takes inside, beyond, grid, path:FILE.jsonl or FILE.jsonl"
-        ) from None
-    except OSError as error:
-        raise NeecoError(f"{path}: cannot read: {error.strerror or error}") from error
+    missing = "no such file; --states takes inside, beyond, grid, path:FILE.jsonl or FILE.jsonl"
+    return hashlib.sha256(read_bytes(path, "a file of states", missing)).hexdigest()
 
 
 @torch.no_grad()

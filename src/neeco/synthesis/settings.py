@@ -44,6 +44,8 @@ class Settings:
     """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
     min_share: float = 0.005
     """Refuse images with less than this share of instrument pixels."""
+    max_unseen: float = 0.25
+    """Refuse images in which more of the instruments' pixels than this share shows what no training frame saw."""
     camera_effects: str | None = None
     """YAML file of blur, noise, smoke and the like, and the ranges they are drawn from (docs/synthesis.md)."""
     tries: int = 50
@@ -61,6 +63,8 @@ class Settings:
             raise NeecoError(f"--label-threshold: {self.label_threshold} is not between 0 and 1")
         if self.tissue_tolerance_mm is not None and not self.tissue_tolerance_mm >= 0:
             raise NeecoError(f"--tissue-tolerance-mm: {self.tissue_tolerance_mm} is negative; give 0 or more")
+        if not 0 <= self.max_unseen <= 1:
+            raise NeecoError(f"--max-unseen: {self.max_unseen} is not a share; give 0 to 1")
         if not 0 <= self.speckle < 1:
             raise NeecoError(f"--speckle: {self.speckle} is not a share; give 0 or more and less than 1")
 

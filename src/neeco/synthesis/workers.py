@@ -10,6 +10,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from neeco.errors import NeecoError
+from neeco.raster.devices import failures_told
 from neeco.synthesis.source import Source
 from neeco.synthesis.writers.folder import Record
 
@@ -126,13 +128,23 @@ def _work(source: Source, output: Path, threads: int, line: Connection) -> None:
     Ctrl-C reaches the whole group of processes: the one that was started decides.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        maker = source.maker(threads)
-        with contextlib.suppress(EOFError):
-            while True:
-                for index in line.recv():
-                    line.send(maker.make(output, index))
+        with failures_told():
+            maker = source.maker(threads)
+            with contextlib.suppress(EOFError):
+                while True:
+                    for index in line.recv():
+                        line.send(maker.make(output, index))
     except NeecoError as error:
         line.send(str(error))
     except BrokenPipeError:
         os._exit(1)  # nobody listens any more
+
+
+def _end_with_parent() -> None:
+    """In the worker: end at once when the process that hired it was killed, lest it write beside the next one."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

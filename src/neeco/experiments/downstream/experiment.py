@@ -22,7 +22,8 @@ from neeco.experiments.downstream.samples import (
 from neeco.experiments.machine import machine
 from neeco.experiments.running import run_jobs, threads_per_worker
 from neeco.experiments.work import JobNews
-from neeco.files import new_folder, read_json, write_json
+from neeco.files import own_folder, read_json, write_json
+from neeco.raster.devices import device_of
 
 
 def run_downstream(plan: DownstreamPlan, news: Callable[[JobNews], None] | None = None) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def run_downstream(plan: DownstreamPlan, news: Callable[[JobNews], None] | None 
     labelled frames or folds, it adds them. A job that fails is told in its place.
     """
     output = plan.spec.output
-    with new_folder(output):
+    with own_folder(output):
         finished: dict[int, dict[str, Any]] = {}
         for index, job in enumerate(plan.jobs):
             if (file := job.folder / JOB_FILE).exists():
@@ -74,7 +75,7 @@ def document(plan: DownstreamPlan, results: Sequence[dict[str, Any]]) -> dict[st
         "version": __version__,
         "complete": False,
         "capture": str(teaching.capture.absolute()),
-        "machine": machine()
+        "machine": machine(device_of(teaching.device, drawing=False))
         | {
             "workers": spec.workers,
             "threads_per_worker": threads_per_worker(spec.workers) if spec.workers > 1 else None,

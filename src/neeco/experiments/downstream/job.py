@@ -97,6 +97,11 @@ class DownstreamJob:
         return self.teaching.capture
 
     @property
+    def device(self) -> str:
+        """A word for `device_of`."""
+        return self.teaching.device
+
+    @property
     def title(self) -> str:
         """Model, condition, labelled frames and fold, as a person reads them."""
         labelled = f", {self.real} labelled" if self.condition.real else ""

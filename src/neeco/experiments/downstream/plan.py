@@ -68,9 +68,8 @@ def plan_downstream(spec: DownstreamSpec) -> DownstreamPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be taught or tested."""
     if spec.folds < 1:
         raise NeecoError(f"--folds: {spec.folds} is none at all; give at least 1")
-    check_workers(spec.workers)
+    check_workers(spec.workers, device_of(spec.teaching.device, drawing=False))
     _check_models(spec)
-    device_of(spec.teaching.device, drawing=False)
     conditions = _conditions(spec)
     capture = read_checked(spec.teaching.capture, spec.teaching.transforms)
     teaching = replace(spec.teaching, splits=_splits(capture, spec.teaching.splits))

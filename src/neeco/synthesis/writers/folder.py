@@ -6,6 +6,7 @@ A record says everything about its image and is written last, so an image withou
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -18,7 +19,8 @@ import torch
 
 from neeco.capture.images import write_image, write_labels, write_png
 from neeco.capture.statefile import camera_to_json, state_to_json
-from neeco.files import write_atomically, write_text
+from neeco.errors import NeecoError
+from neeco.files import read_text, write_atomically, write_text
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 
@@ -28,6 +30,7 @@ DEPTH_MM_PER_COUNT = 0.05
 SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
+SEAL = "sha256"  # of the rest of a record
 PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
 MOST_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
 FOLDERS = (*PIXELS, RECORDS)
@@ -100,7 +103,11 @@ def write_skipped(
 
 
 def _write_record(root: Path, record: Record) -> None:
-    write_text(record_path(root, record["index"]), json.dumps(record, allow_nan=False))
+    write_text(record_path(root, record["index"]), json.dumps(record | {SEAL: _digest(record)}, allow_nan=False))
+
+
+def _digest(record: Record) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def record_path(root: Path, index: int) -> Path:
@@ -109,15 +116,17 @@ def record_path(root: Path, index: int) -> Path:
 
 
 def load_record(root: Path, index: int) -> Record | None:
-    """The record of image `index` when it and all its files are there and whole, else None.
+    """The record of image `index` when it is as it was written and all its files are there and whole, else None.
 
-    The record of a version that wrote fewer files is not whole: its image is to be drawn again.
+    The record of a version that wrote less is not whole: its image is to be drawn again.
     """
     try:
-        record = json.loads(record_path(root, index).read_text(encoding="utf-8"))
+        record = json.loads(read_text(record_path(root, index), "the record of an image"))
+        if record.pop(SEAL, None) != _digest(record):
+            return None
         files = () if record.get("skipped") else files_of(index)
         sizes = {name: (root / name).stat().st_size for name in files}
-    except (OSError, ValueError, AttributeError):
+    except (NeecoError, OSError, ValueError, AttributeError, TypeError, RecursionError):
         return None
     return record if sizes == record.get("files") and record.get("index") == index else None
 
@@ -143,14 +152,6 @@ def link(source: Path, target: Path) -> None:
 def files_of(index: int) -> list[str]:
     """The files of image `index` beside its record, relative to the data set."""
     return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
-
-
-def remove_leftovers(root: Path) -> None:
-    """Delete the half-written files that a killed run left behind (their names start with a dot)."""
-    for folder in FOLDERS:
-        for path in (root / folder).glob(".*"):
-            if path.is_file():
-                path.unlink()
 
 
 def write_depth(path: Path, depth: np.ndarray) -> None:

@@ -1,0 +1,101 @@
+"""What `faults.py` disturbs: verbs on small data, with still clocks, and structure from motion that answers at once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+from forked import TESTS, Child, hasten_ingest, module_at
+
+STEPS = 40
+FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A command on small data. `shelf`: the folder that its output lies in; `touched`: a file of its capture."""
+
+    name: str
+    words: tuple[str, ...]
+    shelf: Path
+    touched: Path | None = None
+    resume: tuple[str, ...] = ()
+    workers: bool = False
+
+    @property
+    def output(self) -> Path:
+        return self.shelf / "out"
+
+
+def still_the_clocks() -> None:
+    """Nothing that is written depends on how long anything took, or when it was done."""
+    from datetime import UTC, datetime
+
+    from neeco.evaluation import evaluate
+    from neeco.experiments import jobs, speed, watching
+    from neeco.report import render
+    from neeco.training import train
+
+    ticks = iter(range(10**12))
+    ticking = SimpleNamespace(perf_counter=lambda: next(ticks) / 1024)  # differences are exact
+    evaluate.time = speed.time = ticking  # type: ignore[assignment]
+    watching.CLOCKS.update(wall=lambda: 0.0, processor=lambda: 0.0)
+    watching.peak_memory_mb = lambda: 1.0
+    assert jobs.CLOCKS is watching.CLOCKS
+    train.train.__kwdefaults__["clock"] = lambda: 0.0
+    render.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def prepare() -> None:
+    """Import what the verbs need, and make their intervals fit runs of some dozen steps."""
+    import torch
+
+    from neeco.training import train
+
+    torch.set_num_threads(1)
+    train.ROW_INTERVAL, train.CHECKPOINT_INTERVAL = 5, 20
+    hasten_ingest()
+    still_the_clocks()
+
+
+def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
+    """The commands, and what they read."""
+    capture = module_at(TESTS / "training" / "capture_files.py").write_grasper(
+        work / "capture", frames=8, sizes=((32, 24),)
+    )
+    run = work / "run"
+    settings = ("--iterations", str(STEPS), "--set", "density_start=10", "--set", "tissue_budget=200")
+    train = ("train", str(capture), *settings)
+    if {"synthesize", "annotate", "workers"} & set(names):
+        ended = Child((*train, "--output", str(run)), work).wait()
+        assert ended.status == 0, ended.told
+    recording = work / "recording"
+    recording.mkdir()
+    world = sys.modules["ingest_world"]
+    world.Recorded(world.World(recording)).write()
+    image = capture / "images" / "000003.png"
+
+    def verb(name: str, *words: str, **more: object) -> Verb:
+        shelf = work / f"shelf-{name}"
+        shelf.mkdir()
+        return Verb(name, (*words, "--output", str(shelf / "out")), shelf, **more)  # type: ignore[arg-type]
+
+    draw = ("synthesize", str(run), "--no-tissue-check", "--min-share", "0", "--max-unseen", "1", "--count")
+    made = {
+        "train": lambda: verb("train", *train, touched=image, resume=("--resume",)),
+        "synthesize": lambda: verb(
+            "synthesize", *draw, "8", "--formats", *FORMATS, touched=run / "scene.safetensors", resume=("--resume",)
+        ),
+        "workers": lambda: verb("workers", *draw, "10", "--workers", "2", resume=("--resume",), workers=True),
+        "annotate": lambda: verb(
+            "annotate", "annotate", str(run), "--min-trust", "0", touched=image, resume=("--resume",)
+        ),
+        "compare": lambda: verb(
+            "compare", "compare", str(capture), "--methods", "3dgs", "kinematic", *settings[:2], touched=image
+        ),
+        "ingest": lambda: verb("ingest", "ingest", str(recording / "recording.yaml")),
+    }
+    return [made[name]() for name in names]

@@ -1,0 +1,156 @@
+"""Files appear whole or not at all, one process at a time; what others wrote is read with measure."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from neeco.errors import NeecoError
+from neeco.files import (
+    LOCK,
+    MOST_VALUES,
+    TEMPORARY,
+    is_vacant,
+    own_folder,
+    parse_yaml,
+    read_json,
+    require_like,
+    write_atomically,
+)
+
+HOLD = """\
+import sys, time
+from neeco.files import own_folder
+with own_folder(sys.argv[1]):
+    print(flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_folder_is_one_process_at_a_time(tmp_path: Path) -> None:
+    place = tmp_path / "deep" / "out"
+    with own_folder(place):
+        with pytest.raises(NeecoError, match="out: another neeco process is writing there; wait for its end"):
+            own_folder(place).__enter__()
+        (place / "file").touch()
+    assert [path.name for path in place.iterdir()] == ["file"]
+    with own_folder(place):
+        pass
+
+
+def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        with pytest.raises(NeecoError, match="another neeco process"):
+            own_folder(tmp_path).__enter__()
+        process.send_signal(signal.SIGKILL)
+    of_another = f"{TEMPORARY}folder"  # say, an ingest's
+    (tmp_path / "deep" / of_another).mkdir(parents=True)
+    half = (f"{TEMPORARY}a.png", f"deep/{TEMPORARY}b.json")
+    whole = (f"deep/{of_another}/{TEMPORARY}c", "deep/whole", ".own")
+    for name in (*half, *whole):
+        (tmp_path / name).write_text("x")
+    assert (tmp_path / LOCK).exists()
+    with own_folder(tmp_path):
+        left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+        assert left == {*whole, LOCK}
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_a_folder_with_nothing_whole_in_it_is_vacant(tmp_path: Path) -> None:
+    assert is_vacant(tmp_path / "absent")
+    (tmp_path / LOCK).touch()
+    (tmp_path / f"{TEMPORARY}abc.yaml").touch()
+    assert is_vacant(tmp_path)
+    (tmp_path / "whole").touch()
+    assert not is_vacant(tmp_path)
+
+
+def test_a_refused_folder_that_was_made_for_it_goes_again(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), own_folder(tmp_path / "a" / "b"):
+        raise ZeroDivisionError
+    assert not (tmp_path / "a").exists()
+
+
+def test_half_a_file_is_known_by_its_name(tmp_path: Path) -> None:
+    def look(temporary: Path) -> None:
+        assert temporary.name.startswith(TEMPORARY)
+        assert temporary.suffix == ".png"
+        temporary.write_text("x")
+
+    write_atomically(tmp_path / "image.png", look)
+    assert os.listdir(tmp_path) == ["image.png"]
+
+
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{after}: &{after} [{','.join([f'*{before}'] * 10)}]\n"
+    for before, after in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (BOMB, "its aliases unfold without measure"),
+        ("&a [*a]", "its aliases unfold without measure"),
+        ("[" * 5000, "its nesting is beyond all measure"),
+        ("a: 2020-13-45", "not valid YAML"),
+        ("a: !!float x", "not valid YAML"),
+        ("a: !!timestamp x", "not valid YAML"),
+        ("!!python/object/apply:os.system ['true']", "line 1: not valid YAML"),
+    ],
+)
+def test_yaml_without_measure_is_refused_in_one_line(text: str, told: str, tmp_path: Path) -> None:
+    began = time.process_time()
+    with pytest.raises(NeecoError, match=rf"^file.yaml: .*{told}") as error:
+        parse_yaml(Path("file.yaml"), text, "repair it")
+    assert "\n" not in str(error.value)
+    assert time.process_time() - began < 5
+
+
+def test_aliases_within_measure_are_read() -> None:
+    assert parse_yaml(Path("x"), "a: &a [1, 2]\nb: *a", "") == {"a": [1, 2], "b": [1, 2]}
+    assert MOST_VALUES > 100_000
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' + "9" * 10_000 + "}"])
+def test_json_without_measure_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(NeecoError, match=r"a.json: not usable JSON: a number or the nesting is beyond all measure"):
+        read_json(tmp_path / "a.json")
+
+
+def test_a_pipe_is_no_json(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.json")
+    with pytest.raises(NeecoError, match=r"a.json: is not a file; expected JSON"):
+        read_json(tmp_path / "a.json")
+
+
+LIKE = {"name": str, "splits": {str: {"psnr": (float, None)}}, "rows": [int]}
+GOOD = {"name": "x", "splits": {"test": {"psnr": None}, "seen": {"psnr": 3}}, "rows": [1], "more": []}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"name": 3}, "f: name: is not as neeco writes it; mend it"),
+        ({"name": "\ud800"}, "f: name: is not as neeco writes it"),
+        ({"splits": {"\ud800": {}}}, "f: splits: holds a name that is no text"),
+        ({"splits": {"test": {}}}, "f: splits: test: psnr is missing; mend it"),
+        ({"splits": {"test": {"psnr": float("nan")}}}, "f: splits: test: psnr: is not as"),
+        ({"splits": []}, "f: splits: is not as"),
+        ({"rows": [1, True]}, r"f: rows\[1\]: is not as"),
+        ({"rows": None}, "f: rows: is not as"),
+    ],
+)
+def test_what_is_built_otherwise_is_told_by_its_place(change: dict[str, object], told: str) -> None:
+    assert require_like(GOOD, LIKE, "f", "mend it") is GOOD
+    with pytest.raises(NeecoError, match=told):
+        require_like(GOOD | change, LIKE, "f", "mend it")
