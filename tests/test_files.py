@@ -20,6 +20,7 @@ from neeco.files import (
     own_folder,
     parse_yaml,
     read_json,
+    require_inside,
     require_like,
     write_atomically,
 )
@@ -62,6 +63,33 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
         left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
         assert left == {*whole, LOCK}
     assert not (tmp_path / LOCK).exists()
+
+
+def test_a_link_out_of_a_folder_is_refused_and_one_within_it_is_not(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "folder", tmp_path / "outside"
+    folder.mkdir()
+    outside.mkdir()
+    (folder / "file").touch()
+    (folder / "same").symlink_to("file")
+    with own_folder(folder):
+        assert require_inside(folder / "same", folder) == folder / "same"
+    (folder / "deep").symlink_to(outside)
+    with pytest.raises(NeecoError, match=r"deep/any.png: a link leads out of .*folder; put there what it leads to"):
+        require_inside(folder / "deep" / "any.png", folder)
+    with pytest.raises(NeecoError, match=r"deep: a link leads out of"):
+        own_folder(folder).__enter__()
+    (folder / "deep").unlink()
+    (folder / "round").symlink_to("round")
+    with pytest.raises(NeecoError, match=r"round: a link that leads in a circle; remove it"):
+        own_folder(folder).__enter__()
+
+
+def test_a_folder_may_be_reached_by_a_link(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "file").touch()
+    (tmp_path / "run").symlink_to("disk")
+    with own_folder(tmp_path / "run"):
+        require_inside(tmp_path / "run" / "file", tmp_path / "run")
 
 
 def test_a_folder_with_nothing_whole_in_it_is_vacant(tmp_path: Path) -> None:

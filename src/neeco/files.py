@@ -81,11 +81,15 @@ def new_folder(path: Path) -> Iterator[None]:
 def own_folder(path: Path, told: Path | None = None) -> Iterator[None]:
     """`new_folder` for this process alone, rid of what killed processes left half-written there.
 
-    Others that ask for the same folder meanwhile are refused (NeecoError naming `told`, by default the folder). The
-    lock goes with the process that holds it, however that ends; a file system without locks refuses nobody. On Windows
-    there is none: nobody is refused, and nothing is swept, which another may be writing.
+    Others that ask for the same folder meanwhile are refused (NeecoError naming `told`, by default the folder), and so
+    is a folder that holds a link out of it. The lock goes with the process that holds it, however that ends; a file
+    system without locks refuses nobody. On Windows there is none: nobody is refused, and nothing is swept, which
+    another may be writing.
     """
     path = Path(path)
+    for entry in path.rglob("*"):  # which follows no link
+        if entry.is_symlink():
+            require_inside(entry, path)
     if fcntl is None:
         with new_folder(path):
             yield
@@ -151,6 +155,17 @@ def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such
     numbers."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def require_inside(file: Path, folder: Path) -> Path:
+    """`file`, whose path goes through `folder`. Raises NeecoError when a link on the way leads out of that, or in a
+    circle."""
+    try:
+        if file.resolve().is_relative_to(folder.resolve()):
+            return file
+    except (OSError, RuntimeError):
+        raise NeecoError(f"{file}: a link that leads in a circle; remove it") from None
+    raise NeecoError(f"{file}: a link leads out of {folder}; put there what it leads to, or remove it")
 
 
 def require_file(path: Path, expected: str) -> None:

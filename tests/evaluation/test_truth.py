@@ -1,5 +1,8 @@
 """What a frame is scored against."""
 
+import pytest
+
+from neeco.errors import NeecoError
 from neeco.evaluation.truth import truth_file
 
 
@@ -10,3 +13,11 @@ def test_exact_truth_comes_before_a_reference_mask(tmp_path):
         file = tmp_path / folder / "000.png"
         file.touch()
         assert truth_file(tmp_path, "000") == file
+
+
+def test_truth_lies_in_its_capture(tmp_path):
+    (tmp_path / "capture" / "truth" / "masks").mkdir(parents=True)
+    (tmp_path / "other.png").touch()
+    (tmp_path / "capture" / "truth" / "masks" / "000.png").symlink_to(tmp_path / "other.png")
+    with pytest.raises(NeecoError, match=r"000.png: a link leads out of .*capture"):
+        truth_file(tmp_path / "capture", "000")

@@ -133,6 +133,20 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
         train(capture, run, CONFIG, resume=True)
 
 
+def test_a_run_is_read_from_its_own_folder_alone(capture: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    train(capture, run, CONFIG)
+    (tmp_path / "large").mkdir()
+    (run / "renders").symlink_to(tmp_path / "large")  # its owner's
+    load_run(run)
+    for name in ("config.yaml", "scene.safetensors", "metrics.jsonl"):
+        (run / name).rename(tmp_path / name)
+        (run / name).symlink_to(tmp_path / name)
+        with pytest.raises(NeecoError, match=rf"{name}: a link leads out of .*run; put there what it leads to"):
+            load_run(run)
+        (tmp_path / name).rename(run / name)
+
+
 def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neeco.capture.images import read_labels, read_mask
 from neeco.capture.model import Capture, Frame
+from neeco.files import require_inside
 
 REFERENCE_FOLDER = "reference_masks"
 MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # in which a frame's is looked for, in this order
@@ -26,8 +27,10 @@ class Reference:
 
 
 def truth_file(root: Path, name: str) -> Path | None:
-    """The mask that the frame called `name` of the capture in `root` is scored against; None when it has none."""
-    return next((file for folder in MASK_FOLDERS if (file := root / folder / f"{name}.png").is_file()), None)
+    """The mask that the frame called `name` of the capture in `root` is scored against; None when it has none. Raises
+    NeecoError where a link leads out of the capture."""
+    file = next((file for folder in MASK_FOLDERS if (file := root / folder / f"{name}.png").is_file()), None)
+    return None if file is None else require_inside(file, root)
 
 
 def load_reference(capture: Capture, frame: Frame) -> Reference | None:

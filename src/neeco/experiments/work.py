@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from neeco.capture import Capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, read_json, write_text
+from neeco.files import is_vacant, read_json, require_inside, write_text
 from neeco.raster.devices import failures_told
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
@@ -81,7 +81,7 @@ def check_output(output: Path, file: str, schema: str, capture: Path, noun: str,
         return None
     if not (output / file).exists():
         raise NeecoError(f"{output}: not empty, and no {noun}; give another --output")
-    stored = read_json(output / file)
+    stored = read_json(require_inside(output / file, output))
     if not isinstance(stored, dict) or stored.get("schema") != schema:
         raise NeecoError(f"{output / file}: schema: is not {schema}; give another --output")
     if stored.get("capture") != str(capture.absolute()):

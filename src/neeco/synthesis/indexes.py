@@ -15,7 +15,7 @@ import torch
 
 import neeco
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, read_json, write_json
+from neeco.files import is_vacant, read_json, require_inside, write_json
 from neeco.labels.annotation import KEYPOINTS
 from neeco.labels.composited import CLEAR_SHARES, instruments_of
 from neeco.labels.drawing import Labeller
@@ -83,7 +83,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")
     if not (output / INFO).exists():
         raise NeecoError(f"{output}: not empty and no {INFO} in it; --resume continues only data sets made by neeco")
-    begun = read_json(output / INFO)
+    begun = read_json(require_inside(output / INFO, output))
     if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     for key in ("schema", "version", "scene_sha256"):

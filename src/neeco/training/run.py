@@ -15,7 +15,7 @@ import yaml
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_like, write_text
+from neeco.files import parse_yaml, read_text, require_inside, require_like, write_text
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
@@ -62,9 +62,13 @@ def open_run(path: Path, device: torch.device | None = None) -> Iterator[Run]:
 
 def read_config(path: Path) -> dict[str, Any]:
     """config.yaml of run folder `path`, checked."""
-    file = Path(path) / "config.yaml"
-    if not Path(path).is_dir():
+    path = Path(path)
+    file = path / "config.yaml"
+    if not path.is_dir():
         raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
+    for entry in path.glob("*"):
+        if not entry.is_dir():  # folders that their owner has linked there are no part of the run
+            require_inside(entry, path)
     if not os.path.lexists(file):
         raise NeecoError(f"{path}: not a run folder (config.yaml is missing); make one with `neeco train`")
     config = parse_yaml(file, read_text(file, "the settings of a run as YAML"), "train again")

@@ -169,6 +169,14 @@ def test_an_image_of_another_size_is_refused_wherever_it_stands(drawn: Path) -> 
         loaded(drawn)
 
 
+@pytest.mark.parametrize("linked", ["images", "images/000003.png", "parts/000003.png", "soft", "dataset.json"])
+def test_a_set_is_read_from_its_own_folder_alone(linked: str, drawn: Path, tmp_path: Path) -> None:
+    (drawn / linked).rename(tmp_path / "elsewhere")
+    (drawn / linked).symlink_to(tmp_path / "elsewhere")
+    with refused(linked, "a link leads out of"):
+        loaded(drawn, edges="soft")
+
+
 @pytest.mark.parametrize("edges", ["soft", "ignore"])
 def test_a_set_without_its_edges_is_refused(edges, drawn: Path) -> None:
     (drawn / edges / "000002.png").unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from neeco import __version__
@@ -18,6 +17,7 @@ from neeco.experiments.downstream.results import answers_of, comparisons, summar
 from neeco.experiments.downstream.samples import (
     CLASSES,
     INFO,
+    DataSet,
 )
 from neeco.experiments.machine import machine
 from neeco.experiments.running import run_jobs, threads_per_worker
@@ -87,8 +87,7 @@ def document(plan: DownstreamPlan, results: Sequence[dict[str, Any]]) -> dict[st
         "labelled": plan.labelled,
         "held_back_every": HELD_BACK_EVERY,
         "sets": [
-            data.described() | {"images": plan.images[data.name], "made_by": _made_by(data.path)}
-            for data in teaching.sets
+            data.described() | {"images": plan.images[data.name], "made_by": _made_by(data)} for data in teaching.sets
         ],
         "models": models,
         "jobs": list(results),
@@ -134,9 +133,9 @@ def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
     return notes
 
 
-def _made_by(path: Path) -> dict[str, Any] | None:
+def _made_by(data: DataSet) -> dict[str, Any] | None:
     """What dataset.json says of how a set was drawn; None where there is none."""
-    file = path / INFO
+    file = data.file(INFO)
     if not file.is_file():
         return None
     stated = read_json(file)

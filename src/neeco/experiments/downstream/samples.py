@@ -17,7 +17,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
 from neeco.evaluation.truth import truth_file
-from neeco.files import read_json, read_text
+from neeco.files import read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
@@ -148,9 +148,13 @@ class DataSet:
     path: Path
     count: int | None = None
 
+    def file(self, *names: str) -> Path:
+        """A file or folder of it. Raises NeecoError where a link leads out of it."""
+        return require_inside(self.path.joinpath(*names), self.path)
+
     def described(self) -> dict[str, Any]:
         """What tells it from others, for a file; `sha256` of its description changes when it is drawn anew."""
-        file = self.path / INFO
+        file = self.file(INFO)
         digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
 
@@ -193,7 +197,7 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
     that `neeco annotate` wrote only the frames of split train are learned from: models are tested on the others. size:
     (width, height) that they must have. Raises NeecoError.
     """
-    folder = data.path / DRAWN_IN
+    folder = data.file(DRAWN_IN)
     if not folder.is_dir():
         raise NeecoError(f"--sets {data.name}: {data.path}: no folder {DRAWN_IN}/; give what `neeco synthesize` wrote")
     images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
@@ -203,8 +207,9 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
     if data.count is not None and data.count > len(images):
         raise NeecoError(f"--sets {data.name}: {data.path}: has {len(images)} images, not {data.count}; draw more")
     labels, meaning = _labels_of(data, classes)
-    samples = [DrawnSample(image, data.path / labels / f"{image.stem}.png", meaning) for image in images[: data.count]]
+    samples = [DrawnSample(image, data.file(labels, f"{image.stem}.png"), meaning) for image in images[: data.count]]
     for sample in samples:
+        require_inside(sample.image, data.path)
         if not sample.labels.is_file():
             raise NeecoError(f"--sets {data.name}: {sample.labels}: no such file; every image needs its labels")
         found = image_size(sample.image)
@@ -219,7 +224,7 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
 
 def _not_tested_on(data: DataSet, images: list[Path]) -> list[Path]:
     """The images that are drawn, or recorded frames of split train."""
-    file, states = data.path / INFO, data.path / STATES
+    file, states = data.file(INFO), data.file(STATES)
     stated = read_json(file) if file.is_file() else None
     settings = stated.get("settings") if isinstance(stated, dict) else None
     if not isinstance(settings, dict) or "annotates" not in settings:
@@ -240,7 +245,7 @@ def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample
     """The sample with the file that says how its edges are to be learned."""
     if edges == "hard":
         return sample
-    file = data.path / edges / f"{sample.name}.png"
+    file = data.file(edges, f"{sample.name}.png")
     if not file.is_file():
         raise NeecoError(f"--sets {data.name}: {file}: no such file; draw the set again, or use {data.name}+hard")
     return replace(sample, soft=file) if edges == "soft" else replace(sample, ignore=file)
@@ -248,7 +253,7 @@ def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample
 
 def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, Meaning]:
     """In which folder of a data set its labels are, and what they mean."""
-    file = data.path / INFO
+    file = data.file(INFO)
     if not file.is_file():
         if classes == "parts":
             raise NeecoError(
