@@ -3,9 +3,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <vector>
 
 #include "kernels.hpp"
+#include "kernels/blur.hpp"
 #include "shadow_map.hpp"
 
 namespace neeco {
@@ -25,12 +25,17 @@ public:
     // Of casters that were drawn from the lamp: alpha and expected depth [height, width]; blurred by `sigma` px.
     void blur(const float* alpha, const float* depth, int width, int height, float sigma) {
         width_ = width, height_ = height;
-        const std::vector<float> across = weights(width, sigma), down = weights(height, sigma);
+        float across[2 * kTaps + 1], down[2 * kTaps + 1];
+        set_window(across, width, sigma);
+        set_window(down, height, sigma);
         const size_t size = (size_t)width * height;
-        std::vector<float> weighted(size);
-        for (size_t i = 0; i < size; i++) weighted[i] = alpha[i] * depth[i];
-        blurred(alpha, across, down, alpha_);
-        blurred(weighted.data(), across, down, weighted_);
+        float* product = product_.reserve(size);
+        for (size_t i = 0; i < size; i++) product[i] = alpha[i] * depth[i];
+        const BlurInputs in = {height, width, kTaps, alpha, down, across, nullptr, nullptr};
+        wasm::blur(in, work_, alpha_.reserve(size), nullptr);
+        BlurInputs of_product = in;
+        of_product.image = product;
+        wasm::blur(of_product, work_, weighted_.reserve(size), nullptr);
     }
 
     // Share of the light that misses a point of depth z (from the lamp) at pixel (x, y) of the map.
@@ -40,38 +45,18 @@ public:
     }
 
 private:
-    static std::vector<float> weights(int size, float sigma) {
-        std::vector<float> taps(2 * kTaps + 1);
+    static void set_window(float* taps, int size, float sigma) {
         float total = 0;
         for (int k = -kTaps; k <= kTaps; k++) {
             const float step = (float)k / std::max(sigma, 0.3f);
             taps[k + kTaps] = std::exp(-0.5f * step * step);
             if (size / 2 + k >= 0 && size / 2 + k < size) total += taps[k + kTaps];
         }
-        for (float& tap : taps) tap /= total;
-        return taps;
-    }
-
-    void blurred(const float* image, const std::vector<float>& across, const std::vector<float>& down, std::vector<float>& out) const {
-        std::vector<float> rows((size_t)width_ * height_);
-        out.assign(rows.size(), 0.f);
-        for (int y = 0; y < height_; y++)
-            for (int k = -kTaps; k <= kTaps; k++) {
-                const int from = std::max(0, -k), to = std::min(width_, width_ - k);
-                float* row = rows.data() + (size_t)y * width_;
-                const float *source = image + (size_t)y * width_ + k, tap = across[k + kTaps];
-                for (int x = from; x < to; x++) row[x] += tap * source[x];
-            }
-        for (int y = 0; y < height_; y++)
-            for (int k = std::max(-kTaps, -y); k <= std::min(kTaps, height_ - 1 - y); k++) {
-                float* row = out.data() + (size_t)y * width_;
-                const float *source = rows.data() + (size_t)(y + k) * width_, tap = down[k + kTaps];
-                for (int x = 0; x < width_; x++) row[x] += tap * source[x];
-            }
+        for (int k = 0; k <= 2 * kTaps; k++) taps[k] /= total;
     }
 
     int width_ = 0, height_ = 0;
-    std::vector<float> alpha_, weighted_;
+    Buffer<float> alpha_, weighted_, product_, work_;
 };
 
 }  // namespace neeco

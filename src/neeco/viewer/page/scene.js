@@ -67,6 +67,7 @@ async function loadScene() {
   const head = JSON.parse(new TextDecoder().decode(await inflated("head")));
   if (head.schema !== "neeco-page/1") throw new Error(`schema ${head.schema}`);
   if (!head.counts.every((count) => Number.isInteger(count) && count >= 0)) throw new Error(`counts ${head.counts}`);
+  if (![0, 1, 2, 3].includes(head.degree)) throw new Error(`degree ${head.degree}`);
   const n = head.counts.reduce((a, b) => a + b, 0);
   const inputs = rasteriserInputs(head, wholeNumbers(head.fields, await inflated("scene"), n), n);
   const size = [n, head.counts[0], (head.degree + 1) ** 2, head.ranges.turn.length / 2, head.labels.length, head.light.lamps.length];
