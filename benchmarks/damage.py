@@ -407,7 +407,7 @@ def edit_npy(path: Path, pick: random.Random) -> None:
     content = path.read_bytes()
     match pick.randrange(5):
         case 0:
-            array = np.load(path)
+            array = np.array(np.load(path, mmap_mode="r"))  # mapped: an earlier edit may have promised terabytes
             array[pick.randrange(len(array)), pick.randrange(array.shape[1])] = pick.choice(
                 [*NUMBERS[:9], float("nan")]
             )
@@ -419,7 +419,7 @@ def edit_npy(path: Path, pick: random.Random) -> None:
         case 2:
             path.write_bytes(content.replace(b"'<f8'", pick.choice((b"'|O' ", b"'<U9'", b"'<i8'", b"'<c8'"))))
         case 3:
-            np.savez(path.with_suffix(".npz"), np.load(path))
+            np.savez(path.with_suffix(".npz"), np.load(path, mmap_mode="r"))
             path.with_suffix(".npz").rename(path)
         case _:
             edit_bytes(path, pick)
