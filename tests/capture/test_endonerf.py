@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -69,6 +71,20 @@ def test_frames_pair_by_name_and_test_as_the_successors_do(endonerf):
     assert [index for index, frame in enumerate(capture.frames) if frame.split == "test"] == [1, 9]
     assert capture.instruments == ()
     assert all(frame.mask_path is None for frame in capture.frames)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("images/frame-000004.color.png", "frame-000004.color.png: is not a file; expected an image"),
+        ("poses_bounds.npy", "no such file"),
+    ],
+)
+def test_a_pipe_is_refused_and_never_waited_for(name, told, endonerf):
+    (endonerf / name).unlink()
+    os.mkfifo(endonerf / name)
+    (problem,) = errors_only(check_capture(endonerf))
+    assert told in str(problem)
 
 
 def test_random_points_fill_the_depth_bounds_of_a_still_camera(endonerf):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -92,6 +93,14 @@ def test_tool_masks_become_loss_masks_that_ignore_the_tool(endonerf, tmp_path):
 def test_a_missing_tool_mask_is_named(endonerf, tmp_path):
     (endonerf / "masks/004.png").unlink()
     with pytest.raises(NeecoError, match="masks/: has 8 masks for 9 images"):
+        convert_folder(endonerf, tmp_path / "capture")
+    assert not (tmp_path / "capture").exists()
+
+
+def test_a_mask_that_is_a_pipe_is_refused_and_never_waited_for(endonerf, tmp_path):
+    (endonerf / "masks/004.png").unlink()
+    os.mkfifo(endonerf / "masks/004.png")
+    with pytest.raises(NeecoError, match="004.png: is not a file; expected an image"):
         convert_folder(endonerf, tmp_path / "capture")
     assert not (tmp_path / "capture").exists()
 

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.files import write_atomically
+from neeco.files import require_file, write_atomically
 
 # Pillow warns of images beyond 90 million pixels, and refuses them beyond twice that: both are refused here
 warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -94,6 +94,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 def _opened(path: Path) -> Iterator[Image.Image]:
     """An image file for the block, not yet decoded. Raises NeecoError when it cannot be read there."""
     try:
+        require_file(path, "an image")
         with Image.open(path) as image:
             yield image
     except NeecoError:
