@@ -100,7 +100,7 @@ def test_a_missing_tool_mask_is_named(endonerf, tmp_path):
 def test_a_mask_that_is_a_pipe_is_refused_and_never_waited_for(endonerf, tmp_path):
     (endonerf / "masks/004.png").unlink()
     os.mkfifo(endonerf / "masks/004.png")
-    with pytest.raises(NeecoError, match="004.png: is not a file; expected an image"):
+    with pytest.raises(NeecoError, match=r"004.png: is not a file; expected an image"):
         convert_folder(endonerf, tmp_path / "capture")
     assert not (tmp_path / "capture").exists()
 
