@@ -17,6 +17,8 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from neeco.files import parse_yaml
+
 SCRIPT = "<script>alert(1)</script>"
 DELETE = object()
 NUMBERS = [-1, 0, 1, 0.5, -0.0, 1e-300, 1e300, -1e308, 2**31, 2**63, 10**12, 10**400, float("nan"), float("inf")]
@@ -211,7 +213,7 @@ def edit_yaml(path: Path, pick: random.Random) -> None:
     elif way < 0.25:
         path.write_text(text + "\n" + pick.choice(YAML_TEXTS))
     else:
-        document = edit(yaml.safe_load(text), pick)
+        document = edit(parse_yaml(path, text, "as it was"), pick)  # which stops at an earlier edit's aliases
         path.write_text(yaml.safe_dump(document), encoding="utf-8", errors="surrogatepass")
 
 

@@ -1,6 +1,6 @@
 """Whatever stands in the files that a command reads, it works or refuses in one line.
 
-    python benchmarks/mutations.py [--cases N] [--seed S] [--case K] [--verbs check train …] [--work DIR]
+    python benchmarks/mutations.py [--cases N] [--seed S] [--first K] [--case K] [--verbs check train …] [--work DIR]
 
 Every case takes fresh copies of a small capture, run, data set, recording and so on, damages what one verb reads in one
 to three places (fields deleted, doubled, of other types, huge, not finite, nested; files cut, with flipped bits,
@@ -359,6 +359,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--case", type=int, help="play this one only, and show what it did")
     parser.add_argument(
         "--verbs", nargs="+", choices=list(CASES), default=list(CASES), help="case numbers depend on it"
@@ -372,7 +373,7 @@ def main() -> int:
     spent = Counter[str]()
     with tempfile.TemporaryDirectory() as temporary:
         bench = Bench(args.work or Path(temporary) / "work", args.verbs, args.seed)
-        for number in [args.case] if args.case is not None else range(args.cases):
+        for number in [args.case] if args.case is not None else range(args.first, args.first + args.cases):
             outcome = bench.play(number)
             counts[outcome.verb] += 1
             refusals[outcome.verb] += outcome.ended.status == 1
@@ -386,8 +387,8 @@ def main() -> int:
                     print("    " + line.strip().replace("\n", "\n    "), flush=True)
             if args.case is not None:
                 print(outcome.ended)
-            elif number % 500 == 499:
-                print(f"{number + 1} cases, {sum(wrong.values())} wrong, {time.monotonic() - began:.0f} s", flush=True)
+            elif (done := sum(counts.values())) % 500 == 0:
+                print(f"{done} cases, {sum(wrong.values())} wrong, {time.monotonic() - began:.0f} s", flush=True)
         os.chdir("/")
     for verb in sorted(counts):
         print(f"{verb}: {counts[verb]} cases, {refusals[verb]} refused, {wrong[verb]} wrong; {spent[verb]:.0f} s")
