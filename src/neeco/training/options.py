@@ -67,6 +67,12 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
         config = config_from_dict(plain)
     except NeecoError as error:
         raise NeecoError(f"--set: {error}") from None
+    check_ranges(config)
+    return config
+
+
+def check_ranges(config: TrainConfig) -> None:
+    """Raise NeecoError naming the option of a number that nothing can be trained with."""
     _check_length(config)
     _check_published_steps(config)
     if config.initial_points is not None and config.initial_points < 1:
@@ -79,7 +85,6 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
     for name, least in (("seed", 0), ("views_per_step", 1), ("tissue_budget", 1), ("instrument_budget", 1)):
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
-    return config
 
 
 def _check_length(config: TrainConfig) -> None:

@@ -19,6 +19,7 @@ from neeco.files import parse_yaml, read_text, require_inside, require_like, wri
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
+from neeco.training.options import check_ranges
 
 SCHEMA = "neeco-run/1"
 CAPTURE_DIGEST = "capture_sha256"
@@ -101,9 +102,11 @@ def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
 
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     """The settings that the run in `path` was started with, of what `read_config` read there. Raises NeecoError for a
-    field that is unknown or does not fit."""
+    field that is unknown or does not fit, or a number that nothing is trained with."""
     known = {key: value for key, value in stored.items() if key not in ("schema", "version", "capture", CAPTURE_DIGEST)}
     try:
-        return config_from_dict(known)
+        config = config_from_dict(known)
+        check_ranges(config)
     except NeecoError as error:
         raise NeecoError(f"{path / 'config.yaml'}: {error}; train again") from None
+    return config
