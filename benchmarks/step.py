@@ -38,7 +38,7 @@ PARTS: list[tuple[Any, str, str]] = [
     (cpu._Rasterize, "forward", "drawing, shadow maps too"),
     (cpu._Rasterize, "backward", "drawing, backward"),
     (shadow, "blocked", "shadows"),
-    (shadow, "blur", "shadows, blur"),
+    (shadow._Blocked, "backward", "shadows, backward"),
     (shadow._Dimmed, "forward", "shadows, dimming"),
     (shadow._Dimmed, "backward", "shadows, dimming, backward"),
     (posing._Pose, "backward", "posing, backward"),

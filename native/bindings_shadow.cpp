@@ -1,126 +1,90 @@
-// neeco._native: what shadows are made of: a blurred plane, what stands behind it, and harmonics dimmed.
-#include <nanobind/stl/optional.h>
+// neeco._native: shadows: what of a lamp's light Gaussians miss, and harmonics dimmed by that.
+#include <cstring>
 
 #include "arrays.hpp"
 #include "kernels.hpp"
-#include "parallel.hpp"
-#include "shadow_map.hpp"
 
 namespace neeco {
 namespace {
 
-// windows [2, T]: down and across; slopes [2, T], their derivatives, with `slope`, where that of the plane goes.
-void blur(Array image, Array windows, MaybeArray slopes, Array out, MaybeArray slope) {
-    if (image.ndim() != 2 || windows.ndim() != 2 || windows.shape(0) != 2 || windows.shape(1) % 2 == 0)
-        throw std::invalid_argument("blur: image must be [H, W], windows [2, T] with T odd");
-    if (slope && !slopes) throw std::invalid_argument("slope: needs the windows' slopes");
-    const size_t taps = windows.shape(1);
-    BlurInputs in{};
-    in.height = static_cast<int>(image.shape(0));
-    in.width = static_cast<int>(image.shape(1));
-    in.reach = static_cast<int>(taps / 2);
-    in.image = image.data();
-    in.down = windows.data();
-    in.across = in.down + taps;
-    in.down_slope = sized(slopes, 2 * taps, "slopes");
-    in.across_slope = in.down_slope ? in.down_slope + taps : nullptr;
-    float *to = sized(out, image.size(), "out"), *to_slope = sized(slope, image.size(), "slope");
+using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
+using Places = nb::ndarray<int32_t, nb::c_contig, nb::device::cpu>;
+
+// maps [3, H, W] and where they lie, int [4]: what `cast` leaves for the gradient. numbers [21]: rotation [9] and centre [3] of the camera, offset [3], fx, fy, cx,
+// cy, sigma, nearest (as CastInputs has them).
+CastInputs cast_inputs(const Array& means, const Flags& casters, const Array& numbers, const Array& maps) {
+    if (maps.ndim() != 3 || maps.shape(0) != 3) throw std::invalid_argument("maps: must be [3, H, W]");
+    CastInputs in{};
+    in.count = static_cast<int>(casters.size());
+    in.height = static_cast<int>(maps.shape(1)), in.width = static_cast<int>(maps.shape(2));
+    in.means = sized(means, 3 * casters.size(), "means");
+    in.casters = casters.data();
+    const float* from = sized(numbers, 21, "numbers");
+    std::memcpy(in.rotation, from, sizeof in.rotation);
+    std::memcpy(in.centre, from + 9, sizeof in.centre);
+    std::memcpy(in.offset, from + 12, sizeof in.offset);
+    in.fx = from[15], in.fy = from[16], in.cx = from[17], in.cy = from[18], in.sigma = from[19], in.nearest = from[20];
+    return in;
+}
+
+void cast(Array alpha, Array depth, Array means, Flags casters, Array numbers, bool slope, Array maps, Places place, Array shares) {
+    CastInputs in = cast_inputs(means, casters, numbers, maps);
+    const size_t size = maps.size() / 3;
+    in.alpha = sized(alpha, size, "alpha"), in.depth = sized(depth, size, "depth");
+    float* to = sized(shares, casters.size(), "shares");
+    if (place.size() != 4) throw std::invalid_argument("place: must have 4 elements");
     static thread_local Buffer<float> work;
     const Kernels& k = kernels();
     nb::gil_scoped_release release;
-    k.blur(in, work, to, to_slope);
+    const CastMaps m = k.cast(in, work, maps.data(), slope, to);
+    const int found[4] = {m.left, m.top, m.width, m.height};
+    std::memcpy(place.data(), found, sizeof found);
 }
 
-void brighten(Array sh, Array factors, float half, Array out) {
-    const size_t count = factors.size(), width = count ? sh.size() / count : 0;
-    sized(sh, count * width, "sh");
+void cast_backward(Array means, Flags casters, Array numbers, Array maps, Places place, Array shares, Array gradient, Array out) {
+    const CastInputs in = cast_inputs(means, casters, numbers, maps);
+    if (place.size() != 4) throw std::invalid_argument("place: must have 4 elements");
+    const int* p = place.data();
+    const size_t size = static_cast<size_t>(p[2]) * p[3];
+    if (3 * size > maps.size()) throw std::invalid_argument("place: is larger than the maps");
+    const CastMaps m = {p[0], p[1], p[2], p[3], maps.data(), maps.data() + size, maps.data() + 2 * size};
+    const float *found = sized(shares, casters.size(), "shares"), *from = sized(gradient, casters.size(), "gradient");
+    float* to = sized(out, 4, "out");
+    static thread_local Buffer<double> partial;
+    const Kernels& k = kernels();
+    nb::gil_scoped_release release;
+    k.cast_backward(in, m, found, from, partial, to);
+}
+
+DimInputs dim_inputs(const Array& sh, const Array& missing, float half, float darkest, float gamma) {
+    const size_t count = missing.size(), width = count ? sh.size() / count : 0;
+    return {static_cast<int>(count), static_cast<int>(width), half, darkest, gamma, sized(sh, count * width, "sh"), missing.data()};
+}
+
+void dim(Array sh, Array missing, float half, float darkest, float gamma, Array out) {
+    const DimInputs in = dim_inputs(sh, missing, half, darkest, gamma);
     float* to = sized(out, sh.size(), "out");
     const Kernels& k = kernels();
     nb::gil_scoped_release release;
-    k.brighten(static_cast<int>(count), static_cast<int>(width), half, sh.data(), factors.data(), to);
+    k.dim(in, to);
 }
 
-void brighten_backward(Array sh, Array factors, float half, Array gradient, Array to_sh, Array to_factors) {
-    const size_t count = factors.size(), width = count ? sh.size() / count : 0;
-    sized(sh, count * width, "sh");
+void dim_backward(Array sh, Array missing, float half, float darkest, float gamma, Array gradient, Array to_sh, Array to_missing) {
+    const DimInputs in = dim_inputs(sh, missing, half, darkest, gamma);
     const float* from = sized(gradient, sh.size(), "gradient");
-    float *to = sized(to_sh, sh.size(), "sh"), *factor = sized(to_factors, count, "factors");
+    float *to = sized(to_sh, sh.size(), "to_sh"), *share = sized(to_missing, missing.size(), "to_missing");
     const Kernels& k = kernels();
     nb::gil_scoped_release release;
-    k.brighten_backward(static_cast<int>(count), static_cast<int>(width), half, sh.data(), factors.data(), from, to, factor);
-}
-
-// Points [N, 3] in the frame of a camera at the place of which a lamp stands off by `offset`, and the lamp's map of what casts.
-struct Cast {
-    const float *alpha, *weighted, *points, *casters, *offset, *focus;  // casters [N]: 1 or 0; focus: fx, fy, cx, cy
-    float nearest;
-    int width, height, count;
-
-    struct Place {
-        float x, y, z, column, row;
-    };
-    Place place(int n) const {
-        const float x = points[3 * n] - offset[0], y = points[3 * n + 1] - offset[1], z = points[3 * n + 2] - offset[2];
-        const float deep = std::max(z, nearest);
-        return {x, y, z, x / deep * focus[0] + focus[2], y / deep * focus[1] + focus[3]};
-    }
-    Blocked blocked(const Place& p) const { return blocked_at(alpha, weighted, width, height, p.column, p.row, p.z); }
-};
-
-Cast cast_of(const Array& alpha, const Array& weighted, const Array& points, const Array& casters, const Array& offset, const Array& focus,
-             float nearest) {
-    if (alpha.ndim() != 2) throw std::invalid_argument("alpha: must be [H, W]");
-    const size_t count = casters.size();
-    return {alpha.data(), sized(weighted, alpha.size(), "weighted"), sized(points, 3 * count, "points"), casters.data(),
-            sized(offset, 3, "offset"), sized(focus, 4, "focus"), nearest, static_cast<int>(alpha.shape(1)),
-            static_cast<int>(alpha.shape(0)), static_cast<int>(count)};
-}
-
-constexpr int kCastRows = 1024;  // per task
-
-void behind(Array alpha, Array weighted, Array points, Array casters, Array offset, Array focus, float nearest, Array out) {
-    const Cast in = cast_of(alpha, weighted, points, casters, offset, focus, nearest);
-    float* to = sized(out, casters.size(), "out");
-    nb::gil_scoped_release release;
-    parallel_for((in.count + kCastRows - 1) / kCastRows, [&](int task) {
-        for (int n = task * kCastRows; n < std::min((task + 1) * kCastRows, in.count); n++) {
-            const Blocked found = in.blocked(in.place(n));
-            to[n] = found.hit && in.casters[n] == 0 ? found.share.value : 0.f;
-        }
-    });
-}
-
-// Adds to the map's gradient [H, W] and to the offset's [3]; drawn: what `behind` found. By one thread: rows share pixels, and few are behind anything.
-void behind_backward(Array alpha, Array weighted, Array points, Array casters, Array offset, Array focus, float nearest, Array drawn,
-                     Array gradient, Array to_alpha, Array to_offset) {
-    const Cast in = cast_of(alpha, weighted, points, casters, offset, focus, nearest);
-    const float *from = sized(gradient, casters.size(), "gradient"), *share = sized(drawn, casters.size(), "drawn");
-    float *map = sized(to_alpha, alpha.size(), "to_alpha"), *to = sized(to_offset, 3, "to_offset");
-    const float fx = in.focus[0], fy = in.focus[1];
-    nb::gil_scoped_release release;
-    for (int n = 0; n < in.count; n++) {
-        if (share[n] == 0) continue;
-        const Cast::Place p = in.place(n);
-        const Blocked found = in.blocked(p);
-        add_between(map, in.width, in.height, p.column, p.row, from[n]);
-        // the point moves across the map as the lamp does, and to first order so does the map of what casts
-        const float across = from[n] * found.share.across, down = from[n] * found.share.down;
-        const float deep = std::max(p.z, in.nearest), by_depth = p.z > in.nearest ? 1 / (deep * deep) : 0.f;
-        to[0] += across * fx * (1 / found.before - 1 / deep);
-        to[1] += down * fy * (1 / found.before - 1 / deep);
-        to[2] += across * (fx * p.x * by_depth - (p.column - in.focus[2]) / found.before) +
-                 down * (fy * p.y * by_depth - (p.row - in.focus[3]) / found.before);
-    }
+    k.dim_backward(in, from, to, share);
 }
 
 }  // namespace
 
 void bind_shadow(nb::module_& m) {
-    m.def("blur", &blur, nb::arg(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg().none());
-    m.def("behind", &behind);
-    m.def("behind_backward", &behind_backward);
-    m.def("brighten", &brighten);
-    m.def("brighten_backward", &brighten_backward);
+    m.def("cast", &cast);
+    m.def("cast_backward", &cast_backward);
+    m.def("dim", &dim);
+    m.def("dim_backward", &dim_backward);
 }
 
 }  // namespace neeco

@@ -14,11 +14,27 @@ struct LossInputs {
     double pixels;              // unmasked pixels
 };
 
-struct BlurInputs {
-    int height, width, reach;
-    const float* image;         // [H, W]
-    const float *down, *across;               // [2 reach + 1] windows
-    const float *down_slope, *across_slope;   // and their derivatives, where the plane's is wanted
+// A lamp and the Gaussians that its light may reach. What casts was drawn from the lamp by a camera turned as the image's.
+struct CastInputs {
+    int count, height, width;    // Gaussians; the map
+    const float *alpha, *depth;  // [H, W] of what casts
+    const float* means;          // [N, 3] mm, world
+    const bool* casters;         // [N], which miss nothing; or null
+    float rotation[9], centre[3], offset[3];  // camera_from_world and centre of the image's camera; the lamp's place in its frame
+    float fx, fy, cx, cy, sigma, nearest;     // px, px (how far the map is blurred), mm
+};
+
+// What `cast` makes of the map [H, W], where anything casts: `left` and `top` say where that lies.
+struct CastMaps {
+    int left, top, width, height;
+    float *opacity, *weighted, *slope;  // blurred; times depth; the opacity's derivative by sigma
+};
+
+// Harmonics [N, width] whose colours, `half` more than they say, are dimmed by the share of the light each Gaussian misses.
+struct DimInputs {
+    int count, width;
+    float half, darkest, gamma;
+    const float *sh, *missing;
 };
 
 struct AdamStep {
@@ -68,11 +84,12 @@ struct Kernels {
     void (*project_backward)(Frame&, const GaussianInputs&, const GaussianGradients&);
     double (*photometric)(const LossInputs&, Buffer<float>& work, float* gradient);
     void (*adam)(const AdamStep&);
-    void (*blur)(const BlurInputs&, Buffer<float>& work, float* out, float* slope);  // slope: or null
-    // of harmonics [N, width], half: by how much of the constant one colours are more than harmonics say
-    void (*brighten)(int count, int width, float half, const float* sh, const float* factors, float* out);
-    void (*brighten_backward)(int count, int width, float half, const float* sh, const float* factors, const float* from, float* to_sh,
-                              float* to_factors);
+    // maps: room for three of [H, W]
+    CastMaps (*cast)(const CastInputs&, Buffer<float>& work, float* maps, bool slope, float* shares);
+    void (*cast_backward)(const CastInputs&, const CastMaps&, const float* shares, const float* gradient, Buffer<double>& partial,
+                          float* to);
+    void (*dim)(const DimInputs&, float* out);
+    void (*dim_backward)(const DimInputs&, const float* from, float* to_sh, float* to_missing);
     void (*pose)(const Body&, const PosedRows&);
     void (*pose_backward)(const Body&, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers);
 };

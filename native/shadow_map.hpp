@@ -24,18 +24,6 @@ inline Reading look_up(const float* image, int width, int height, float x, float
     return {(1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d), (1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)};
 }
 
-// Adds to the four pixels that a reading is of.
-inline void add_between(float* image, int width, int height, float x, float y, float amount) {
-    x -= 0.5f, y -= 0.5f;
-    const int column = (int)std::floor(x), row = (int)std::floor(y);
-    const float u = x - column, v = y - row;
-    auto add = [&](int r, int c, float share) {
-        if (r >= 0 && c >= 0 && r < height && c < width) image[(size_t)r * width + c] += share * amount;
-    };
-    add(row, column, (1 - v) * (1 - u)), add(row, column + 1, (1 - v) * u);
-    add(row + 1, column, v * (1 - u)), add(row + 1, column + 1, v * u);
-}
-
 // How opaque the casters are before a point of depth z at pixel (x, y) of the map, and how deep they are there.
 struct Blocked {
     Reading share;

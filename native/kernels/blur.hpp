@@ -1,7 +1,7 @@
 // A plane under a separable window, zero outside, and how that changes with one number that the window depends on.
 #pragma once
 
-#include "kernels.hpp"
+#include "frame.hpp"
 #include "parallel.hpp"
 #include "simd.hpp"
 
@@ -9,6 +9,13 @@ namespace neeco {
 namespace NEECO_VARIANT {
 
 constexpr int kBlurRows = 16;  // per task
+
+struct BlurInputs {
+    int height, width, reach;
+    const float* image;                      // [H, W]
+    const float *down, *across;              // [2 reach + 1] windows
+    const float *down_slope, *across_slope;  // and their derivatives, where the plane's is wanted
+};
 
 NEECO_INLINE size_t blur_stride(int width) { return ((size_t)width + W - 1) / W * W; }
 
@@ -19,10 +26,19 @@ NEECO_INLINE vf under_window(const float* first, size_t step, const float* windo
     return sum;
 }
 
-static void blur(const BlurInputs& in, Buffer<float>& work, float* out, float* slope) {
-    const int size = 2 * in.reach + 1, tasks = (in.height + kBlurRows - 1) / kBlurRows;
+NEECO_INLINE int blur_tasks(int height) { return (height + kBlurRows - 1) / kBlurRows; }
+
+// Floats that `blur` works in.
+NEECO_INLINE size_t blur_room(int height, int width, int reach) {
+    const size_t stride = blur_stride(width);
+    return 2 * stride * (height + 2 * reach) + blur_tasks(height) * (stride + 2 * reach);
+}
+
+// out [H, W]; slope: that of `out` where the windows' slopes are those, or null.
+static void blur(const BlurInputs& in, float* room, float* out, float* slope) {
+    const int size = 2 * in.reach + 1, tasks = blur_tasks(in.height);
     const size_t stride = blur_stride(in.width), plane = stride * (in.height + 2 * in.reach);
-    float* rows = work.reserve(2 * plane + tasks * (stride + 2 * in.reach));  // blurred along rows; the same for the slope
+    float* rows = room;  // blurred along rows; the same for the slope
     float *rows_slope = rows + plane, *padded = rows_slope + plane;
     for (float* p : {rows, rows_slope}) {
         std::memset(p, 0, in.reach * stride * 4);

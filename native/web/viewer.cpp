@@ -5,10 +5,10 @@
 #include <cmath>
 
 #include "kernels.hpp"
+#include "kernels/cast.hpp"
 #include "kernels/composite.hpp"
 #include "kernels/project.hpp"
 #include "parallel.hpp"
-#include "shadow.hpp"
 
 #define NEECO_EXPORT(name) __attribute__((export_name(#name)))
 
@@ -18,6 +18,15 @@ namespace {
 constexpr int kMostInstruments = 8, kMostJoints = 4, kMostLamps = 3;  // joints: of one instrument
 constexpr int kPoseFloats = 16, kHingeFloats = 7;  // floats: [R|t] by rows and the rotation's quaternion; pivot, axis, reading
 constexpr float kMargin15 = 0.15f;     // of the image: how far beyond it the projection is linearised where it stands
+
+// The shadows of what moves on what stands still are those of neeco/raster/shadow.py.
+constexpr float kResolution = 0.5f, kMargin = 0.15f;  // of the image's, and of its size to each side
+constexpr float kGamma = 2.2f, kDarkest = 0.01f, kNearestLit = 1e-3f;
+
+struct Lamp {
+    float offset[3];  // mm, in the camera's frame
+    float strength;   // share of the light
+};
 
 enum Show { kImage, kLabelsOverImage, kLabels, kDepth };
 
@@ -35,7 +44,7 @@ struct Page {
     Buffer<float> color, alpha, depth, channels;
     Buffer<uint32_t> pixels;
     Buffer<int32_t> ids;
-    ShadowMap map;
+    Buffer<float> maps, work, missed;
     Frame frame, light_frame;
 } page;
 
@@ -126,15 +135,16 @@ void cast(const Lamp& lamp, const View& v, float* missing) {
     const Images out = {page.color.reserve(3 * size), page.alpha.reserve(size), page.depth.reserve(size), nullptr,
                         page.radii.reserve(page.count), nullptr};
     draw(f, table, in, out, false);
-    page.map.blur(out.alpha, out.depth, seen.width, seen.height, page.shadow_width * seen.fx);
-    const float *r = f.camera.rotation, *t = f.camera.translation;
-    for (int i = 0; i < page.tissue; i++) {
-        const float* p = page.means.data() + 3 * i;
-        const float z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
-        if (!(z > 1e-3f)) continue;
-        const float x = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0], y = r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1];
-        missing[i] += lamp.strength * page.map.blocked(seen.fx * x / z + seen.cx, seen.fy * y / z + seen.cy, z);
-    }
+    CastInputs in_light{};
+    in_light.count = page.tissue, in_light.height = seen.height, in_light.width = seen.width;
+    in_light.alpha = out.alpha, in_light.depth = out.depth, in_light.means = page.means.data();
+    std::memcpy(in_light.rotation, f.camera.rotation, sizeof in_light.rotation);
+    std::memcpy(in_light.centre, centre, sizeof in_light.centre);
+    in_light.fx = seen.fx, in_light.fy = seen.fy, in_light.cx = seen.cx, in_light.cy = seen.cy;
+    in_light.sigma = page.shadow_width * seen.fx, in_light.nearest = kNearestLit;
+    float* shares = page.missed.reserve(page.tissue);
+    wasm::cast(in_light, page.work, page.maps.reserve(3 * size), false, shares);
+    for (int i = 0; i < page.tissue; i++) missing[i] += lamp.strength * shares[i];
 }
 
 uint32_t packed(const float* rgb) {

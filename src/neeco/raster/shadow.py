@@ -7,7 +7,7 @@ Only brightness changes; nothing is added to the image, and labels know nothing 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,88 +45,103 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     shadow = light.shadow
     casters, lit = shadow.casters, shadow.strengths.detach() > 0
     every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # the device is asked once
-    if every or not some:  # nothing to fall on, or nothing that falls
+    if every or not some or not any(shines):  # nothing to fall on, or nothing that falls
         return gaussians
-    missing = torch.zeros_like(gaussians.opacities)
-    among = Casting.of(gaussians, casters, camera)
-    for shining, offset, strength in zip(shines, shadow.offsets, shadow.strengths, strict=True):
-        if shining:
-            missing = missing + strength * blocked(among, shadow.width, offset, camera, draw)
-    sh = _Dimmed.apply(gaussians.sh, (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA))
+    shares = blocked(Casting.of(gaussians, casters, camera), shadow.width, shadow.offsets, draw, shines)
+    sh = _Dimmed.apply(gaussians.sh, shadow.strengths @ shares)
     return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
 
 
 class _Dimmed(torch.autograd.Function):
-    """Harmonics [N, K, 3] whose colour, half a unit more than they say, is multiplied by `lit` [N].
+    """Harmonics [N, K, 3] whose colour, half a unit more than they say, loses the share `missing` [N] of its light.
 
     Written out since torch's own steps would fill and add up several tensors of this size. float32 on the CPU takes the
     native kernel.
     """
 
     @staticmethod
-    def forward(ctx: Any, sh: Tensor, lit: Tensor) -> Tensor:
-        ctx.save_for_backward(sh, lit)
-        if not all_native(sh, lit):
-            return brightened(sh, lit[:, None, None])
+    def forward(ctx: Any, sh: Tensor, missing: Tensor) -> Tensor:
+        ctx.save_for_backward(sh, missing)
+        if not all_native(sh, missing):
+            return brightened(sh, _left(missing)[:, None, None])
         out = sh.new_empty(sh.shape)
-        native().brighten(sh.detach().contiguous(), lit.detach().contiguous(), HALF, out)
+        native().dim(*_plain(sh, missing), HALF, DARKEST, GAMMA, out)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
-        sh, lit = ctx.saved_tensors
+        sh, missing = ctx.saved_tensors
         (grad,) = grads
-        if not all_native(sh, lit):
+        if not all_native(sh, missing):
+            lit = _left(missing)
             to_lit = (grad.flatten(1) * sh.flatten(1)).sum(1) + HALF * grad[:, 0].sum(1)
-            return grad * lit[:, None, None], to_lit
-        to_sh, to_lit = sh.new_empty(sh.shape), lit.new_empty(lit.shape)
-        native().brighten_backward(
-            sh.detach().contiguous(), lit.detach().contiguous(), HALF, grad.contiguous(), to_sh, to_lit
-        )
-        return to_sh, to_lit
+            slope = torch.where(1 - missing > DARKEST, -lit / (GAMMA * (1 - missing)), 0)
+            return grad * lit[:, None, None], to_lit * slope
+        to_sh, to_missing = sh.new_empty(sh.shape), missing.new_empty(missing.shape)
+        native().dim_backward(*_plain(sh, missing), HALF, DARKEST, GAMMA, grad.contiguous(), to_sh, to_missing)
+        return to_sh, to_missing
+
+
+def _left(missing: Tensor) -> Tensor:
+    """By what stored colours are multiplied where this share of the light is missed."""
+    return (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA)
+
+
+def _plain(*tensors: Tensor) -> list[Tensor]:
+    """As the kernels take them."""
+    return [tensor.detach().contiguous() for tensor in tensors]
 
 
 @dataclass(frozen=True)
 class Casting:
-    """Those that cast and those that may stand behind them, as a camera sees them: the same for every lamp."""
+    """Those that cast and those that may stand behind them, before a camera: the same for every lamp."""
 
     casters: Tensor  # [N] bool
     bare: Gaussians  # the casters, as opaque as they are and of no particular colour
-    points: Tensor  # [N, 3] mm, means of all in the camera's frame
+    means: Tensor  # [N, 3] mm, of all, world
+    camera: Camera
 
     @staticmethod
     @torch.no_grad()
     def of(gaussians: Gaussians, casters: Tensor, camera: Camera) -> Casting:
         """Of all the Gaussians and which of them cast, bool [N]."""
         bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None).select(casters)
-        pose = camera.world_from_camera.to(gaussians.means)
-        return Casting(casters, bare, (gaussians.means - pose[:3, 3]) @ pose[:3, :3])
+        return Casting(casters, bare, gaussians.means.detach(), camera)
 
 
-def blocked(among: Casting, width: Tensor, offset: Tensor, camera: Camera, draw: Draw) -> Tensor:
-    """Share [N] of the light of a lamp at `offset` [3] mm, of this `width` (slope), that the casters keep from each
-    Gaussian; 0 for themselves."""
-    at_light = _light_camera(camera, offset.detach())
+def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: Sequence[bool] | None = None) -> Tensor:
+    """Shares [L, N] of the light of lamps at `offsets` [L, 3] mm, of this `width` (slope), that the casters keep from
+    each Gaussian; 0 for themselves, and for lamps that do not shine (`shines`; None: all do). float32 on the CPU takes
+    the native kernels."""
+    lamps = [index for index in range(len(offsets)) if shines is None or shines[index]]
+    if all_native(among.means, offsets):
+        return _Blocked.apply(width, offsets, among, draw, lamps)
+    none = torch.zeros_like(among.means[:, 0])
+    rows = [_blocked_by(among, width, offsets[k], draw) if k in lamps else none for k in range(len(offsets))]
+    return torch.stack(rows)
+
+
+def _blocked_by(among: Casting, width: Tensor, offset: Tensor, draw: Draw) -> Tensor:
+    """`blocked` of one lamp, [N]. Any float type and device."""
+    at_light = _light_camera(among.camera, offset.detach())
     with torch.no_grad():
         seen = draw(among.bare, at_light)
+    return blocked_reference(seen.alpha, seen.depth, width, offset, among, at_light)
+
+
+def blocked_reference(
+    alpha: Tensor, depth: Tensor, width: Tensor, offset: Tensor, among: Casting, at_light: Camera
+) -> Tensor:
+    """What `blocked` makes of a lamp's map, the opacity `alpha` [h, w] and `depth` [h, w] mm of what casts: shares [N].
+    Gradients reach the lamp's width and offset [3] mm. Any float type and device."""
     sigma = width * at_light.fx
-    alpha = blur(seen.alpha, sigma)  # [h, w]
-    with torch.no_grad():
-        weighted = blur(seen.alpha * seen.depth, sigma)  # [h, w]
-    if all_native(alpha, among.points):
-        return _Behind.apply(alpha, weighted, offset, among, at_light)
-    return behind_reference(alpha, weighted, offset, among, at_light)
-
-
-def behind_reference(alpha: Tensor, weighted: Tensor, offset: Tensor, among: Casting, at_light: Camera) -> Tensor:
-    """Share [N] of a lamp's light that misses each Gaussian: what its map (opacity `alpha` [h, w], and that times
-    depth, `weighted`) shows before it. Gradients reach the map's opacity and the lamp's offset [3] mm. Any float type
-    and device."""
+    opacity = blur(alpha, sigma)  # [h, w]
     focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy)
     with torch.no_grad():
-        summed = torch.stack([alpha, weighted], -1)  # [h, w, 2]
-        points = among.points
+        summed = torch.stack([opacity, blur(alpha * depth, sigma)], -1)  # [h, w, 2]
+        pose = among.camera.world_from_camera.to(among.means)
+        points = (among.means - pose[:3, 3]) @ pose[:3, :3]  # [N, 3] mm, in the camera's frame
         pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)  # [N, 2]; those behind fall outside
         weight, sums = _look_up(summed, pixels, at_light).unbind(1)
         before = (sums / weight.clamp_min(NEAR)).clamp_min(NEAR)  # [N] mm, depth of what casts there
@@ -135,29 +150,43 @@ def behind_reference(alpha: Tensor, weighted: Tensor, offset: Tensor, among: Cas
     points, before = points[few], before[few]
     pixels = torch.stack(project(points - offset, *focus, nearest=NEAREST), 1)
     pixels = pixels + _parallax(offset, pixels.detach(), before, at_light)
-    return torch.zeros_like(among.points[:, 0]).masked_scatter(hit, _look_up(alpha[..., None], pixels, at_light)[:, 0])
+    return torch.zeros_like(among.means[:, 0]).masked_scatter(hit, _look_up(opacity[..., None], pixels, at_light)[:, 0])
 
 
-class _Behind(torch.autograd.Function):
-    """`behind_reference` by the native kernel."""
+class _Blocked(torch.autograd.Function):
+    """`blocked` by the native kernels."""
 
     @staticmethod
-    def forward(ctx: Any, alpha: Tensor, weighted: Tensor, offset: Tensor, among: Casting, at_light: Camera) -> Tensor:
-        focus = constant((at_light.fx, at_light.fy, at_light.cx, at_light.cy), offset.device)
-        plain = [t.detach().float().contiguous() for t in (alpha, weighted, among.points, among.casters, offset, focus)]
-        out = among.points.new_empty(len(among.points))
-        native().behind(*plain, NEAREST, out)
-        ctx.save_for_backward(*plain)
-        ctx.drawn = out
-        return out
+    def forward(ctx: Any, width: Tensor, offsets: Tensor, among: Casting, draw: Draw, lamps: list[int]) -> Tensor:
+        pose = among.camera.world_from_camera.detach().cpu().double()
+        means = among.means.contiguous()
+        shares = torch.zeros(len(offsets), len(means))
+        ctx.lamps, ctx.kept = [], [width, offsets, means, among.casters, shares]
+        for lamp in lamps:
+            at_light = _light_camera(among.camera, offsets[lamp])
+            seen = draw(among.bare, at_light)
+            maps = torch.empty(3, at_light.height, at_light.width)
+            focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, NEAREST)
+            numbers = [*pose[:3, :3].T.flatten().tolist(), *pose[:3, 3].tolist(), *offsets[lamp].tolist(), *focus]
+            given = torch.tensor(numbers, dtype=torch.float32)
+            wanted = ctx.needs_input_grad[0]
+            alpha, depth = _plain(seen.alpha, seen.depth)
+            place = torch.empty(4, dtype=torch.int32)
+            native().cast(alpha, depth, means, among.casters, given, wanted, maps, place, shares[lamp])
+            ctx.lamps.append((lamp, given, maps, place, at_light.fx))
+        return shares
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        alpha, *_, offset, _ = plain = ctx.saved_tensors
-        to_alpha, to_offset = torch.zeros_like(alpha), torch.zeros_like(offset)
-        native().behind_backward(*plain, NEAREST, ctx.drawn, gradients[0].contiguous(), to_alpha, to_offset)
-        return to_alpha, None, to_offset, None, None
+        width, offsets, means, casters, shares = ctx.kept
+        to_width, to_offsets, found = torch.zeros_like(width), torch.zeros_like(offsets), torch.empty(4)
+        gradient = gradients[0].contiguous()
+        for lamp, given, maps, place, focal in ctx.lamps:
+            native().cast_backward(means, casters, given, maps, place, shares[lamp], gradient[lamp], found)
+            to_offsets[lamp] = found[:3]
+            to_width += focal * found[3]
+        return to_width, to_offsets, None, None, None
 
 
 def _light_camera(camera: Camera, offset: Tensor) -> Camera:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,12 +44,17 @@ class CanonicalGaussians:
         start = sum(self.counts[:index])
         return slice(start, start + self.counts[index])
 
-    @property
+    @cached_property
     def bodies(self) -> Tensor:
-        """[N] int64, the body of each row."""
+        """[N] int64, the body of each row; not to be changed."""
         like = self.means
         rows = [like.new_full((count,), body, dtype=torch.int64) for body, count in enumerate(self.counts)]
         return torch.cat(rows)  # filled there: a copy of the counts would wait for the device
+
+    @cached_property
+    def of_instruments(self) -> Tensor:
+        """[N] bool, rows of any instrument; not to be changed."""
+        return self.bodies > 0
 
     def tensors(self) -> dict[str, Tensor]:
         """Every learned tensor by name; extras as `extras.NAME`."""

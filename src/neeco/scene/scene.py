@@ -125,7 +125,8 @@ class Scene(nn.Module):
         """
         canonical = self.canonical
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
-        falloff = self.falloff[(canonical.bodies > 0).long()]
+        tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
+        falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
         return Gaussians(
             means=posed.means,
             quats=posed.quats,
@@ -161,7 +162,7 @@ class Scene(nn.Module):
         if not self.casts_shadow:
             return None
         strengths = self.shadow_strengths.clamp(0.0, 1.0)
-        return Shadow(self.canonical.bodies > 0, self.shadow_offsets, strengths, self.shadow_width)
+        return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
         """`state` with the learned tracker-to-world correction applied to its poses."""

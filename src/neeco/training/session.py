@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
@@ -320,5 +321,7 @@ def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
 
 
 def _squared_error(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    if mask is None:
+        return mse_loss(image, target)
     squared = (image - target).square()  # [H, W, 3]
-    return squared.mean() if mask is None else (squared * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)
+    return (squared * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)

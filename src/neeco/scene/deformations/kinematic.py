@@ -191,7 +191,7 @@ class Kinematic(Deformation):
         """The whole instruments' label [N, 1]: parts share it out, so all of them together have 1."""
         if not (self.settings.label_sharpness > 0 and iteration > SHARPENS_FROM and self.label_names):
             return None
-        return (canonical.bodies > 0).to(canonical.means.dtype)[:, None]
+        return canonical.of_instruments.to(canonical.means.dtype)[:, None]
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
         """Sparse instruments with sharp labels and decided parts."""

@@ -102,7 +102,7 @@ def _fade(session: GaussianSession) -> None:
     """Let what is faint of the instruments be learned anew: it may have been the shadow."""
     canonical = session.scene.canonical
     logits = canonical.opacity_logits
-    faint = (canonical.bodies > 0) & (torch.sigmoid(logits) <= OPAQUE)
+    faint = canonical.of_instruments & (torch.sigmoid(logits) <= OPAQUE)
     logits[faint] = logits[faint].clamp_max(math.log(FAINT / (1 - FAINT)))
     session.adam.forget("opacity_logits")
 
@@ -168,7 +168,7 @@ def _drawn(session: GaussianSession, index: int, offsets: Tensor) -> tuple[Tenso
     kept = ~instrument | (posed.opacities > OPAQUE)
     posed, instrument = posed.select(kept), instrument[kept]
     among = Casting.of(posed, instrument, camera)
-    missed = [blocked(among, scene.shadow_width, offset, camera, rasterize) for offset in offsets]
+    missed = blocked(among, scene.shadow_width, offsets, rasterize)  # [C, N]
     channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
     drawing = rasterize(posed, camera, channels=channels)
     assert drawing.channels is not None
