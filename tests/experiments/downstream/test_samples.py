@@ -123,6 +123,9 @@ def test_annotated_frames_that_say_no_split_are_refused(drawn: Path) -> None:
         loaded(annotated(drawn, ["test"] * 6))
     with refused("--sets set", "states.jsonl: not as `neeco annotate` writes it"):
         loaded(annotated(drawn, ["train"] * 5))
+    (drawn / "states.jsonl").write_text("[" * 100_000)
+    with refused("--sets set", "states.jsonl: not as `neeco annotate` writes it"):
+        loaded(drawn)
     (drawn / "states.jsonl").unlink()
     with refused("states.jsonl: no such file"):
         loaded(drawn)

@@ -234,7 +234,7 @@ def _not_tested_on(data: DataSet, images: list[Path]) -> list[Path]:
         lines = [json.loads(line) for line in text.splitlines()]
         splits = {Path(line["image"]).name: line["recorded_split"] for line in lines}
         kept = [image for image in images if splits[image.name] == "train"]
-    except (ValueError, TypeError, LookupError):
+    except (ValueError, TypeError, LookupError, RecursionError):
         raise NeecoError(f"--sets {data.name}: {states}: not as `neeco annotate` writes it") from None
     if not kept:
         raise NeecoError(f"--sets {data.name}: {data.path}: none of its frames is of split train; annotate more")
