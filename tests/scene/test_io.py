@@ -92,6 +92,15 @@ def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> 
         load_scene(path)
 
 
+@pytest.mark.parametrize("grey", [1e300, -0.5, float("nan")])
+def test_a_background_that_is_no_grey_is_refused(kinematic: Scene, tmp_path: Path, grey: float) -> None:
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    rewrite(path, lambda header: header.update(background=grey))
+    with pytest.raises(NeecoError, match=r"scene.safetensors: .*its background is .*, which is no grey"):
+        load_scene(path)
+
+
 def test_a_scene_from_before_shadows_casts_none(kinematic: Scene, tmp_path: Path) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)

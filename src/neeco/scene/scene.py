@@ -116,6 +116,8 @@ class Scene(nn.Module):
             raise ValueError(f"sh_degree is {scene.sh_degree}, which its harmonics are not of")
         # older scenes call it backdrop, or have none
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
+        if not 0 <= scene.background <= 1:
+            raise ValueError(f"its background is {scene.background}, which is no grey in [0, 1]")
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:

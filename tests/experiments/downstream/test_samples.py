@@ -196,6 +196,14 @@ def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
         drawn_samples(DataSet("set", drawn), "instrument", "hard", SIZE)  # known before the work
 
 
+def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:
+    """It would go into downstream.json, which could not be written."""
+    stated = json.loads((drawn / "dataset.json").read_text())
+    (drawn / "dataset.json").write_text(json.dumps(stated | {"settings": {"count": float("nan")}}))
+    with refused("--sets set", "dataset.json: holds NaN or an infinite number; draw the set again"):
+        loaded(drawn)
+
+
 def test_parts_are_refused_where_labels_tell_none(drawn: Path) -> None:
     write_ids(drawn, tuple((name, "instrument") for name in "abcd"))
     assert loaded(drawn)[0].instruments.max() == 4

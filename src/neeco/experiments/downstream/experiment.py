@@ -16,7 +16,6 @@ from neeco.experiments.downstream.plan import FILE, SCHEMA, DownstreamPlan
 from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds
 from neeco.experiments.downstream.samples import (
     CLASSES,
-    INFO,
     DataSet,
 )
 from neeco.experiments.machine import machine
@@ -135,8 +134,9 @@ def _told_by(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _made_by(data: DataSet) -> dict[str, Any] | None:
     """What dataset.json says of how a set was drawn; None where there is none."""
-    file = data.file(INFO)
-    if not file.is_file():
-        return None
-    stated = read_json(file)
-    return {key: stated.get(key) for key in ("settings", "scene", "scene_sha256", "version", "complete")}
+    stated = data.info()
+    return (
+        None
+        if stated is None
+        else {key: stated.get(key) for key in ("settings", "scene", "scene_sha256", "version", "complete")}
+    )

@@ -152,6 +152,21 @@ class DataSet:
         """A file or folder of it. Raises NeecoError where a link leads out of it."""
         return require_inside(self.path.joinpath(*names), self.path)
 
+    def info(self) -> Any:
+        """What its dataset.json says, fit to be written into another file; None where there is none. Raises
+        NeecoError."""
+        file = self.file(INFO)
+        if not file.is_file():
+            return None
+        stated = read_json(file)
+        try:
+            json.dumps(stated, allow_nan=False)
+        except (ValueError, RecursionError):
+            raise NeecoError(
+                f"--sets {self.name}: {file}: holds NaN or an infinite number; draw the set again"
+            ) from None
+        return stated
+
     def described(self) -> dict[str, Any]:
         """What tells it from others, for a file; `sha256` of its description changes when it is drawn anew."""
         file = self.file(INFO)
@@ -224,8 +239,7 @@ def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[
 
 def _not_tested_on(data: DataSet, images: list[Path]) -> list[Path]:
     """The images that are drawn, or recorded frames of split train."""
-    file, states = data.file(INFO), data.file(STATES)
-    stated = read_json(file) if file.is_file() else None
+    stated, states = data.info(), data.file(STATES)
     settings = stated.get("settings") if isinstance(stated, dict) else None
     if not isinstance(settings, dict) or "annotates" not in settings:
         return images
@@ -253,14 +267,13 @@ def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample
 
 def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, Meaning]:
     """In which folder of a data set its labels are, and what they mean."""
-    file = data.file(INFO)
-    if not file.is_file():
+    file, stated = data.file(INFO), data.info()
+    if stated is None:
         if classes == "parts":
             raise NeecoError(
                 f"--sets {data.name}: {file}: no such file, so no parts are known; use --classes instrument"
             )
         return "masks", _meaning({number: (1, "instrument") for number in (1, MASK)}, classes)
-    stated = read_json(file)
     try:
         entries = [(int(entry["id"]), str(entry["instrument"]), str(entry["part"])) for entry in stated["ids"][1:]]
         if not all(0 < number < 256 for number, _, _ in entries):
