@@ -39,8 +39,6 @@ PARTS: list[tuple[Any, str, str]] = [
     (cpu._Rasterize, "backward", "drawing, backward"),
     (shadow, "blocked", "shadows"),
     (shadow._Blocked, "backward", "shadows, backward"),
-    (shadow._Dimmed, "forward", "shadows, dimming"),
-    (shadow._Dimmed, "backward", "shadows, dimming, backward"),
     (posing._Pose, "backward", "posing, backward"),
     (losses._Photometric, "forward", "loss with its gradient"),
     (torch.Tensor, "backward", "autograd"),

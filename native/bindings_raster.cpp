@@ -96,7 +96,7 @@ nb::dict last_statistics() {
 class Drawing {
 public:
     Drawing(Array means, Array quats, Array scales, Array opacities, Array sh, MaybeArray sh_frames, MaybeArray falloff,
-            MaybeArray vignette, MaybeArray channels, MaybeArray background, Array world_from_camera, float fx, float fy, float cx, float cy,
+            MaybeArray vignette, MaybeArray gains, MaybeArray channels, MaybeArray background, Array world_from_camera, float fx, float fy, float cx, float cy,
             int width, int height, float nearest)
         : frame_(store().take()), arrays_{means, quats, scales, opacities, sh} {
         const size_t n = opacities.size();
@@ -116,9 +116,10 @@ public:
         in_.sh_frames = sized(sh_frames, 4 * n, "sh_frames");
         in_.falloff = sized(falloff, n, "falloff");
         in_.vignette = sized(vignette, 2, "vignette");
+        in_.gains = sized(gains, n, "gains");
         in_.channels = sized(channels, c * n, "channels");
         background_ = sized(background, 3, "background");
-        for (const MaybeArray& a : {sh_frames, falloff, vignette, channels, background})
+        for (const MaybeArray& a : {sh_frames, falloff, vignette, gains, channels, background})
             if (a) arrays_.push_back(*a);
         frame_->camera = camera_from(world_from_camera, fx, fy, cx, cy, width, height, nearest);
     }
@@ -141,14 +142,15 @@ public:
     void backward(MaybeArray color, MaybeArray alpha, MaybeArray depth, MaybeArray channels, Array drawn_alpha, Array drawn_depth,
                   const std::vector<MaybeArray>& to) {
         const size_t p = pixels(), n = in_.count;
-        if (to.size() != 10) throw std::invalid_argument("backward: ten gradients expected");
+        if (to.size() != 11) throw std::invalid_argument("backward: eleven gradients expected");
         const ImageGradients from{sized(color, 3 * p, "color"), sized(alpha, p, "alpha"), sized(depth, p, "depth"),
                                   sized(channels, p * in_.channel_count, "channels"), sized(drawn_alpha, p, "alpha"),
                                   sized(drawn_depth, p, "depth"), background_};
         const GaussianGradients gradients{sized(to[0], 3 * n, "means"), sized(to[1], 4 * n, "quats"), sized(to[2], 3 * n, "scales"),
                                           sized(to[3], n, "opacities"), sized(to[4], 3 * n * in_.sh_count, "sh"), sized(to[5], n, "falloff"),
-                                          sized(to[6], n * in_.channel_count, "channels"), sized(to[7], 2 * n, "centers"),
-                                          sized(to[8], 2, "vignette"), sized(to[9], 16, "world_from_camera")};
+                                          sized(to[6], n * in_.channel_count, "channels"), sized(to[7], n, "gains"),
+                                          sized(to[8], 2 * n, "centers"), sized(to[9], 2, "vignette"),
+                                          sized(to[10], 16, "world_from_camera")};
         if (!kernels_) throw std::runtime_error("backward before forward");
         nb::gil_scoped_release release;
         draw_backward(*frame_, *kernels_, in_, from, gradients);
@@ -169,10 +171,10 @@ private:
 
 void bind_raster(nb::module_& m) {
     nb::class_<Drawing>(m, "Drawing")
-        .def(nb::init<Array, Array, Array, Array, Array, MaybeArray, MaybeArray, MaybeArray, MaybeArray, MaybeArray, Array, float,
-                      float, float, float, int, int, float>(),
+        .def(nb::init<Array, Array, Array, Array, Array, MaybeArray, MaybeArray, MaybeArray, MaybeArray, MaybeArray, MaybeArray, Array,
+                      float, float, float, float, int, int, float>(),
              nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(),
-             nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
+             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
         .def("forward", &Drawing::forward, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg())
         .def("backward", &Drawing::backward, nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(),
              nb::arg());

@@ -1,4 +1,4 @@
-// neeco._native: shadows: what of a lamp's light Gaussians miss, and harmonics dimmed by that.
+// neeco._native: what of a lamp's light Gaussians miss.
 #include <cstring>
 
 #include "arrays.hpp"
@@ -56,35 +56,11 @@ void cast_backward(Array means, Flags casters, Array numbers, Array maps, Places
     k.cast_backward(in, m, found, from, partial, to);
 }
 
-DimInputs dim_inputs(const Array& sh, const Array& missing, float half, float darkest, float gamma) {
-    const size_t count = missing.size(), width = count ? sh.size() / count : 0;
-    return {static_cast<int>(count), static_cast<int>(width), half, darkest, gamma, sized(sh, count * width, "sh"), missing.data()};
-}
-
-void dim(Array sh, Array missing, float half, float darkest, float gamma, Array out) {
-    const DimInputs in = dim_inputs(sh, missing, half, darkest, gamma);
-    float* to = sized(out, sh.size(), "out");
-    const Kernels& k = kernels();
-    nb::gil_scoped_release release;
-    k.dim(in, to);
-}
-
-void dim_backward(Array sh, Array missing, float half, float darkest, float gamma, Array gradient, Array to_sh, Array to_missing) {
-    const DimInputs in = dim_inputs(sh, missing, half, darkest, gamma);
-    const float* from = sized(gradient, sh.size(), "gradient");
-    float *to = sized(to_sh, sh.size(), "to_sh"), *share = sized(to_missing, missing.size(), "to_missing");
-    const Kernels& k = kernels();
-    nb::gil_scoped_release release;
-    k.dim_backward(in, from, to, share);
-}
-
 }  // namespace
 
 void bind_shadow(nb::module_& m) {
     m.def("cast", &cast);
     m.def("cast_backward", &cast_backward);
-    m.def("dim", &dim);
-    m.def("dim_backward", &dim_backward);
 }
 
 }  // namespace neeco

@@ -103,7 +103,7 @@ struct GaussianInputs {
     const float* falloff = nullptr;     // [N] or null: no headlight
     const float* vignette = nullptr;    // [2], with falloff
     const float* channels = nullptr;    // [N, C] or null
-    const float* gains = nullptr;       // [N] or null: by which colours are multiplied; not for the backward pass
+    const float* gains = nullptr;       // [N] or null: by which colours are multiplied, > 0
 };
 
 struct Images {
@@ -133,6 +133,7 @@ struct GaussianGradients {   // each may be null: not wanted
     float* sh;
     float* falloff;
     float* channels;
+    float* gains;
     float* centers;          // [N, 2]
     float* vignette;         // [2]
     float* world_from_camera;  // [4, 4]

@@ -30,13 +30,6 @@ struct CastMaps {
     float *opacity, *weighted, *slope;  // blurred; times depth; the opacity's derivative by sigma
 };
 
-// Harmonics [N, width] whose colours, `half` more than they say, are dimmed by the share of the light each Gaussian misses.
-struct DimInputs {
-    int count, width;
-    float half, darkest, gamma;
-    const float *sh, *missing;
-};
-
 struct AdamStep {
     float* parameter;
     const float* gradient;
@@ -88,8 +81,6 @@ struct Kernels {
     CastMaps (*cast)(const CastInputs&, Buffer<float>& work, float* maps, bool slope, float* shares);
     void (*cast_backward)(const CastInputs&, const CastMaps&, const float* shares, const float* gradient, Buffer<double>& partial,
                           float* to);
-    void (*dim)(const DimInputs&, float* out);
-    void (*dim_backward)(const DimInputs&, const float* from, float* to_sh, float* to_missing);
     void (*pose)(const Body&, const PosedRows&);
     void (*pose_backward)(const Body&, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers);
 };

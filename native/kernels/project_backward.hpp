@@ -69,15 +69,16 @@ NEECO_INLINE void projection_gradient(const Camera& c, const Projected& p, const
                    c.fx * iz2 * p.slope_x * (to_jxz + x_free) + c.fy * iz2 * p.slope_y * (to_jyz + y_free);
 }
 
-// Through colour = max(0, sh . basis + 0.5) * light: SH, falloff, and the mean.
+// Through colour = max(0, sh . basis + 0.5) * light * gain: SH, falloff, gain, and the mean.
 NEECO_INLINE void color_gradient(const Frame& frame, const GaussianInputs& in, const GaussianGradients& to, const Projected& p,
                                  const int* index, int live, const vf* to_color, const vf* drawn, MeanGradient& m, vf* sums) {
     const Camera& c = frame.camera;
-    vf factor = all(1.f);
+    vf factor = in.gains ? gather(in.gains, index, 1) : all(1.f);
+    const vf to_log = to_color[0] * drawn[0] + to_color[1] * drawn[1] + to_color[2] * drawn[2];  // of what multiplies colours
+    if (to.gains) scatter(to.gains, index, 1, live, to_log / factor);
     if (in.falloff) {
         const Light light = light_lanes(in, p, index);
-        factor = light.factor;
-        const vf to_log = to_color[0] * drawn[0] + to_color[1] * drawn[1] + to_color[2] * drawn[2];
+        factor *= light.factor;
         const vf falloff = gather(in.falloff, index, 1);
         if (to.falloff) scatter(to.falloff, index, 1, live, to_log * light.log2_distance * -kLn2);
         const vf by_distance = -falloff * to_log / light.distance2;
@@ -184,6 +185,7 @@ static void clear_gradients(const GaussianInputs& in, const GaussianGradients& t
     clear_row(to.sh, g, (size_t)in.sh_count * 3);
     clear_row(to.falloff, g, 1);
     clear_row(to.channels, g, (size_t)in.channel_count);
+    clear_row(to.gains, g, 1);
     clear_row(to.centers, g, 2);
 }
 

@@ -6,7 +6,6 @@
 #include "project_backward.hpp"
 #include "posing.hpp"
 #include "cast.hpp"
-#include "dim.hpp"
 
 #define NEECO_TEXT2(x) #x
 #define NEECO_TEXT(x) NEECO_TEXT2(x)
@@ -19,7 +18,7 @@ const Kernels& NEECO_JOIN(kernels_, NEECO_VARIANT)() {
     namespace v = NEECO_VARIANT;
     static const Kernels table = {NEECO_TEXT(NEECO_VARIANT), v::W, v::kStrip, v::kTileHeight, v::project, v::composite,
                                   v::composite_backward, v::project_backward, v::photometric, v::adam, v::cast,
-                                  v::cast_backward, v::dim, v::dim_backward, v::pose, v::pose_backward};
+                                  v::cast_backward, v::pose, v::pose_backward};
     return table;
 }
 

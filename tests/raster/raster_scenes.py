@@ -52,7 +52,8 @@ def make_scene(
         "background": torch.rand(3, generator=g),
     }
     if light:
-        tensors |= {"falloff": normal(count) * 0.3 + 1, "vignette": normal(2) * 0.3}
+        left = torch.rand(count, generator=torch.Generator().manual_seed(seed)) + 0.1
+        tensors |= {"falloff": normal(count) * 0.3 + 1, "vignette": normal(2) * 0.3, "left": left}
     if frames:
         tensors["sh_frames"] = torch.nn.functional.normalize(normal(count, 4), dim=-1)
     if channels:
@@ -66,7 +67,7 @@ def make_scene(
 
 def leaves(scene: Scene, dtype: torch.dtype) -> tuple[dict[str, Tensor], Gaussians, Camera]:
     t = {k: v.to(dtype).clone().requires_grad_(k != "sh_frames") for k, v in scene.tensors.items()}
-    light = Headlight(t["falloff"], t["vignette"]) if "falloff" in t else None
+    light = Headlight(t["falloff"], t["vignette"], left=t["left"]) if "falloff" in t else None
     gaussians = Gaussians(t["means"], t["quats"], t["scales"], t["opacities"], t["sh"], t.get("sh_frames"), light)
     camera = Camera(
         t["world_from_camera"], scene.focal, scene.focal * 1.03, scene.width / 2 + 1.3, scene.height / 2 - 0.7,

@@ -139,7 +139,9 @@ def test_a_gaussian_beside_the_camera_does_not_blind_the_image(simd: str) -> Non
     assert 0.1 < float(out.color.detach().max()) < 1
 
 
-@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh", "channels", "falloff", "sh_frames"])
+@pytest.mark.parametrize(
+    "field", ["means", "quats", "scales", "opacities", "sh", "channels", "falloff", "left", "sh_frames"]
+)
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_gaussians_that_are_not_finite_draw_nothing(simd: str, field: str, value: float) -> None:
     scene = make_scene(50, 4, 1, seed=7)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, kernels, rasterize
+from neeco.raster.blur import LEAST, blur
 from neeco.raster.native import Family
 from neeco.raster.shadow import GAMMA, Casting, _light_camera, blocked, blocked_reference
 from neeco.raster.threads import set_threads
@@ -240,3 +241,15 @@ def test_the_same_bits_whatever_the_number_of_threads(simd: str) -> None:
     finally:
         set_threads(0)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(height=st.integers(13, 40), width=st.integers(13, 40), sigma=st.floats(0.01, 30.0))
+def test_a_blur_moves_light_and_loses_none(height: int, width: int, sigma: float) -> None:
+    image = torch.zeros(height, width, dtype=torch.float64)
+    image[height // 2, width // 2] = 1
+    out = blur(image, torch.tensor(sigma, dtype=torch.float64))
+    assert float(out.sum()) == pytest.approx(1)
+    spread = (out.sum(0) * (torch.arange(width) - width // 2) ** 2).sum().sqrt()
+    assert float(spread) <= max(sigma, LEAST) + 1e-9
+    assert torch.equal(out, out.clamp(0, 1))

@@ -160,7 +160,7 @@ def test_a_gaussian_beside_the_camera_does_not_blind_the_image() -> None:
 NOT_FINITE = [
     (field, value)
     for value in (float("nan"), float("inf"), -float("inf"))
-    for field in ("means", "quats", "scales", "opacities", "sh", "channels", "falloff", "sh_frames")
+    for field in ("means", "quats", "scales", "opacities", "sh", "channels", "falloff", "left", "sh_frames")
 ]
 
 

@@ -183,7 +183,7 @@ def _normal_equations(
         step = float(level.step[index % 6])
         moved[index] += step
         is_camera = index >= len(parameters) - 6
-        posed = still if is_camera else replace(problem.gaussians(moved), sh=still.sh, headlight=still.headlight)
+        posed = still if is_camera else replace(problem.gaussians(moved), headlight=still.headlight)
         columns.append(_smooth(problem.draw(posed, level, moved) - image, level.weight).flatten() / step)
     jacobian = torch.stack(columns)  # [P, h * w * 3]
     weighted = jacobian * weight.flatten()

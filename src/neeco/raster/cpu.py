@@ -26,6 +26,7 @@ def rasterize_cpu(
         gaussians.sh,
         None if light is None else light.falloff,
         channels,
+        None if light is None else light.left,
         None if light is None else light.vignette,
         camera.world_from_camera,
         background,
@@ -55,11 +56,12 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, offsets: Tensor, frames: Tensor | None, camera: Camera, keep: bool, *tensors: Tensor | None
     ) -> Any:
         plain = [None if t is None else t.detach() for t in tensors]
-        means, quats, scales, opacities, sh, falloff, channels, vignette, world_from_camera, background = plain
+        means, quats, scales, opacities, sh, falloff, channels, left, vignette, world_from_camera, background = plain
         assert means is not None
         try:
             drawing = native().Drawing(
-                means, quats, scales, opacities, sh, frames, falloff, vignette, channels, background, world_from_camera,
+                means, quats, scales, opacities, sh, frames, falloff, vignette, left, channels, background,
+                world_from_camera,
                 camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
             )  # fmt: skip
             height, width = camera.height, camera.width
@@ -88,11 +90,11 @@ class _Rasterize(torch.autograd.Function):
         wanted = ctx.needs_input_grad[4:]
         grads = [
             torch.empty_like(t) if need and t is not None else None
-            for t, need in zip([*gaussians, vignette, pose], wanted[:9], strict=True)
+            for t, need in zip([*gaussians, vignette, pose], wanted[:10], strict=True)
         ]
         to_offsets = torch.empty(tensors[0].shape[0], 2)
-        ctx.drawing.backward(*images, alpha.detach(), depth.detach(), [*grads[:7], to_offsets, *grads[7:]])
+        ctx.drawing.backward(*images, alpha.detach(), depth.detach(), [*grads[:8], to_offsets, *grads[8:]])
         to_background = None
-        if wanted[9] and images[0] is not None and background is not None:
+        if wanted[10] and images[0] is not None and background is not None:
             to_background = ((1 - alpha.detach())[..., None] * images[0]).sum(dim=(0, 1))
         return to_offsets, None, None, None, *grads, to_background

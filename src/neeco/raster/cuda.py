@@ -32,7 +32,9 @@ def rasterize_cuda(
     frames = None if gaussians.sh_frames is None else gaussians.sh_frames[index].float()
     values = sh_colors(gaussians.sh[index].float(), means, pose[:3, 3], frames).clamp(min=0)
     if gaussians.headlight is not None:
-        light = Headlight(gaussians.headlight.falloff[index].float(), gaussians.headlight.vignette.float())
+        lit = gaussians.headlight
+        left = None if lit.left is None else lit.left[index].float()
+        light = Headlight(lit.falloff[index].float(), lit.vignette.float(), left=left)
         values = values * headlight_factor(light, camera, means @ rotation.T + translation)[:, None]
     if channels is not None:
         values = torch.cat([values, channels[index].float()], dim=-1)

@@ -133,7 +133,8 @@ def usable_gaussians(gaussians: Gaussians, camera: Camera, channels: Tensor | No
     n = len(gaussians)
     light = gaussians.headlight
     tensors: list[Tensor | None] = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
-    tensors += [gaussians.sh, gaussians.sh_frames, channels, None if light is None else light.falloff]
+    tensors += [gaussians.sh, gaussians.sh_frames, channels]
+    tensors += [] if light is None else [light.falloff, light.left]
     good = depth_keys(gaussians.means, camera) > camera.near
     for tensor in tensors:
         if tensor is not None and n > 0:
@@ -154,6 +155,9 @@ def _hide(
         return torch.where(hidden.reshape(-1, *[1] * (tensor.dim() - 1)), value, tensor)
 
     light = gaussians.headlight
+    if light is not None:
+        left = None if light.left is None else but(light.left, 1.0)
+        light = Headlight(but(light.falloff, 0.0), light.vignette, left=left)
     shown = Gaussians(
         means=but(gaussians.means, pose[:3, 3] + pose[:3, 2]),
         quats=but(gaussians.quats, 1.0),
@@ -161,7 +165,7 @@ def _hide(
         opacities=but(gaussians.opacities, 0.0),
         sh=but(gaussians.sh, 0.0),
         sh_frames=None if gaussians.sh_frames is None else but(gaussians.sh_frames, 1.0),
-        headlight=None if light is None else Headlight(but(light.falloff, 0.0), light.vignette),
+        headlight=light,
     )
     return shown, None if channels is None else but(channels, 0.0)
 

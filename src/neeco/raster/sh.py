@@ -68,8 +68,9 @@ def sh_colors(sh: Tensor, means: Tensor, camera_centre: Tensor, sh_frames: Tenso
 
 
 def headlight_factor(headlight: Headlight, camera: Camera, camera_means: Tensor) -> Tensor:
-    """Brightness [N] of the headlight at means [N, 3] in the camera frame, mm."""
+    """Brightness [N] of the headlight at means [N, 3] in the camera frame, mm, with what shadows leave of it."""
     x, y, z = camera_means.unbind(-1)
     log_distance = 0.5 * torch.log((x * x + y * y + z * z) / 100.0**2)
     t = field_slopes(camera, camera_means).square().sum(-1)
-    return torch.exp(headlight.vignette[0] * t + headlight.vignette[1] * t * t - headlight.falloff * log_distance)
+    factor = torch.exp(headlight.vignette[0] * t + headlight.vignette[1] * t * t - headlight.falloff * log_distance)
+    return factor if headlight.left is None else factor * headlight.left

@@ -20,7 +20,6 @@ from neeco.raster.blur import blur
 from neeco.raster.native import all_native, native
 from neeco.raster.on_device import constant
 from neeco.raster.pinhole import project
-from neeco.raster.sh import HALF, brightened
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 RESOLUTION = 0.5  # of the image's
@@ -35,9 +34,9 @@ Draw = Callable[[Gaussians, Camera], Rendering]
 
 
 def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
-    """The same Gaussians, the colours of those that cast nothing dimmed by the headlight's shadows; `draw` rasterizes.
+    """The same Gaussians, their headlight with what its shadows leave of it instead of them; `draw` rasterizes.
 
-    Gradients reach the lamps' offsets, strengths and width, and the colours; the casters' shapes are taken as they are.
+    Gradients reach the lamps' offsets, strengths and width; the casters' shapes are taken as they are.
     """
     light = gaussians.headlight
     if light is None or light.shadow is None:
@@ -48,49 +47,8 @@ def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
     if every or not some or not any(shines):  # nothing to fall on, or nothing that falls
         return gaussians
     shares = blocked(Casting.of(gaussians, casters, camera), shadow.width, shadow.offsets, draw, shines)
-    sh = _Dimmed.apply(gaussians.sh, shadow.strengths @ shares)
-    return replace(gaussians, sh=sh, headlight=replace(light, shadow=None))
-
-
-class _Dimmed(torch.autograd.Function):
-    """Harmonics [N, K, 3] whose colour, half a unit more than they say, loses the share `missing` [N] of its light.
-
-    Written out since torch's own steps would fill and add up several tensors of this size. float32 on the CPU takes the
-    native kernel.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, sh: Tensor, missing: Tensor) -> Tensor:
-        ctx.save_for_backward(sh, missing)
-        if not all_native(sh, missing):
-            return brightened(sh, _left(missing)[:, None, None])
-        out = sh.new_empty(sh.shape)
-        native().dim(*_plain(sh, missing), HALF, DARKEST, GAMMA, out)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
-        sh, missing = ctx.saved_tensors
-        (grad,) = grads
-        if not all_native(sh, missing):
-            lit = _left(missing)
-            to_lit = (grad.flatten(1) * sh.flatten(1)).sum(1) + HALF * grad[:, 0].sum(1)
-            slope = torch.where(1 - missing > DARKEST, -lit / (GAMMA * (1 - missing)), 0)
-            return grad * lit[:, None, None], to_lit * slope
-        to_sh, to_missing = sh.new_empty(sh.shape), missing.new_empty(missing.shape)
-        native().dim_backward(*_plain(sh, missing), HALF, DARKEST, GAMMA, grad.contiguous(), to_sh, to_missing)
-        return to_sh, to_missing
-
-
-def _left(missing: Tensor) -> Tensor:
-    """By what stored colours are multiplied where this share of the light is missed."""
-    return (1 - missing).clamp_min(DARKEST) ** (1 / GAMMA)
-
-
-def _plain(*tensors: Tensor) -> list[Tensor]:
-    """As the kernels take them."""
-    return [tensor.detach().contiguous() for tensor in tensors]
+    left = (1 - shadow.strengths @ shares).clamp_min(DARKEST) ** (1 / GAMMA)
+    return replace(gaussians, headlight=replace(light, shadow=None, left=left))
 
 
 @dataclass(frozen=True)
@@ -170,7 +128,7 @@ class _Blocked(torch.autograd.Function):
             numbers = [*pose[:3, :3].T.flatten().tolist(), *pose[:3, 3].tolist(), *offsets[lamp].tolist(), *focus]
             given = torch.tensor(numbers, dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
-            alpha, depth = _plain(seen.alpha, seen.depth)
+            alpha, depth = (image.detach().contiguous() for image in (seen.alpha, seen.depth))
             place = torch.empty(4, dtype=torch.int32)
             native().cast(alpha, depth, means, among.casters, given, wanted, maps, place, shares[lamp])
             ctx.lamps.append((lamp, given, maps, place, at_light.fx))

@@ -30,17 +30,19 @@ class Headlight:
     `(distance / 100 mm) ** -falloff * exp(vignette[0] * t + vignette[1] * t**2)`,
     distance and t taken at its mean, in the camera frame: distance = |p|, t = (p_x / p_z)^2 + (p_y / p_z)^2, the two
     slopes brought into the field of view and its margin (`field_slopes`): beyond it the vignette means nothing, and its
-    powers would blind the image.
+    powers would blind the image. What shadows leave of it, `left`, multiplies, too.
     """
 
     falloff: Tensor  # [N] exponent
     vignette: Tensor  # [2]
     shadow: Shadow | None = None
+    left: Tensor | None = None  # [N] of stored colours, > 0; None: all
 
     def to(self, device: torch.device | str) -> Headlight:
         """The same light on `device`."""
         shadow = None if self.shadow is None else self.shadow.to(device)
-        return Headlight(self.falloff.to(device), self.vignette.to(device), shadow)
+        left = None if self.left is None else self.left.to(device)
+        return Headlight(self.falloff.to(device), self.vignette.to(device), shadow, left)
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Gaussians:
         light = self.headlight
         if light is not None:
             shadow = None if light.shadow is None else replace(light.shadow, casters=light.shadow.casters[chosen])
-            light = replace(light, falloff=light.falloff[chosen], shadow=shadow)
+            left = None if light.left is None else light.left[chosen]
+            light = Headlight(light.falloff[chosen], light.vignette, shadow, left)
         return Gaussians(
             means=self.means[chosen],
             quats=self.quats[chosen],

@@ -51,6 +51,7 @@ def rasterize_triton(
             gaussians.sh,
             None if light is None else light.falloff,
             channels,
+            None if light is None else light.left,
             None if light is None else light.vignette,
             camera.world_from_camera.to(device),
             background,
@@ -109,10 +110,11 @@ class _Rasterize(torch.autograd.Function):
                 drawing.projected.records, inputs.channels, drawing.lists, inputs.background, drawing.tiles, images,
                 (to_color, to_alpha, to_depth, to_channels),
             )  # fmt: skip
-            to = project_backward(inputs, drawing.projected, camera, sums, wanted[4], wanted[7] or wanted[8])
+            to = project_backward(inputs, drawing.projected, camera, sums, wanted[4], wanted[8] or wanted[9])
         to_background = None
-        if wanted[9] and to_color is not None and inputs.background is not None:
+        if wanted[10] and to_color is not None and inputs.background is not None:
             to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))
-        grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.vignette, to.pose]
+        grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.left]
+        grads += [to.vignette, to.pose]
         kept = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
         return to.centers, None, None, *kept, to_background, None

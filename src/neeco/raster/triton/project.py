@@ -38,6 +38,7 @@ class Inputs:
     sh: Tensor  # [N, K, 3]
     falloff: Tensor | None  # [N]
     channels: Tensor | None  # [N, C]
+    left: Tensor | None  # [N]: what shadows leave of the light, > 0
     vignette: Tensor | None  # [2], there where falloff is
     pose: Tensor  # [4, 4] world_from_camera
     background: Tensor | None  # [3]
@@ -76,7 +77,7 @@ def tiles_touched(seen, x, y, half_height, slope, k0, k1, peak, width, height, T
 
 @triton.jit(do_not_specialize=["count"])
 def project_kernel(
-    means, quats, scales, opacities, sh, falloff, channels, vignette, pose, frames,
+    means, quats, scales, opacities, sh, falloff, channels, left, vignette, pose, frames,
     records, ellipses, counts, depths, radii, count, fx, fy, cx, cy, width, height, near,
     SH: tl.constexpr, C: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -102,7 +103,9 @@ def project_kernel(
     seen = seen & finite(px) & finite(py) & finite(half_width) & finite(half_height)
     seen = seen & (px + half_width > 0) & (px - half_width < width)
     seen = seen & (py + half_height > 0) & (py - half_height < height)
-    red, green, blue = colors(sh, falloff, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y, SH)
+    red, green, blue = colors(
+        sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y, SH
+    )
     seen = seen & finite(red) & finite(green) & finite(blue)
     if channels is not None:
         for ch in range(C):
@@ -136,7 +139,8 @@ def put_four(at, a, b, c, d, mask):
 
 
 @triton.jit
-def colors(sh, falloff, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y, SH: tl.constexpr):
+def colors(sh, falloff, left, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, slope_x, slope_y,
+           SH: tl.constexpr):  # fmt: skip
     """Red, green and blue as drawn; not numbers where any input is none."""
     dx, dy, dz, _ = direction(pose, wx, wy, wz)
     if frames is not None:
@@ -152,6 +156,9 @@ def colors(sh, falloff, vignette, frames, pose, g, seen, wx, wy, wz, x, y, z, sl
     if falloff is not None:
         factor, _, _ = headlight(tl.load(falloff + g, seen, other=0.0), vignette, x, y, z, slope_x, slope_y)
         light = light * factor
+    if left is not None:
+        light = light * tl.load(left + g, seen, other=1.0)
+        light = tl.where(finite(light), light, float("nan"))  # black would stay black under an infinite one
     return tl.maximum(red, 0.0) * light, tl.maximum(green, 0.0) * light, tl.maximum(blue, 0.0) * light
 
 
@@ -176,7 +183,7 @@ def project(inputs: Inputs, camera: Camera, tiles: Tiles) -> Projected:
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
             inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.sh, inputs.falloff, inputs.channels,
-            inputs.vignette, inputs.pose, inputs.frames,
+            inputs.left, inputs.vignette, inputs.pose, inputs.frames,
             out.records, out.ellipses, out.counts, out.depths, out.radii,
             n, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), camera.near,
             SH=inputs.sh.shape[1], C=channels, TILE=tiles.size, BLOCK=BLOCK, num_warps=4, enable_fp_fusion=True,

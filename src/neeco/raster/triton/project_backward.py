@@ -38,6 +38,7 @@ class Gradients:
     opacities: Tensor
     sh: Tensor | None  # None: not wanted
     falloff: Tensor | None
+    left: Tensor | None
     channels: Tensor | None
     vignette: Tensor | None
     pose: Tensor | None
@@ -166,8 +167,8 @@ def direction_gradient(sh, to_sh, frames, pose, g, inside, seen, wx, wy, wz, red
 
 @triton.jit(do_not_specialize=["count"])
 def project_backward_kernel(
-    means, quats, scales, opacities, sh, falloff, vignette, pose, frames, records, counts, sums,
-    to_centers, to_means, to_quats, to_scales, to_opacities, to_sh, to_falloff, camera_sums,
+    means, quats, scales, opacities, sh, falloff, left, vignette, pose, frames, records, counts, sums,
+    to_centers, to_means, to_quats, to_scales, to_opacities, to_sh, to_falloff, to_left, camera_sums,
     count, fx, fy, cx, cy, width, height, near,
     SH: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -199,8 +200,12 @@ def project_backward_kernel(
     mx, my, mz = mean_gradient(pose, to_x, to_y, to_z, g0, g1, g2, g3, g4, g5, x, y, iz, slope_x, slope_y,
                                clamped_x, clamped_y, fx, fy)  # fmt: skip
     red, green, blue = triple_at(records + g * RECORD + 6, seen)
+    to_log = to_red * red + to_green * green + to_blue * blue  # of whatever multiplies colours
+    if left is not None:
+        dimmed = tl.load(left + g, seen, other=1.0)
+        put(to_left + g, to_log / dimmed, inside, seen)
+        to_red, to_green, to_blue = to_red * dimmed, to_green * dimmed, to_blue * dimmed
     if falloff is not None:
-        to_log = to_red * red + to_green * green + to_blue * blue
         lx, ly, lz, light, t = light_gradient(falloff, vignette, to_falloff, g, inside, seen, to_log, x, y, z, iz,
                                               slope_x, slope_y, clamped_x, clamped_y)  # fmt: skip
         mx, my, mz = mx + lx, my + ly, mz + lz
@@ -234,13 +239,14 @@ def project_backward(
     partial = torch.zeros(programs, CAMERA_SUMS.value, device=device) if want_camera else None
     to_sh = torch.empty_like(inputs.sh) if want_sh else None
     to_falloff = None if inputs.falloff is None else torch.empty_like(inputs.falloff)
+    to_left = None if inputs.left is None else torch.empty_like(inputs.left)
     to = [torch.empty_like(t) for t in (inputs.means, inputs.quats, inputs.scales, inputs.opacities)]
     centers = torch.empty(n, 2, device=device)
     if n:
         project_backward_kernel[(programs,)](
-            inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.sh, inputs.falloff, inputs.vignette,
-            inputs.pose, inputs.frames, projected.records, projected.counts, sums,
-            centers, *to, to_sh, to_falloff, partial,
+            inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.sh, inputs.falloff, inputs.left,
+            inputs.vignette, inputs.pose, inputs.frames, projected.records, projected.counts, sums,
+            centers, *to, to_sh, to_falloff, to_left, partial,
             n, camera.fx, camera.fy, camera.cx, camera.cy, float(camera.width), float(camera.height), camera.near,
             SH=inputs.sh.shape[1], WIDTH=sums.stride(0), BLOCK=BLOCK, num_warps=4, enable_fp_fusion=True,
         )  # fmt: skip
@@ -250,7 +256,7 @@ def project_backward(
         pose, vignette = _pose_gradient(total, inputs.pose.double()), total[15:17].float()
     channels = None if inputs.channels is None else sums[:, HEAD.value :]
     means, quats, scales, opacities = to
-    return Gradients(centers, means, quats, scales, opacities, to_sh, to_falloff, channels, vignette, pose)
+    return Gradients(centers, means, quats, scales, opacities, to_sh, to_falloff, to_left, channels, vignette, pose)
 
 
 def _pose_gradient(total: Tensor, pose: Tensor) -> Tensor:
