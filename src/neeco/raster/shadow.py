@@ -119,7 +119,8 @@ class _Blocked(torch.autograd.Function):
         pose = among.camera.world_from_camera.detach().cpu().double()
         means = among.means.contiguous()
         shares = torch.zeros(len(offsets), len(means))
-        ctx.lamps, ctx.kept = [], [width, offsets, means, among.casters, shares]
+        ctx.lamps = []
+        ctx.save_for_backward(width, offsets, means, among.casters, shares)
         for lamp in lamps:
             at_light = _light_camera(among.camera, offsets[lamp])
             seen = draw(among.bare, at_light)
@@ -137,7 +138,7 @@ class _Blocked(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        width, offsets, means, casters, shares = ctx.kept
+        width, offsets, means, casters, shares = ctx.saved_tensors
         to_width, to_offsets, found = torch.zeros_like(width), torch.zeros_like(offsets), torch.empty(4)
         gradient = gradients[0].contiguous()
         for lamp, given, maps, place, focal in ctx.lamps:
