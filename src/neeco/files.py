@@ -87,15 +87,15 @@ def own_folder(path: Path, told: Path | None = None) -> Iterator[None]:
     another may be writing.
     """
     path = Path(path)
-    for entry in path.rglob("*"):  # which follows no link
-        if entry.is_symlink():
-            require_inside(entry, path)
-    if fcntl is None:
-        with new_folder(path):
-            yield
-        return
-    with new_folder(path), _locked(path, path if told is None else told):
-        for entry in list(path.rglob(f"{TEMPORARY}*")):
+    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if told is None else told)
+    with new_folder(path), lock:
+        halves = []
+        for entry in path.rglob("*"):  # which follows no link
+            if entry.is_symlink():
+                require_inside(entry, path)
+            if fcntl is not None and entry.name.startswith(TEMPORARY):
+                halves.append(entry)
+        for entry in halves:
             inside = entry.relative_to(path).parts[:-1]
             if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):  # folders have owners
                 entry.unlink()
