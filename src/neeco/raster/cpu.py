@@ -10,28 +10,15 @@ from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
 from neeco.raster.native import native
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Camera, Gaussians, Rendering, differentiable
 
 
 def rasterize_cpu(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
 ) -> Rendering:
     """`rasterize` with neeco's own C++ kernels. Inputs are taken as float32 on the CPU."""
-    light = gaussians.headlight
-    differentiable = [
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        None if light is None else light.falloff,
-        channels,
-        None if light is None else light.left,
-        None if light is None else light.vignette,
-        camera.world_from_camera,
-        background,
-    ]
-    tensors = [None if t is None else _prepared(t) for t in differentiable]
+    given = differentiable(gaussians, camera, channels, background)
+    tensors = [None if t is None else _prepared(t) for t in given]
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)

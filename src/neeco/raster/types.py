@@ -110,6 +110,26 @@ class Camera:
         return replace(self, world_from_camera=self.world_from_camera.to(device))
 
 
+def differentiable(
+    gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
+) -> list[Tensor | None]:
+    """What gradients of a drawing reach, in the order in which neeco's own backends take it; None: not there."""
+    light = gaussians.headlight
+    return [
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        None if light is None else light.falloff,
+        channels,
+        None if light is None else light.left,
+        None if light is None else light.vignette,
+        camera.world_from_camera,
+        background,
+    ]
+
+
 @dataclass(frozen=True)
 class Rendering:
     """One drawn image, and what density control wants to know of it."""

@@ -16,7 +16,7 @@ from neeco.raster.triton.composite import Images, composite
 from neeco.raster.triton.composite_backward import composite_backward
 from neeco.raster.triton.project import Inputs, Projected, project
 from neeco.raster.triton.project_backward import project_backward
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Camera, Gaussians, Rendering, differentiable
 
 TILE = 16  # px
 
@@ -39,24 +39,11 @@ def rasterize_triton(
 
     The image has the same bits every time; gradients do where `torch.use_deterministic_algorithms(True)` asks for it.
     """
-    light = gaussians.headlight
     device = gaussians.means.device
+    frames = None if gaussians.sh_frames is None else gaussians.sh_frames.detach()
     tensors = [
         None if tensor is None else tensor.to(torch.float32).contiguous()
-        for tensor in (
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.sh,
-            None if light is None else light.falloff,
-            channels,
-            None if light is None else light.left,
-            None if light is None else light.vignette,
-            camera.world_from_camera.to(device),
-            background,
-            None if gaussians.sh_frames is None else gaussians.sh_frames.detach(),
-        )
+        for tensor in (*differentiable(gaussians, camera.to(device), channels, background), frames)
     ]
     for tensor in tensors:
         if tensor is not None and tensor.device != device:
