@@ -117,6 +117,7 @@ class _Blocked(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, width: Tensor, offsets: Tensor, among: Casting, draw: Draw, lamps: list[int]) -> Tensor:
         pose = among.camera.world_from_camera.detach().cpu().double()
+        view = [*pose[:3, :3].T.flatten().tolist(), *pose[:3, 3].tolist()]
         means = among.means.contiguous()
         shares = torch.zeros(len(offsets), len(means))
         ctx.lamps = []
@@ -126,8 +127,7 @@ class _Blocked(torch.autograd.Function):
             seen = draw(among.bare, at_light)
             maps = torch.empty(3, at_light.height, at_light.width)
             focus = (at_light.fx, at_light.fy, at_light.cx, at_light.cy, float(width) * at_light.fx, NEAREST)
-            numbers = [*pose[:3, :3].T.flatten().tolist(), *pose[:3, 3].tolist(), *offsets[lamp].tolist(), *focus]
-            given = torch.tensor(numbers, dtype=torch.float32)
+            given = torch.tensor([*view, *offsets[lamp].tolist(), *focus], dtype=torch.float32)
             wanted = ctx.needs_input_grad[0]
             alpha, depth = (image.detach().contiguous() for image in (seen.alpha, seen.depth))
             place = torch.empty(4, dtype=torch.int32)
