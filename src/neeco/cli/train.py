@@ -47,7 +47,7 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
-    from neeco.cli._training import train_with_progress
+    from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
     from neeco.training.options import variant_config
 
