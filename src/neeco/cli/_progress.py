@@ -25,7 +25,7 @@ EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
 
 
 class Bars:
-    """A bar for each thing that is counted and each running job; none before there is progress, so that bad input prints
+    """A bar for each thing counted and each running job; none before there is progress, so that bad input prints
     its one line alone."""
 
     def __init__(self) -> None:

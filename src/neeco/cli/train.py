@@ -75,10 +75,10 @@ def explain() -> str:
     from neeco.scene.methods import METHODS
     from neeco.settings import described
 
-    told = ["Settings of each method, as --set deformation.NAME=VALUE:"]
+    paragraphs = ["Settings of each method, as --set deformation.NAME=VALUE:"]
     for name, method in METHODS.items():
         fields = [f"{field}: {kind} = {default}" for field, kind, default in described(method.Settings)]
         if fields:
             words = " ".join((method.Settings.__doc__ or "").split())
-            told.append(f"{name}: {', '.join(fields)}. {words}")
-    return "\n\n".join(told)
+            paragraphs.append(f"{name}: {', '.join(fields)}. {words}")
+    return "\n\n".join(paragraphs)
