@@ -114,7 +114,7 @@ def test_full_memory_says_how_much_was_asked_for_and_what_to_do() -> None:
     told = device_failure(torch.cuda.OutOfMemoryError(FULL))
     assert told is not None
     assert "memory is full (2.50 GiB more were asked for, 1.02 GiB of 7.78 GiB are free): " in told
-    assert "--tissue-budget" in told
+    assert "--max-tissue-gaussians" in told
     assert "--device cpu" in told
     for said in ("CUDA error: out of memory\nCUDA kernel", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling"):
         assert "memory is full: " in (device_failure(RuntimeError(said)) or "")

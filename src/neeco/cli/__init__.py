@@ -11,12 +11,14 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
 from neeco.errors import NeecoError
+from neeco.settings import RenamedWarning, warn_renamed
 
 VERBS = {
     "demo": "The whole main job on the bundled sample capture, in five minutes.",
@@ -33,6 +35,16 @@ VERBS = {
     "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
+}
+
+# (verb, old) -> new: flags and words of version 0.1, read for one more version
+RENAMED = {
+    ("train", "--views-per-step"): "--batch-size",
+    ("train", "--tissue-budget"): "--max-tissue-gaussians",
+    ("train", "--instrument-budget"): "--max-instrument-gaussians",
+    ("compare", "--processor-minutes"): "--cpu-minutes",
+    ("downstream", "--pick"): "--frame-selection",
+    ("downstream", "--real"): "--num-real",
 }
 
 DESCRIPTION = "Labelled images of surgical instruments in states nobody recorded."
@@ -53,7 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # told to end, end as on Ctrl-C: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        status = _dispatch(words)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            warnings.simplefilter("always", RenamedWarning)
+            status = _dispatch(words)
         sys.stdout.flush()
         return status
     except NeecoError as error:
@@ -88,6 +103,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     import tyro
 
+    words = _renamed(words)
     run, arguments = _verb(words) if words and words[0] in VERBS else (None, None)
     choices: dict[str, Callable[..., Any]] = {
         name: arguments if arguments is not None and name == words[0] else _named_only(name, line)
@@ -103,6 +119,23 @@ def _dispatch(words: list[str]) -> int:
     keep_freed_memory()
     with failures_told():
         return run(parsed)
+
+
+def _renamed(words: list[str]) -> list[str]:
+    """`words` with the flags' names of today; a warning for each that was called otherwise."""
+    verb = words[0] if words else ""
+    renamed = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        new = RENAMED.get((verb, flag.replace("_", "-")), flag)
+        warn_renamed(flag, new)
+        renamed.append(f"{new}{equals}{value}")
+    return renamed
+
+
+def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """A warning as one line on the error stream."""
+    print(f"neeco: warning: {_printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
 def _verb(words: Sequence[str]) -> tuple[Callable[[Any], int], Callable[..., Any]]:

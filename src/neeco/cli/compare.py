@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Compare:
     """Train and score methods on the same frames under the same budget; writes tables and a report.
 
-    Give one of --minutes, --processor-minutes and --iterations. Interrupted, the same command goes on where it stopped;
+    Give one of --minutes, --cpu-minutes and --iterations. Interrupted, the same command goes on where it stopped;
     with more methods or seeds it adds them to what is there.
     """
 
@@ -36,8 +36,8 @@ class Compare:
     """How many seeds of each method, from 0; with 2 or more the tables tell mean and standard deviation."""
     minutes: float | None = None
     """Each run trains so long by the clock on the wall."""
-    processor_minutes: float | None = None
-    """Each run trains so long in time of the processor, all threads together: fair on a machine that others use."""
+    cpu_minutes: float | None = None
+    """Each run trains so many minutes of CPU time, all threads together: fair on a machine that others use."""
     iterations: int | None = None
     """Each run trains so many steps."""
     splits: tuple[str, ...] | None = None
@@ -102,7 +102,7 @@ def _budget(args: Compare) -> Budget:
 
     options = {
         "--minutes": args.minutes,
-        "--processor-minutes": args.processor_minutes,
+        "--cpu-minutes": args.cpu_minutes,
         "--iterations": args.iterations,
     }
     given = [option for option, value in options.items() if value is not None]
@@ -111,6 +111,6 @@ def _budget(args: Compare) -> Budget:
         raise NeecoError(
             f"{told}; every method trains equally long: give one of {', '.join(options)} (try --minutes 5)"
         )
-    if args.processor_minutes is not None:
-        return Budget(args.processor_minutes, None, "processor")
+    if args.cpu_minutes is not None:
+        return Budget(args.cpu_minutes, None, "processor")
     return Budget(args.minutes, args.iterations)

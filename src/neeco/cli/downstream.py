@@ -36,7 +36,7 @@ class Downstream:
     """NAME=DATASET, folders that `neeco synthesize` wrote; NAME=DATASET:COUNT takes its first COUNT images."""
     models: tuple[str, ...] = ("unet",)
     """unet (MONAI's U-Net, masks), dfine (a small D-FINE, boxes), yolo (your own ultralytics program, boxes)."""
-    real: tuple[str, ...] = ("0", "20", "all")
+    num_real: tuple[str, ...] = ("0", "20", "all")
     """How many recorded training frames are labelled: numbers or all; 0 teaches with sets alone."""
     folds: int = 5
     """Each takes other labelled frames and another seed; intervals are over folds."""
@@ -46,7 +46,7 @@ class Downstream:
     """Folder of masks named as the frames, for the recorded training frames; default: the capture's truth."""
     classes: Literal["instrument", "parts"] = "instrument"
     """One class, or shaft, wrist and jaws."""
-    pick: Literal["spread", "first"] = "spread"
+    frame_selection: Literal["spread", "first"] = "spread"
     """Which frames are labelled: spread over the recording, or its first."""
     splits: tuple[str, ...] = ()
     """Splits to test on; default: all but train that have true masks."""
@@ -102,7 +102,7 @@ def _spec(args: Downstream) -> DownstreamSpec:
         splits=args.splits,
         labels=args.labels,
         transforms=args.transforms,
-        pick=args.pick,
+        pick=args.frame_selection,
         steps=args.steps,
         side=args.size,
         batch=args.batch,
@@ -113,7 +113,7 @@ def _spec(args: Downstream) -> DownstreamSpec:
         teaching,
         args.output,
         tuple(dict.fromkeys(args.models)),
-        tuple(dict.fromkeys(args.real)),
+        tuple(dict.fromkeys(args.num_real)),
         args.folds,
         args.conditions or None,
         {name: Path(file) for name, file in weights.items()},

@@ -24,7 +24,7 @@ class Arguments:
     adjustment."""
     iterations: int | None = None
     """Frames drawn and learned from; by default as the method has it."""
-    views_per_step: int | None = None
+    batch_size: int | None = None
     """Frames between two optimisation steps, whose mean loss is minimised; by default 1. More are for a GPU."""
     minutes: float | None = None
     """Stop in time with a finished run."""
@@ -37,9 +37,9 @@ class Arguments:
     """Which transforms file of the capture to read."""
     joints: tuple[str, ...] | None = None
     """Joints that move parts; by default those that the pose does not already explain."""
-    tissue_budget: int | None = None
+    max_tissue_gaussians: int | None = None
     """Most Gaussians of the tissue."""
-    instrument_budget: int | None = None
+    max_instrument_gaussians: int | None = None
     """Most Gaussians of each instrument."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other field of the training config, as NAME=VALUE (e.g. schedule.opacity_reset=inverse); repeatable."""
@@ -55,13 +55,13 @@ def run(args: Arguments) -> int:
         args.method,
         {
             "iterations": args.iterations,
-            "views_per_step": args.views_per_step,
+            "views_per_step": args.batch_size,
             "minutes": args.minutes,
             "seed": args.seed,
             "transforms": args.transforms,
             "joints": args.joints,
-            "tissue_budget": args.tissue_budget,
-            "instrument_budget": args.instrument_budget,
+            "tissue_budget": args.max_tissue_gaussians,
+            "instrument_budget": args.max_instrument_gaussians,
         },
         args.set,
     )

@@ -61,7 +61,7 @@ def device_failure(error: BaseException) -> str | None:
         told = f" ({', '.join(numbers)})" if numbers else ""
         return (
             f"--device: the GPU's memory is full{told}: close what else uses it, take smaller budgets of Gaussians "
-            "(--tissue-budget, --instrument-budget), smaller images or fewer frames, or --device cpu"
+            "(--max-tissue-gaussians, --max-instrument-gaussians), smaller images or fewer frames, or --device cpu"
         )
     lost = getattr(torch, "AcceleratorError", ())  # since PyTorch 2.8; before, a RuntimeError of the same words
     if isinstance(error, lost) or said.startswith(("CUDA error:", "cuDNN error:", "Triton Error [CUDA]:")):
