@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import State
+from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
@@ -191,8 +191,7 @@ def find_thresholds(scene: Scene) -> DeltaThresholds:
     Raises NeecoError when no kind of delta tells Gaussians apart, as in a scene in which nothing moves.
     """
     states = scene.recorded.states
-    chosen = sorted(set(np.linspace(0, len(states) - 1, THRESHOLD_STATES).astype(int))) if states else []
-    found = [delta_magnitudes(scene, states[k]) for k in chosen]
+    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), THRESHOLD_STATES, floor=True)]
     limits = {
         kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
         for kind in DELTAS

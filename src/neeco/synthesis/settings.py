@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Literal
 
 from neeco.errors import NeecoError
+from neeco.settings import warn_renamed
 
 LabelWay = Literal["composited", "threshold"]
 Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
@@ -63,7 +63,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if (new := RENAMED_SAMPLERS.get(self.states)) is not None:
-            warnings.warn(f"--states {self.states} is now called {new}", FutureWarning, stacklevel=3)
+            warn_renamed(f"--states {self.states}", new)
             object.__setattr__(self, "states", new)
 
     def check(self) -> None:

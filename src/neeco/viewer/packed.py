@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neeco.errors import NeecoError
-from neeco.labels.composited import threshold_of
+from neeco.labels.labellers import threshold_of
 from neeco.raster.sh import SH_C0
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.deformations.static import Static
