@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from neeco.experiments.work import JobNews
+    from neeco.experiments.study import JobEvent
     from neeco.training.train import ProgressRow
 
 EVALUATION_SHARE = 0.1  # of a job's bar; the rest is training
@@ -58,7 +58,7 @@ class Bars:
         if title in self.tasks:
             self.bar.update(self.tasks[title], completed=1.0)
 
-    def job(self, news: JobNews) -> None:
+    def job(self, news: JobEvent) -> None:
         """What `run_jobs` tells."""
         title = f"{news.index + 1}/{news.total} {news.job.title}"
         task = self._task(title)

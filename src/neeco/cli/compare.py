@@ -15,7 +15,7 @@ from neeco.settings import Device
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
     options = {
         "--minutes": args.minutes,
