@@ -18,8 +18,7 @@ from torch.nn.functional import normalize
 from neeco.errors import NeecoError
 from neeco.labels.composited import threshold_of
 from neeco.raster.sh import SH_C0
-from neeco.scene.deformations.base import HingeMotion
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.drawable import HingeMotion
 from neeco.viewer.steering import across, shafts_of, slider_ranges
 
 if TYPE_CHECKING:
@@ -55,9 +54,8 @@ class Field:
 def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
-    canonical, refusal = scene.canonical, why_not(scene)
-    motion = None if refusal else scene.deformation.hinge_motion(canonical)
-    if motion is None:
+    canonical, motion = scene.canonical, scene.hinge_motion()
+    if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
@@ -92,8 +90,7 @@ def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
 
 def why_not(scene: Drawable) -> str | None:
     """Why a page cannot hold `scene`, in a line that says what can show it; None where it can."""
-    posed = gaussian_scene(scene, "--export") if scene.has_gaussians else None
-    if posed is None or posed.deformation.hinge_motion(posed.canonical) is None:
+    if scene.hinge_motion() is None:
         return (
             f"method {scene.method} asks a network for every state, which a page cannot; "
             "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"

@@ -14,7 +14,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import HingeMotion, Learned
 from neeco.scene.learning import Session, Start, Training
 from neeco.scene.method import Method, Stored
 
@@ -54,18 +54,6 @@ class Deltas:
     means: Tensor  # [N, 3] mm
     quats: Tensor  # [N, 4]
     scales: Tensor  # [N, 3] mm
-
-
-@dataclass(frozen=True)
-class HingeMotion:
-    """All that posing takes where bodies move rigidly with their instruments and turn about hinges, for renderers
-    other than this program's."""
-
-    log_scales: Tensor  # [N, 3], as drawn
-    turns: Tensor  # [N, J, 2] rad by which joint j turns a Gaussian: at a reading of 0, and per unit of the reading
-    hinges: tuple[
-        tuple[tuple[Tensor, Tensor], ...], ...
-    ]  # per moving instrument and joint: pivot [3] mm, unit axis [3]
 
 
 class Deformation(nn.Module, Method):

@@ -24,12 +24,12 @@ from neeco.scene.deformations.base import (
     UNPERTURBED,
     Deformation,
     Deltas,
-    HingeMotion,
     Perturbation,
     Posed,
     floored_decay,
     state_of,
 )
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING

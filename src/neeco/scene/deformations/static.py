@@ -14,7 +14,8 @@ from typing import Any, ClassVar
 
 from neeco.capture.model import State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, HingeMotion, Perturbation, Posed
+from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.method import PLAIN_TRAINING
 
 
