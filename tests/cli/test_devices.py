@@ -15,12 +15,12 @@ from neeco.cli._kept import kept
 from neeco.errors import NeecoError
 from neeco.experiments import jobs
 from neeco.raster import devices
-from neeco.scene.learning import StepResult
 from neeco.scene.scene import Scene
+from neeco.scene.training_session import StepResult
+from neeco.scene.training_views import TrainingViews
 from neeco.training.options import training_config
 from neeco.training.session import GaussianSession
 from neeco.training.train import train
-from neeco.training.views import TrainingViews
 
 OF_A_RUN = {
     "evaluate": [],
