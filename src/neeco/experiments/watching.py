@@ -22,7 +22,7 @@ from neeco.labels.drawing import draw
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
-    from neeco.scene.learning import Session
+    from neeco.scene.training_session import Session
 
 BEGUN_FILE = "begun.json"
 CURVE_FILE = "curve.jsonl"

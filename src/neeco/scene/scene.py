@@ -190,7 +190,7 @@ class Scene(nn.Module):
         return camera
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where there are any."""
+        """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""
         channels = self.label_channels() if labels and self.label_names else None
         return rasterize(self.at(state), self.camera(camera), channels=channels)
 

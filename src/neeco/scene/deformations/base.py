@@ -15,8 +15,8 @@ from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import HingeMotion, Learned
-from neeco.scene.learning import Session, Start, Training
 from neeco.scene.method import Method, Stored
+from neeco.scene.training_session import GaussianTraining
 
 FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are shorter)
 MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
@@ -92,10 +92,6 @@ class Deformation(nn.Module, Method):
         cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
 
     @classmethod
-    def session(cls, start: Start, scene: Any | None) -> Session:
-        return start.gaussians(scene)
-
-    @classmethod
     def load(cls, stored: Stored) -> Learned:
         return stored.gaussians(cls(stored.instruments, stored.settings), stored)
 
@@ -140,7 +136,7 @@ class Deformation(nn.Module, Method):
         density control carries them along."""
         return {}
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         """Once, before the first step of a new scene (not when a run goes on); may replace the canonical Gaussians."""
 
     def disturbed(
@@ -166,11 +162,11 @@ class Deformation(nn.Module, Method):
         """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
         return {}
 
-    def between_steps(self, training: Training, before: float) -> None:
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
         """After every step; `before` is the progress before it: for what is due once a mark has been passed. A step may
-        be several iterations (`views_per_step`)."""
+        be several iterations (`batch_size`)."""
 
-    def finish(self, training: Training) -> None:
+    def finish(self, training: GaussianTraining) -> None:
         """Find out what is found once learning has ended; may replace the canonical Gaussians."""
 
 

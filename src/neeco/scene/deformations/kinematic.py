@@ -31,9 +31,9 @@ from neeco.scene.deformations.base import (
 )
 from neeco.scene.drawable import HingeMotion
 from neeco.scene.hinges import PART_LOGITS, Hinges
-from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
+from neeco.scene.training_session import GaussianTraining
 
 LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
@@ -196,7 +196,7 @@ class Kinematic(Deformation):
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         training.instruments.find(self)
 
     def disturbed(
@@ -245,7 +245,7 @@ class Kinematic(Deformation):
         opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
         return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
 
-    def between_steps(self, training: Training, before: float) -> None:
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
         passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
         if self.settings.shadow and (passed or any(map(training.reached, SHADOW_AT))):
             training.instruments.find_shadow()
@@ -254,7 +254,7 @@ class Kinematic(Deformation):
         elif passed and self.settings.wrist_again:
             training.instruments.replace_wrists(self)
 
-    def finish(self, training: Training) -> None:
+    def finish(self, training: GaussianTraining) -> None:
         training.instruments.conclude(self)
         if self.settings.rim:
             scene = training.scene

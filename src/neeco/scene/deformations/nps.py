@@ -32,8 +32,8 @@ from neeco.scene.deformations.base import (
     state_of,
 )
 from neeco.scene.encoding import encode
-from neeco.scene.learning import Training
 from neeco.scene.swept import SweptVolume
+from neeco.scene.training_session import GaussianTraining
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
@@ -143,7 +143,7 @@ class NPS(LabelledByMotion):
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
         self.mean_center, self.mean_halfwidth = point_box(means)
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
             training.instruments.bound(self.gate)
 
