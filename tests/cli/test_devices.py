@@ -11,16 +11,16 @@ import torch
 from neeco.capture import Capture
 from neeco.capture.writer import write_capture
 from neeco.cli import main
-from neeco.cli._kept import kept
+from neeco.cli._progress import resumable
 from neeco.errors import NeecoError
 from neeco.experiments import training_job
 from neeco.raster import devices
-from neeco.scene.learning import StepResult
 from neeco.scene.scene import Scene
+from neeco.scene.training_session import StepResult
+from neeco.scene.training_views import TrainingViews
 from neeco.training.options import training_config
 from neeco.training.session import GaussianSession
 from neeco.training.train import train
-from neeco.training.views import TrainingViews
 
 OF_A_RUN = {
     "evaluate": [],
@@ -177,12 +177,12 @@ class TestADeviceThatFails:
 
     def test_what_is_kept_is_told_once_there_is_something(self, tmp_path: Path) -> None:
         begun = tmp_path / "config.yaml"
-        with pytest.raises(torch.cuda.OutOfMemoryError), kept("go on", begun):
+        with pytest.raises(torch.cuda.OutOfMemoryError), resumable("go on", begun):
             raise torch.cuda.OutOfMemoryError
-        with pytest.raises(KeyboardInterrupt, match=r"^$"), kept("go on", begun):
+        with pytest.raises(KeyboardInterrupt, match=r"^$"), resumable("go on", begun):
             raise KeyboardInterrupt
         begun.touch()
-        with pytest.raises(NeecoError, match=r"memory is full: .*; go on$"), kept("go on", begun):
+        with pytest.raises(NeecoError, match=r"memory is full: .*; go on$"), resumable("go on", begun):
             raise torch.cuda.OutOfMemoryError
-        with pytest.raises(KeyboardInterrupt, match=r"^go on$"), kept("go on", begun):
+        with pytest.raises(KeyboardInterrupt, match=r"^go on$"), resumable("go on", begun):
             raise KeyboardInterrupt

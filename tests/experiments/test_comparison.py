@@ -204,7 +204,7 @@ def test_distance_goes_by_time_without_instruments(capture: Path) -> None:
         (["--methods", "3dgs", "--iterations", "5", "--seeds", "0"], "--seeds: 0"),
         (["--methods", "3dgs", "--iterations", "5", "--workers", "0"], "--workers: 0"),
         (["--methods", "3dgs", "--iterations", "5", "--splits", "tset"], "no split 'tset'"),
-        (["--methods", "3dgs", "--iterations", "5", "--masks", "sam"], "not NAME=FOLDER"),
+        (["--methods", "3dgs", "--iterations", "5", "--masks", "sam"], "not NAME=VALUE"),
         (["--methods", "3dgs", "--iterations", "5", "--masks", "3dgs=x"], "is the name of a method"),
         (["--methods", "3dgs", "--iterations", "5", "--masks", "sam=/no/where"], "/no/where: no such folder"),
         (["--methods", "3dgs", "--iterations", "5", "--lpips-weights", "/no/where"], "no such folder"),

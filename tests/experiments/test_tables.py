@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from neeco.cli._tables import fitted
+from neeco.cli._output import fitted
 from neeco.experiments.comparison_tables import latex_text, markdown_text, summary_csv, tables_of
 from neeco.experiments.study import spread
 from neeco.experiments.summary import RUN_METRICS, SPLIT_METRICS, summarise

@@ -143,6 +143,6 @@ def _timed(run: Run, frames: Sequence[Frame], device: torch.device) -> list[floa
             while len(seconds) < count and time.perf_counter() - began < patience:
                 start = time.perf_counter()
                 frame = frames[len(seconds) % len(frames)]
-                synchronise(scene.draw(frame.state, frame.camera).color.device)
+                synchronise(scene.render(frame.state, frame.camera).color.device)
                 seconds.append(time.perf_counter() - start)
     return seconds

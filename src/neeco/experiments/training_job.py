@@ -35,7 +35,7 @@ from neeco.training.train import ProgressRow, train
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
-    from neeco.scene.learning import Session
+    from neeco.scene.training_session import Session
 
 JOB_SCHEMA = "neeco-job/1"
 JOB_FILE = "job.json"  # the result of a finished job
