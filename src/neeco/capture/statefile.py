@@ -37,7 +37,7 @@ def read_states(path: Path, instruments: Sequence[Instrument]) -> list[StateLine
     Raises NeecoError naming file, line and field: unreadable, not JSON, an instrument or joint missing or unknown, a
     pose that is not rigid, a joint outside its limits.
     """
-    missing = "no such file; --states takes inside, beyond, grid or a file of states"
+    missing = "no such file; --states takes interpolate, extrapolate, grid or a file of states"
     lines = read_text(Path(path), "one JSON object per line", missing).split("\n")
     states = [
         _parse_line(line, f"{path}: line {number}", instruments) for number, line in enumerate(lines, 1) if line.strip()
