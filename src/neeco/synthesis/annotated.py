@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Capture, Frame
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
 from neeco.files import own_folder, write_json

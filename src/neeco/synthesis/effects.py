@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from numpy.random import Generator
 
-from neeco.capture.nodes import as_float
+from neeco.capture.documents import as_float
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 

@@ -11,8 +11,7 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import State
-from neeco.capture.similarity import RecordedStates
+from neeco.capture.model import RecordedStates, State
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
