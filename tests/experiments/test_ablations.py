@@ -13,7 +13,7 @@ import torch
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.experiments import ablation_run, training_job
 from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
 from neeco.experiments.ablation_run import chosen_ablations, distinct_variants, run_ablations

@@ -14,7 +14,7 @@ from neeco.capture.check import read_checked
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
+from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.comparison_tables import write_tables
 from neeco.experiments.machine import machine, measure_speed
 from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neeco.capture.model import Capture
-from neeco.evaluation.difference import FULL_SCALE
+from neeco.evaluation.image_metrics import FULL_SCALE
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.experiments.comparison import job_folder
 from neeco.experiments.comparison_tables import (

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import overlay_outline
-from neeco.evaluation.image_metrics import psnr
+from neeco.evaluation.image_metrics import overlay_outline, psnr
+from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.evaluation.truth import load_reference
 from neeco.experiments.comparison import job_folder
 from neeco.labels.drawing import draw
 from neeco.report.page import difference, jpeg, to_bytes
