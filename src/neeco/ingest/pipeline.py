@@ -314,7 +314,7 @@ class _Ingest:
                 splits[i],
                 self.visible / f"{frames[i]:06d}.png.png" if self.visible else None,
             )
-            for i in chosen
+            for i in chosen.tolist()
         )
         reliable = sfm.reliable_points()
         if not reliable.any():

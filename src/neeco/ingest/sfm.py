@@ -169,5 +169,7 @@ def _load(path: Path, names: list[str], source: Path) -> SfmResult:
         row = {name: index for index, name in enumerate(names)}
         arrays = ("world_from_camera", "points", "colors", "errors", "lengths", "observations", "camera_params")
         return SfmResult(
-            np.array([row[name] for name in found]), *(saved[name] for name in arrays), float(saved["reprojection"])
+            indices=np.array([row[name] for name in found]),
+            reprojection_px=float(saved["reprojection"]),
+            **{name: saved[name] for name in arrays},
         )
