@@ -19,8 +19,8 @@ import torch
 from scipy.ndimage import binary_opening, distance_transform_edt, uniform_filter
 from torch import Tensor
 
-from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Capture, Frame
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
 from neeco.files import own_folder, write_json

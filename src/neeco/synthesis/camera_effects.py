@@ -18,8 +18,8 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.documents import as_float
 from neeco.capture.model import InstrumentState, State
-from neeco.capture.nodes import as_float
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 from neeco.labels.annotation import place_in_image, working_ends

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.poses import swap_camera_axes
+from neeco.capture.model import swap_camera_axes
 from neeco.files import write_json
 from neeco.labels.annotation import bounding_box
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
