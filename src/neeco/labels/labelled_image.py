@@ -10,15 +10,16 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.labels.annotation import annotate, keypoint_names
-from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.labels.annotation import InstrumentLabel, annotate, keypoint_names
+from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth
 from neeco.labels.labellers import CompositedLabels, instruments_of
 from neeco.raster.types import Camera
+from neeco.scene.scene import gaussian_scene
 
 if TYPE_CHECKING:
-    from neeco.scene import Drawable, Scene
+    from neeco.scene import Drawable
 
-MIN_COMPONENT = 0.01  # of an instrument's largest component: smaller ones are not labelled
+MIN_COMPONENT = 0.01  # of an instrument's largest component: smaller ones are not labelled, as by `synthesize`
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,16 @@ class LabelledImage(RGBDImage):
 
     @classmethod
     def from_drawing(
-        cls, scene: Scene, drawing: LayeredDrawing, part_names: tuple[tuple[str, str], ...]
+        cls,
+        drawing: LayeredDrawing,
+        labels: Sequence[InstrumentLabel],
+        part_names: tuple[tuple[str, str], ...],
+        keypoint_names: tuple[str, ...],
     ) -> LabelledImage:
-        """The labels that a drawing of `scene` implies."""
-        labels = [label.to_json() for label in annotate(scene, drawing, part_names)]
+        """From a drawing and the `labels` that `annotate` finds in it."""
+        values = [label.to_json() for label in labels]
         depth = torch.from_numpy(drawing.depth)
-        return cls.of(drawing.image, depth, drawing.parts, drawing.ignored, labels, part_names, keypoint_names(scene))
+        return cls.of(drawing.image, depth, drawing.parts, drawing.ignored, values, part_names, keypoint_names)
 
     def targets(self) -> dict[str, Tensor]:
         """As torchvision's detection models take it: image float32 [3, H, W], and `labels` int64 [I], counted from 1 in
@@ -122,9 +127,6 @@ def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool = 
     Raises NeecoError where the state lacks an instrument or joint of the scene; and with `labels` where the scene's
     method learns none.
     """
-    from neeco.labels.drawing import surface_depth
-    from neeco.scene.scene import gaussian_scene
-
     if not labels:
         rendering = scene.render(state, camera)
         depth = torch.from_numpy(surface_depth(rendering)).float()
@@ -132,4 +134,5 @@ def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool = 
     known = gaussian_scene(scene, "draw labels")
     labeller = CompositedLabels(known)
     drawing = draw_layers(known, labeller, state, camera, MIN_COMPONENT)
-    return LabelledImage.from_drawing(known, drawing, labeller.names)
+    found = annotate(known, drawing, labeller.names)
+    return LabelledImage.from_drawing(drawing, found, labeller.names, keypoint_names(known))
