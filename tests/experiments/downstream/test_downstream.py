@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import torch
 from downstream_world import Pixels, bar_parts, read_grey, save_grey, write_set
+from neeco.experiments.downstream.plan import DownstreamSpec, job_folder, plan_downstream
+from neeco.experiments.downstream.tables import tables_of, write_tables
 from torch import Tensor
 
 from neeco.errors import NeecoError
@@ -27,10 +29,8 @@ from neeco.experiments.downstream import model as models_module
 from neeco.experiments.downstream import plan as plan_module
 from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
 from neeco.experiments.downstream.job import Teaching
-from neeco.experiments.downstream.model import Boxes
-from neeco.experiments.downstream.plan import DownstreamSpec, job_folder, plan_downstream
 from neeco.experiments.downstream.samples import DataSet
-from neeco.experiments.downstream.tables import tables_of, write_tables
+from neeco.experiments.downstream.scores import Detections
 
 TIMES = ("seconds", "processor_seconds", "machine")
 
@@ -39,10 +39,10 @@ class Corners(Pixels):
     """Always answers with one box, learned or not."""
 
     model = "corners"
-    answers = "boxes"
+    predicts = "boxes"
 
-    def answer(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Boxes]:
-        return [Boxes(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
+    def predictions(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Detections]:
+        return [Detections(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
 
 
 @pytest.fixture(autouse=True)
@@ -143,12 +143,12 @@ def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: 
     chosen: dict[int, set] = {}
     for job in plan.jobs:
         task = job._task(plan.capture)
-        learned = tuple(sample.name for sample in task.feed.sources[0])
+        learned = tuple(sample.name for sample in task.batches.sources[0])
         kept = tuple(sample.name for sample in task.validation)
         assert len(learned) + len(kept) == 6
         assert not set(learned) & set(kept)
         assert {"006", "007", "012"}.isdisjoint({*learned, *kept})
-        assert len(task.feed.sources) == 1 + len(job.condition.sets)
+        assert len(task.batches.sources) == 1 + len(job.condition.sets)
         chosen.setdefault(job.fold, set()).add((learned, kept))
     assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
     assert len(set.union(*chosen.values())) == 3
@@ -174,7 +174,7 @@ def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSpec, monkeypa
     assert finish() == [(None, False), (None, False), ((6 - 2) * 2, True)]  # of six steps of two
     monkeypatch.setattr(job_module, "FINISH_ROUNDS", 0.4)  # of five frames: two images
     assert finish()[2] == ((6 - 1) * 2, True)
-    monkeypatch.setattr(Pixels, "orders_images", False)
+    monkeypatch.setattr(Pixels, "keeps_order", False)
     assert finish() == [(None, False)] * 3
 
 
@@ -347,11 +347,11 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSpec, capture: Pat
         ({"workers": 0}, "--workers: 0 is none at all; give at least 1"),
         ({"models": ()}, "--models: none is given"),
         ({"models": ("segformer",)}, "--models: 'segformer' is unknown; choose of"),
-        ({"real": ("some",)}, "--real: 'some' is neither a number of labelled frames nor all"),
-        ({"real": ("11",)}, "--real: 11 labelled frames are asked for, the capture has 10; use all"),
-        ({"real": ()}, "--real: leaves nothing to teach"),
-        ({"real": ("6",), "conditions": ("kin",)}, "--real: leaves nothing to teach; add 0"),
-        ({"real": ("0",), "conditions": ("real",)}, "--real: leaves nothing to teach"),
+        ({"real": ("some",)}, "--num-real: 'some' is neither a number of labelled frames nor all"),
+        ({"real": ("11",)}, "--num-real: 11 labelled frames are asked for, the capture has 10; use all"),
+        ({"real": ()}, "--num-real: leaves nothing to teach"),
+        ({"real": ("6",), "conditions": ("kin",)}, "--num-real: leaves nothing to teach; add 0"),
+        ({"real": ("0",), "conditions": ("real",)}, "--num-real: leaves nothing to teach"),
         ({"conditions": ("kim",)}, "--conditions kim: 'kim' is neither"),
         ({"weights": {"unet": Path("x")}}, "--weights: 'unet' is not among --models pixels"),
         ({"weights": {"pixels": Path("/nowhere/w")}}, "--weights pixels: /nowhere/w: no such file"),
@@ -441,13 +441,13 @@ def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSpec
 
 
 def test_a_model_that_lacks_something_is_refused_with_the_remedy(spec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pixels, "unmet", classmethod(lambda cls: "needs patience; pip install patience"))
+    monkeypatch.setattr(Pixels, "missing_requirement", classmethod(lambda cls: "needs patience; pip install patience"))
     with refused("--models pixels: needs patience; pip install patience"):
         plan_downstream(spec)
 
 
 def test_images_too_small_for_a_model_are_refused(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pixels, "sees_too_little", classmethod(lambda cls, size: size[0] < 48))
+    monkeypatch.setattr(Pixels, "is_too_small", classmethod(lambda cls, size: size[0] < 48))
     plan_downstream(spec)
     with refused("--models pixels: it would see images of 24x16 px, too small for it; give a larger --size"):
         plan_downstream(changed(spec, side=24))
@@ -496,11 +496,11 @@ def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSpec, drawn:
     result = taught(replace(spec, folds=1, real=("0", "6")))
     failed = [job["condition"] for job in result["jobs"] if "error" in job]
     assert failed == ["kin", "kin+real"]
-    assert "000003.png: id 77 means nothing" in result["jobs"][1]["error"]
+    assert "000003.png: id 77 has no class" in result["jobs"][1]["error"]
 
 
 def test_a_course_that_still_rises_is_noted(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.experiments.downstream import torch_training
+    from neeco.experiments.downstream import model as torch_training
 
     score = [0.0]
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neeco.experiments.downstream.results import (
-    answers_of,
     comparisons,
     equivalent,
+    findings,
     metrics_of,
     paired,
     summarise_folds,
@@ -48,7 +48,7 @@ def documented(results: list[dict], sets=("kin", "other"), models=MASKS) -> dict
         "summary": summarise_folds(results, models, ["test"]),
         "paired": comparisons([one for one in results if "error" not in one], models, ["test"], sets),
     }
-    return made | {"answers": answers_of(made)}
+    return made | {"answers": findings(made)}
 
 
 def pairs(results: list[dict], sets=("kin", "other")) -> set[tuple]:
