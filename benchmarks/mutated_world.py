@@ -58,11 +58,11 @@ def prepare() -> None:
         "av",
     ):
         importlib.import_module(module)
-    from neeco.experiments import speed
+    from neeco.experiments import machine
 
     torch.set_num_threads(1)
     hasten_ingest()
-    speed.ROUNDS, speed.DRAWS = 1, 1
+    machine.ROUNDS, machine.DRAWS = 1, 1
 
 
 def make_world(desk: Path, wanted: set[str]) -> None:

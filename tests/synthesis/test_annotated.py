@@ -55,7 +55,7 @@ def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Rec
     for index in range(8):
         state = rod_state(x=2.0 * index - 7, y=3.0, jaw=0.1 * index)
         with torch.no_grad():
-            image = scene.draw(state, CAMERA).color.clamp(0, 1)
+            image = scene.render(state, CAMERA).color.clamp(0, 1)
         if index == HIDDEN:
             image[5:45, 20:60] = torch.tensor([0.1, 0.3, 0.9])
         path = root / "images" / f"{index:03d}.png"

@@ -98,3 +98,12 @@ class Capture:
     def splits(self) -> tuple[str, ...]:
         """Names of the splits present, in order of first appearance."""
         return tuple(dict.fromkeys(frame.split for frame in self.frames))
+
+
+def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
+    """Indices of at most `most` of `count` items, evenly spaced from the first to the last, in order, none twice.
+
+    Places between two items are rounded to the nearest (half to even), or with `floor` down.
+    """
+    places = np.linspace(0, count - 1, min(count, most))
+    return np.unique((np.floor if floor else np.rint)(places).astype(int)).tolist()

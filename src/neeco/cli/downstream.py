@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from neeco.cli._outcome import tell_outcome
-from neeco.cli._tables import fitted
-from neeco.settings import Device
+from neeco.cli._output import fitted, print_outcome
+from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.experiments.downstream.plan import DownstreamSpec
@@ -67,7 +66,7 @@ class Downstream:
 
 def run(args: Downstream) -> int:
     """Teach and test with progress bars; print tables, answers and where the files lie; 1 when a training failed."""
-    from neeco.cli._bars import Bars
+    from neeco.cli._progress import Bars
     from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
     from neeco.experiments.downstream.plan import plan_downstream
     from neeco.experiments.downstream.tables import tables_of, write_tables
@@ -87,7 +86,9 @@ def run(args: Downstream) -> int:
     for sentence in experiment["answers"]:
         console.print(sentence, markup=False, highlight=False)
     notes, failed = experiment["notes"], failed_jobs(experiment)
-    return tell_outcome(console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings")
+    return print_outcome(
+        console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings"
+    )
 
 
 def _spec(args: Downstream) -> DownstreamSpec:
@@ -108,7 +109,7 @@ def _spec(args: Downstream) -> DownstreamSpec:
         batch=args.batch,
         device=args.device,
     )
-    weights = dict(_named("--weights", word, "unet=unet.safetensors") for word in args.weights)
+    weights = dict(name_and_value("--weights", word, "unet=unet.safetensors") for word in args.weights)
     return DownstreamSpec(
         teaching,
         args.output,
@@ -126,19 +127,10 @@ def _data_set(word: str) -> DataSet:
     from neeco.errors import NeecoError
     from neeco.experiments.downstream.samples import DataSet
 
-    name, place = _named("--sets", word, "kinematic=dataset")
+    name, place = name_and_value("--sets", word, "kinematic=dataset")
     folder, colon, count = place.rpartition(":")
     if not colon or not count.isdecimal() or Path(place).exists():
         return DataSet(name, Path(place))
     if int(count) < 1:
         raise NeecoError(f"--sets {word}: {count} images is nothing to learn from; give at least 1")
     return DataSet(name, Path(folder), int(count))
-
-
-def _named(option: str, word: str, example: str) -> tuple[str, str]:
-    from neeco.errors import NeecoError
-
-    name, equals, value = word.partition("=")
-    if not (name and equals and value):
-        raise NeecoError(f"{option}: {word!r} is not NAME=PATH; write such as {example}")
-    return name, value

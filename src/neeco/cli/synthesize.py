@@ -38,8 +38,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Make the data set and say where it lies."""
-    from neeco.cli._bars import counting
-    from neeco.cli._kept import kept
+    from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.synthesis.dataset import synthesize
     from neeco.training.run import load_run, open_run
@@ -50,7 +49,7 @@ def run(arguments: Arguments) -> int:
     device = device_of(arguments.device)
     with open_run(drawn, device) as trained, counting("synthesize", settings.count) as advance:
         others = [load_run(cast, device) for cast in casts]
-        with kept("what was drawn is kept; run the same command again with --resume"):
+        with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,
                 arguments.output,

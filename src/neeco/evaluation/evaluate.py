@@ -181,7 +181,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     for index in range(TIMED_DRAWS + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
-        synchronise(scene.draw(frame.state, frame.camera).color.device)
+        synchronise(scene.render(frame.state, frame.camera).color.device)
         seconds.append(time.perf_counter() - start)
         if len(seconds) > 1 and sum(seconds) > TIMED_SECONDS:
             break

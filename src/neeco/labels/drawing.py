@@ -85,7 +85,7 @@ class Labeller(Protocol):
 @torch.no_grad()
 def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
     """Draw `state` as `camera` sees it, with the scene's own labels where it has any."""
-    rendering = scene.draw(state, camera, labels=True)
+    rendering = scene.render(state, camera, labels=True)
     parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
 

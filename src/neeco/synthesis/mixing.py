@@ -6,7 +6,6 @@ there; lengths stay what they are (mm). The light is that of the tissue's captur
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.random import Generator
-from torch import Tensor, nn
+from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
@@ -26,8 +25,7 @@ from neeco.raster.pinhole import project
 from neeco.raster.sh import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
-from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.deformations.base import Deformation
 from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.scene.seen import SEEN
@@ -61,7 +59,7 @@ class Mixture:
     def of(cls, tissue: Scene, casts: Sequence[Scene]) -> Mixture:
         """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
         for scene in (tissue, *casts):
-            if not isinstance(scene.deformation, Kinematic):
+            if not scene.deformation.separates_instruments or scene.method != tissue.method:
                 raise NeecoError(
                     f"--instruments: method {scene.method} does not keep tissue and instruments apart; "
                     "mix runs of method kinematic"
@@ -192,12 +190,10 @@ def tissue_depth(ground: Gaussians, camera: Camera, point: np.ndarray) -> float:
 def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:
     """One scene of the tissue of `tissue` and the instruments of `casts`."""
     instruments = tuple(instrument for scene in casts for instrument in scene.instruments)
-    deformation = Kinematic(instruments, copy.deepcopy(casts[0].settings))
-    deformation.hinges = nn.ModuleList(copy.deepcopy(hinges) for s in casts for hinges in _kinematic(s).hinges)
-    columns = deformation.logit_count
-    bodies = [_body(tissue, 0, columns)]
+    deformation = tissue.deformation.combined([scene.deformation for scene in casts])
+    bodies = [_body(tissue, 0, deformation)]
     for scene, gain in zip(casts, gains, strict=True):
-        bodies += [_brightened(_body(scene, k + 1, columns), gain) for k in range(len(scene.instruments))]
+        bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
     mixed = Scene(
         tissue.method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
@@ -211,19 +207,13 @@ def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float
     return mixed.requires_grad_(False)
 
 
-def _kinematic(scene: Scene) -> Kinematic:
-    assert isinstance(scene.deformation, Kinematic)
-    return scene.deformation
-
-
-def _body(scene: Scene, index: int, columns: int) -> CanonicalGaussians:
-    """One body alone, with as many part logits as the mixed scene has, and how well it was seen."""
+def _body(scene: Scene, index: int, deformation: Deformation) -> CanonicalGaussians:
+    """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
-    logits = canonical.extras[PART_LOGITS][rows]
     seen = scene.seen()[rows]
-    padded = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
+    extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
-    return alone.with_extras(**{PART_LOGITS: padded, SEEN: seen})
+    return alone.with_extras(**extras, **{SEEN: seen})
 
 
 def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:

@@ -120,8 +120,8 @@ def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["--sets", "kin"], "--sets: 'kin' is not NAME=PATH; write such as kinematic=dataset"),
-        (["--sets", "=x"], "--sets: '=x' is not NAME=PATH"),
+        (["--sets", "kin"], "--sets: 'kin' is not NAME=VALUE; write such as kinematic=dataset"),
+        (["--sets", "=x"], "--sets: '=x' is not NAME=VALUE"),
         (["--sets", "kin=nowhere:0"], "--sets kin=nowhere:0: 0 images is nothing to learn from; give at least 1"),
         (["--sets", "kin=nowhere"], "--sets kin: nowhere: no folder images/; give what `neeco synthesize` wrote"),
         (["--sets", "kin=nowhere:many"], "--sets kin: nowhere:many: no folder images/"),
@@ -137,7 +137,7 @@ def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path
         (["--batch", "-1"], "--batch: -1 is none at all"),
         (["--splits", "tset"], "has no split 'tset'; it has train, test, unseen"),
         (["--labels", "nowhere"], "nowhere: no such folder; give a folder of masks"),
-        (["--weights", "unet"], "--weights: 'unet' is not NAME=PATH; write such as unet=unet.safetensors"),
+        (["--weights", "unet"], "--weights: 'unet' is not NAME=VALUE; write such as unet=unet.safetensors"),
         (["--weights", "unet=nowhere"], "--weights unet: nowhere: no such file"),
         (["--weights", "dfine=nowhere"], "--weights: 'dfine' is not among --models unet"),
         (["--device", "tpu"], "--device: 'tpu' is unknown"),

@@ -32,14 +32,13 @@ from neeco.scene.deformations.base import (
     state_of,
 )
 from neeco.scene.encoding import encode
-from neeco.scene.learning import Training
 from neeco.scene.swept import SweptVolume
+from neeco.scene.training_session import GaussianTraining
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
 SHAPE_UNIT = 0.1  # of quaternion and log scale
-WARM_UP = 0.075  # share of the training: Deformable-3DGS rests for 3,000 of 40,000 iterations
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class NPSSettings:
     state: Literal["full", "rotation_jaw"] = "full"
     half: bool = False
     chunk: int = 65536
-    warm_up: float = WARM_UP
+    warm_up: float = 0.075
     gate_mm: float | None = None
 
     def __post_init__(self) -> None:
@@ -144,7 +143,7 @@ class NPS(LabelledByMotion):
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
         self.mean_center, self.mean_halfwidth = point_box(means)
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
             training.instruments.bound(self.gate)
 

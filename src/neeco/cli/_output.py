@@ -1,12 +1,18 @@
-"""Tables for the terminal, cut between columns where they are wider than it."""
+"""What several verbs print: tables that fit the terminal, where files lie, what failed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
+
+from neeco.errors import NeecoError
+from neeco.files import new_folder
 
 if TYPE_CHECKING:
     from neeco.experiments.tables import Table as ResultTable
@@ -23,8 +29,8 @@ def fitted(table: ResultTable, width: int) -> list[Table]:
     rows = []
     for row in table.rows:
         cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
-        told = cells if row.failed is None else [Text("failed", "red")]
-        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *told])
+        shown = cells if row.failed is None else [Text("failed", "red")]
+        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *shown])
     return _pieces(table.title, headings, rows, keys, width)
 
 
@@ -63,3 +69,33 @@ def _piece(
     for row in rows:
         table.add_row(*row[:keys], *(row[keys:] if len(row) == keys + 1 else [row[i] for i in group]))
     return table
+
+
+def print_outcome(
+    console: Console, output: Path, stem: str, page: Path, notes: Sequence[str], failed: Sequence[str], runs: str
+) -> int:
+    """Print notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`) failed, and prints
+    the first failure."""
+    for note in notes:
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    for what, name in (("tables", f"{stem}.md, .csv, .tex"), ("all numbers", f"{stem}.json, data/")):
+        console.print(f"{what}: {output}/: {name}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
+    if not failed:
+        return 0
+    more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""
+    text = f"neeco: error: {len(failed)} of {runs} failed: {failed[0]}{more}"
+    Console(stderr=True).print(text, markup=False, highlight=False, soft_wrap=True)
+    return 1
+
+
+@contextmanager
+def ready_for_json(path: Path | None) -> Iterator[None]:
+    """For the work whose numbers go to `--json`: checks before it that the file can be written.
+
+    Raises NeecoError for a folder, or a file whose folder cannot be written to.
+    """
+    if path is not None and path.is_dir():
+        raise NeecoError(f"--json: {path} is a folder; name a file")
+    with nullcontext() if path is None else new_folder(path.parent):
+        yield
