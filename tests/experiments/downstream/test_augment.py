@@ -14,7 +14,7 @@ from neeco.experiments.downstream.samples import augment
 SIZE = (60, 80)
 
 
-def coloured(counted: bool = False, share: bool = False) -> Example:
+def coloured(valid: bool = False, coverage: bool = False) -> Example:
     """A red and a green rectangle of two instruments before blue."""
     classes, instruments = np.zeros((2, *SIZE), np.uint8)
     image = np.full((*SIZE, 3), (10, 10, 130), np.uint8)
@@ -26,8 +26,8 @@ def coloured(counted: bool = False, share: bool = False) -> Example:
         image,
         classes,
         instruments,
-        everywhere if counted else None,
-        (classes > 0).astype(np.float32) * 0.8 if share else None,
+        everywhere if valid else None,
+        (classes > 0).astype(np.float32) * 0.8 if coverage else None,
     )
 
 
@@ -91,7 +91,7 @@ def test_the_same_numbers_give_the_same_pixels_and_others_do_not() -> None:
 def test_the_original_is_left_as_it_was() -> None:
     example, before = coloured(valid=True, coverage=True), coloured(valid=True, coverage=True)
     augment(example, np.random.default_rng(1))
-    for name in ("image", "classes", "instruments", "counted", "share"):
+    for name in ("image", "classes", "instruments", "valid", "coverage"):
         assert np.array_equal(getattr(example, name), getattr(before, name))
 
 

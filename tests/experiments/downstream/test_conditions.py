@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -10,17 +11,16 @@ from hypothesis import strategies as st
 
 from neeco.errors import NeecoError
 from neeco.experiments.downstream.job import (
-    HELD_BACK_EVERY,
-    HELD_BACK_FROM,
     Condition,
+    DownstreamSettings,
     default_conditions,
-    hold_out,
     labelled_count,
     labelled_frames,
     parse_condition,
 )
 
 SETS = ("kin", "other")
+SETTINGS = DownstreamSettings(Path("capture"), Path("out"))
 
 
 @pytest.mark.parametrize(
@@ -107,14 +107,14 @@ def test_whole_stretches_are_drawn_from() -> None:
 
 @given(st.integers(0, 60), st.integers(0, 12))
 def test_what_is_held_back_is_not_learned_and_nothing_is_lost(count: int, fold: int) -> None:
-    learned, kept = hold_out(range(count), fold)
+    learned, kept = SETTINGS.hold_out(range(count), fold)
     assert sorted([*learned, *kept]) == list(range(count))
-    assert bool(kept) == (count >= HELD_BACK_FROM)
-    assert len(kept) <= -(-count // HELD_BACK_EVERY)
+    assert bool(kept) == (count >= SETTINGS.min_validated)
+    assert len(kept) <= -(-count // SETTINGS.validation_every)
     assert learned or not count
 
 
 def test_each_fold_holds_back_other_images() -> None:
-    kept = [hold_out(range(40), fold)[1] for fold in range(5)]
+    kept = [SETTINGS.hold_out(range(40), fold)[1] for fold in range(5)]
     assert sorted(frame for fold in kept for frame in fold) == list(range(40))
-    assert hold_out(range(40), 5) == hold_out(range(40), 0)
+    assert SETTINGS.hold_out(range(40), 5) == SETTINGS.hold_out(range(40), 0)

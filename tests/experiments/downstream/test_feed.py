@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-import pytest
 from downstream_world import Held, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.experiments.downstream import feed as module
 from neeco.experiments.downstream.samples import BatchSampler
 
 SOURCES = [squares(3, 0, 16), squares(11, 10, 16), squares(1, 50, 16)]
@@ -79,14 +77,14 @@ def test_augmentation_sees_every_example_and_repeats_with_the_seed() -> None:
     assert len(set(first)) == 9
 
 
-def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def read_twice() -> list[int]:
+def test_images_are_read_once_unless_they_do_not_fit() -> None:
+    def read_twice(**limit: int) -> list[int]:
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
-        feed = BatchSampler([source], 0)
+        feed = BatchSampler([source], 0, **limit)
         again = [feed.batch(4) for _ in range(3)]
         assert all(any(np.array_equal(example.image, s.example.image) for s in source) for b in again for example in b)
         return sorted(len(sample.loads) for sample in source)
 
     assert read_twice() == [1, 1, 1, 1]
-    monkeypatch.setattr(module, "CACHE_BYTES", 2 * (3 + 1 + 1) * 16**2)  # image, classes, instruments of two
-    assert read_twice() == [1, 1, 3, 3]
+    two = 2 * (3 + 1 + 1) * 16**2  # image, classes and instruments of two
+    assert read_twice(cache_bytes=two) == [1, 1, 3, 3]

@@ -22,6 +22,7 @@ from neeco.experiments.downstream.models import dfine
 from neeco.experiments.downstream.models.dfine import DFine
 from neeco.experiments.downstream.models.unet import UNet, targets
 from neeco.experiments.downstream.samples import BatchSampler, Example
+from neeco.experiments.downstream.scores import Detections
 
 
 def needs(model: str) -> None:
@@ -65,9 +66,9 @@ def test_another_seed_or_other_threads_of_random_numbers_give_other_or_the_same_
 @pytest.fixture
 def small_dfine(monkeypatch: pytest.MonkeyPatch) -> None:
     needs("dfine")
-    monkeypatch.setattr(dfine, "STAGES", (16, 32, 64, 64))
-    monkeypatch.setattr(dfine, "WIDTH", 32)
-    monkeypatch.setattr(dfine, "QUERIES", 6)
+    monkeypatch.setattr(DFine, "stages", (16, 32, 64, 64))
+    monkeypatch.setattr(DFine, "width", 32)
+    monkeypatch.setattr(DFine, "queries", 6)
     monkeypatch.setattr(DFine, "learning_rate", 2e-3)
 
 

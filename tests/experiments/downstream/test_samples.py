@@ -152,7 +152,7 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     (tmp_path / "empty" / "images").mkdir(parents=True)
     with refused("--sets set", "has no image", "neeco synthesize"):
         loaded(tmp_path / "empty")
-    with refused("--sets set", "has 6 images, not 7; draw more"):
+    with refused("--sets set", "has 6 images, not 7; synthesize more"):
         loaded(drawn, count=7)
     with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
         synthetic_samples(DataSet("set", drawn), "instrument", "hard", (60, 50))
@@ -200,14 +200,14 @@ def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> Non
     """It would go into downstream.json, which could not be written."""
     stated = json.loads((drawn / "dataset.json").read_text())
     (drawn / "dataset.json").write_text(json.dumps(stated | {"settings": {"count": float("nan")}}))
-    with refused("--sets set", "dataset.json: holds NaN or an infinite number; draw the set again"):
+    with refused("--sets set", "dataset.json: holds NaN or an infinite number; synthesize the set again"):
         loaded(drawn)
 
 
 def test_parts_are_refused_where_labels_tell_none(drawn: Path) -> None:
     write_ids(drawn, tuple((name, "instrument") for name in "abcd"))
     assert loaded(drawn)[0].instruments.max() == 4
-    with refused("--sets set", "tell no parts; use --classes instrument"):
+    with refused("--sets set", "have no parts; use --classes instrument"):
         loaded(drawn, "parts")
 
 
