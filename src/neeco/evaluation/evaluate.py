@@ -21,8 +21,8 @@ from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, m
 from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
-from neeco.labels.composited import threshold_of
 from neeco.labels.drawing import draw
+from neeco.labels.labellers import threshold_of
 from neeco.raster.threads import synchronise
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene

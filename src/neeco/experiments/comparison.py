@@ -11,7 +11,7 @@ from typing import Any
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
-from neeco.capture.fingerprint import fingerprint
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips

@@ -41,7 +41,7 @@ from neeco.report.downstream_figures import (
     with_labelled,
 )
 from neeco.report.downstream_shots import Gallery, galleries
-from neeco.report.render import REPORT_FILE, split_counts, write_page
+from neeco.report.page import REPORT_FILE, split_counts, write_page
 
 FAILED = "failed: "  # how notes on failed trainings begin; they are listed by themselves
 CHANCE = round(1 / (1 - CONFIDENCE))  # of so many comparisons that differ in nothing, one is called a difference
