@@ -13,7 +13,7 @@ from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture.images import write_labels
 from neeco.experiments.downstream.job import job_folder
-from neeco.experiments.downstream.results import findings, comparisons, summarise_folds, verdict
+from neeco.experiments.downstream.results import comparisons, findings, summarise_folds, verdict
 from neeco.experiments.downstream.samples import CLASSES, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_figures import differences, families, question, score_chart, signed
@@ -329,7 +329,7 @@ def test_a_logarithmic_axis_has_the_points_as_ticks():
 def test_the_command_makes_the_same_experiment(experiment):
     told = command_of(experiment)
     assert told.startswith("neeco downstream ")
-    assert "--sets kinematic=/sets/kinematic --models unet dfine --real 0 5 all --folds 2 --splits test unseen" in told
+    assert "--sets kinematic=/sets/kinematic --models unet dfine --num-real 0 5 all --folds 2 --splits test unseen" in told
     assert "--conditions" not in told
     experiment["jobs"][0]["condition"] = "kinematic+soft"
     assert "--conditions kinematic+soft real real+augment kinematic kinematic+real" in command_of(experiment)

@@ -11,8 +11,7 @@ from markupsafe import Markup
 
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.experiments.downstream.job import AUGMENT, REAL
-from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, verdict
-from neeco.experiments.downstream.results import title_of
+from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, title_of, verdict
 from neeco.report.charts import (
     PALETTE,
     Level,

@@ -56,7 +56,7 @@ class DownstreamPlan:
 
 
 def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
-    """Check everything that can be known before the work. Raises NeecoError for whatever cannot be trained or tested."""
+    """Check all that can be known before the work. Raises NeecoError for what cannot be trained or tested."""
     for option in ("folds", "steps", "size", "batch"):
         value = getattr(settings, option)
         if value is not None and value < 1:

@@ -52,6 +52,8 @@ HELPS, HURTS, NONE_SHOWN = "helps", "hurts", "no difference shown"
 VERDICTS = (HELPS, HURTS, NONE_SHOWN)
 JOB_KEYS = ("model", "condition", "real", "fold")
 KEYS = ("trained on", "labelled")
+PAIRED_KEYS = ("model", "split", "metric", "condition", "real", "against", "against_real")
+PAIRED_COLUMNS = (*PAIRED_KEYS, "folds", "difference", "low", "high")
 
 Document = Mapping[str, Any]
 Scores = Mapping[tuple[str, int], Mapping[int, float]]  # by (condition, labelled frames): the score by fold
@@ -140,19 +142,8 @@ def paired(jobs: Sequence[Document], first: Arm, second: Arm, split: str, metric
     if folds > 1:
         reach = stats.t.ppf((1 + CONFIDENCE) / 2, folds - 1) * differences.std(ddof=1) / math.sqrt(folds)
         low, high = mean - float(reach), mean + float(reach)
-    return {
-        "model": first.model,
-        "split": split,
-        "metric": metric,
-        "condition": first.condition,
-        "real": first.real,
-        "against": second.condition,
-        "against_real": second.real,
-        "folds": folds,
-        "difference": mean,
-        "low": low,
-        "high": high,
-    }
+    keys = (first.model, split, metric, first.condition, first.real, second.condition, second.real)
+    return dict(zip(PAIRED_COLUMNS, (*keys, folds, mean, low, high), strict=True))
 
 
 def comparisons(
@@ -242,7 +233,8 @@ def _finding(key: tuple[str, int], scores: Scores, experiment: Document, model: 
     if REAL not in words:
         most, best = curve[-1]
         share = f"{100 * value / best:.1f} % of what" if best else "where"
-        return f"{count} and no manual label: {metric} {value:.3f}, {share} {most} labelled frames alone reach ({best:.3f})"
+        reference = f"{share} {most} labelled frames alone reach ({best:.3f})"
+        return f"{count} and no manual label: {metric} {value:.3f}, {reference}"
     rows = {
         row["against"]: row
         for row in main_differences(experiment, model, split)
@@ -367,7 +359,7 @@ def data_files(experiment: Document) -> dict[str, str]:
         "frames.csv": _all_keys([*keys, "split", "frame"], frames),
         "jobs.csv": [*keys, "iterations", "best_step", "seconds", "processor_seconds", "error"],
         "validation.csv": [*keys, "step", "score"],
-        "paired.csv": "model split metric condition real against against_real folds difference low high".split(),
+        "paired.csv": PAIRED_COLUMNS,
     }
     rows = (scores, frames, jobs, curves, experiment["paired"])
     return {name: csv_text(columns[name], some) for name, some in zip(columns, rows, strict=True)}

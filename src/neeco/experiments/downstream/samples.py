@@ -147,7 +147,7 @@ class DataSet:
         return require_inside(self.path.joinpath(*names), self.path)
 
     def info(self) -> Any:
-        """What its dataset.json says, fit to be written to another file; None where there is none. Raises NeecoError."""
+        """What its dataset.json says, fit for another JSON file; None where there is none. Raises NeecoError."""
         file = self.file(DATASET_FILE)
         if not file.is_file():
             return None
