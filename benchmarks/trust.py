@@ -24,7 +24,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.evaluation.truth import load_reference
 from neeco.labels.composited import CompositedLabels
-from neeco.raster.rotations import rigid_from_vector
+from neeco.raster.geometry import rigid_from_vector
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.annotated import fitted, usual_of
 from neeco.synthesis.trust import judge

@@ -23,7 +23,7 @@ from neeco.experiments.jobs import UNLIMITED, Budget, run_job
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
 from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
 from neeco.experiments.watching import HeldOut
-from neeco.raster.threads import set_threads
+from neeco.raster.native import set_threads
 from neeco.training import train as train_module
 from neeco.training.options import training_config
 from neeco.training.session import GaussianSession

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
-from neeco.raster.rotations import skew
+from neeco.raster.geometry import skew
 from neeco.scene.encoding import encode_by_octave, window
 from neeco.scene.nerfies.render import composite, even_depths, finer_depths
 from neeco.scene.nerfies.scene import NerfScene

@@ -19,7 +19,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
-from neeco.raster.rotations import rigid_from_vector
+from neeco.raster.geometry import rigid_from_vector
 from neeco.report.annotated_page import write_annotated_page
 from neeco.scene import Scene
 from neeco.synthesis import trust

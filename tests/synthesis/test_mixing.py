@@ -18,7 +18,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.synthesis.acceptance import ENTERS_ANOTHER, Acceptance

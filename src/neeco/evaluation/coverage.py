@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
 from neeco.labels.composited import composited_parts, threshold_of
-from neeco.raster.pinhole import pixel_centers, project, unproject_world
+from neeco.raster.geometry import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
 
 if TYPE_CHECKING:

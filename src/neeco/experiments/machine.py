@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from neeco.raster.devices import cuda_backend
-from neeco.raster.threads import simd, threads
+from neeco.raster.native import simd, threads
 
 STATUS = Path("/proc/self/status")
 CLEAR = Path("/proc/self/clear_refs")

@@ -161,7 +161,7 @@ def _run_there(job: Work, threads: int) -> dict[str, Any]:
     """In the worker: use no more than its share of cores and GPUs, then run the job."""
     import ray
 
-    from neeco.raster.threads import keep_freed_memory, set_threads
+    from neeco.raster.native import keep_freed_memory, set_threads
 
     if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time

@@ -11,7 +11,7 @@ import torch
 
 from neeco.capture.model import Capture, Frame
 from neeco.experiments.machine import machine
-from neeco.raster.threads import synchronise
+from neeco.raster.native import synchronise
 from neeco.training.run import Run
 
 WARM_UP = 3  # draws before any is timed

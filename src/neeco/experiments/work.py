@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from neeco.capture import Capture
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, read_json, require_inside, write_text
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], news in words
 
@@ -100,7 +100,7 @@ def attempt_job(job: Work, progress: JobProgress | None = None, capture: Capture
     folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
-        with failures_told():
+        with readable_failures():
             result = job.run(progress, capture)
     except NeecoError as error:
         return job.identity() | {"error": " ".join(str(error).split()), "splits": {}}

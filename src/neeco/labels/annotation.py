@@ -12,7 +12,7 @@ from torch import Tensor
 from neeco.labels.composited import instruments_of
 from neeco.labels.contours import bounding_box, minimum_rectangle, outer_polygons
 from neeco.labels.drawing import LayeredDrawing, to_numpy
-from neeco.raster.pinhole import project
+from neeco.raster.geometry import project
 from neeco.raster.types import Camera
 
 if TYPE_CHECKING:

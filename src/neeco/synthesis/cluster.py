@@ -16,7 +16,7 @@ from typing import Any
 from neeco.cluster import joined
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 from neeco.synthesis.making import Maker
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
@@ -110,7 +110,7 @@ def _kept(output: Path, record: Record, files: Mapping[str, bytes]) -> Record:
 def _make_there(parcel: Parcel, indices: tuple[int, ...]) -> Made | str:
     """In the worker: the images, or in a line what is wrong."""
     try:
-        with failures_told(), tempfile.TemporaryDirectory() as folder:
+        with readable_failures(), tempfile.TemporaryDirectory() as folder:
             maker = _maker(parcel)
             made = []
             for index in indices:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from neeco import cluster
 from neeco.errors import NeecoError
 from neeco.files import own_folder, write_json
-from neeco.raster.threads import threads
+from neeco.raster.native import threads
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE, UNSEEN
 from neeco.synthesis.cluster import make_on_cluster

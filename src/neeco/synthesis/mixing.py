@@ -22,7 +22,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.resize import resize_camera
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
-from neeco.raster.pinhole import project
+from neeco.raster.geometry import project
 from neeco.raster.sh import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from neeco.raster.threads import keep_freed_memory, set_threads
+from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_scene
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.making import Maker

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from neeco.errors import NeecoError
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 from neeco.synthesis.source import Source
 from neeco.synthesis.writers.folder import Record
 
@@ -130,7 +130,7 @@ def _work(source: Source, output: Path, threads: int, line: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        with failures_told():
+        with readable_failures():
             maker = source.maker(threads)
             with contextlib.suppress(EOFError):
                 while True:

@@ -14,7 +14,7 @@ from neeco.capture.check.frames import states_of
 from neeco.capture.parsed import Parsed, Place
 from neeco.capture.poses import swap_camera_axes
 from neeco.capture.problems import ProblemReport, errors_only, shown
-from neeco.raster.pinhole import project
+from neeco.raster.geometry import project
 
 FEW_POINTS = 100
 FAR = 10.0  # in sizes of the scene
