@@ -38,8 +38,8 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.experiments.jobs import Budget, Job, run_job
 from neeco.experiments.machine import machine
+from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.files import write_json, write_text
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.devices import device_of, readable_failures
@@ -217,8 +217,10 @@ def train_both(capture: Path, device: torch.device, iterations: int) -> list[dic
     for where in dict.fromkeys((str(device), "cpu")):
         with tempfile.TemporaryDirectory() as folder:
             config = training_config("kinematic", {})
-            job = Job("kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where)
-            done = run_job(job)
+            job = TrainingJob(
+                "kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where
+            )
+            done = job.run()
         scores = {name: {k: values[k] for k in ("psnr", "mask_iou")} for name, values in done["splits"].items()}
         rows.append({"device": where, "iterations": iterations, "seconds": done["seconds"], "splits": scores})
     return rows

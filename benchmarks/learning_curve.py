@@ -79,7 +79,7 @@ class HeldOut:
         for split, rows in self.frames.items():
             whole, inside = [], []
             for frame, photo, mask in rows:
-                image = scene.draw(frame.state, frame.camera).color.clamp(0, 1)
+                image = scene.render(frame.state, frame.camera).color.clamp(0, 1)
                 whole.append(psnr(image, photo, frame.load_mask()))
                 inside.append(psnr(image, photo, mask) if mask is not None else float("nan"))
             scores[split] = (sum(whole) / len(whole), sum(inside) / len(inside))

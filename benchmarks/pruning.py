@@ -45,7 +45,7 @@ def prune(path: Path, count: int) -> None:
         cells, began, drawn = [], time.process_time(), 0
         for split in held_out_splits(capture):
             frames = capture.split(split)
-            scores = [psnr(scene.draw(f.state, f.camera).color.clamp(0, 1), f.load_image()) for f in frames]
+            scores = [psnr(scene.render(f.state, f.camera).color.clamp(0, 1), f.load_image()) for f in frames]
             cells.append(f"{split} {statistics.mean(scores):.2f}")
             drawn += len(frames)
         each = (time.process_time() - began) / drawn * 1e3

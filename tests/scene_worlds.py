@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.raster.geometry import rigid_from_vector
+from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS

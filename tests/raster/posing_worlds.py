@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.geometry import rigid_from_vector
 from neeco.raster.posing import HingedBody, pose_bodies
+from neeco.raster.rotations import rigid_from_vector
 
 GAUSSIANS = ("means", "quats", "log_scales", "logits")
 LEARNED = ("world_from_body", "pivots", "axes", "angles", "shaft_origin", "shaft_direction")

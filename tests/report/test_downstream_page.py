@@ -312,7 +312,6 @@ def test_a_set_has_one_colour_alone_and_beside_labelled_frames(experiment):
     assert families(experiment) == ["real", "real+augment", "kinematic+real"]
     chart = score_chart(experiment, experiment["models"][0], "test")
     assert chart.count('class="level"') == 1
-    assert 'class="level" d=' in chart
     assert "var(--m2)" in chart.split('class="level"')[1].partition("/>")[0]
     assert chart.count("stroke-width: 0.7") == 3 * 2  # a thin line per condition and fold
 

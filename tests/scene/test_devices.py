@@ -92,7 +92,7 @@ def test_a_field_and_its_losses_stay_on_the_device() -> None:
     loss = drawn.fine.color.mean() + drawn.coarse.color.mean() + elastic + robust(moved.square().sum(-1)).mean()
     loss.backward()
     assert all_meta(loss, *(parameter.grad for parameter in scene.parameters()))
-    rendering = scene.draw(scene.recorded.states[0], scene.recorded.cameras[0])
+    rendering = scene.render(scene.recorded.states[0], scene.recorded.cameras[0])
     assert all_meta(rendering.color, rendering.alpha, rendering.depth)
 
 

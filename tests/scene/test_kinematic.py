@@ -13,7 +13,7 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.geometry import quat_to_matrix, rotate_about
+from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
 from neeco.scene.deformations.kinematic import PART_LOGITS, Spin
 

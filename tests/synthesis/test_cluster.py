@@ -55,7 +55,7 @@ def drawing_processes() -> list[int]:
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            if path.read_bytes().startswith(b"ray::_make_there"):
+            if path.read_bytes().startswith(b"ray::_draw_remotely"):
                 found.append(int(path.parent.name))
     return found
 

@@ -10,7 +10,7 @@ import torch
 
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.geometry import rigid_from_vector
+from neeco.raster.rotations import rigid_from_vector
 from neeco.training.initial import moving_joints
 
 ARM = Instrument("arm", {"insertion": None, "jaw": (0.0, 1.0), "stuck": None})

@@ -14,7 +14,7 @@ from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
     options = {
         "--minutes": args.minutes,

@@ -18,7 +18,7 @@ from torch.nn.functional import conv2d
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.evaluation.resize import resize_camera, resize_image
 from neeco.raster import rasterize
-from neeco.raster.geometry import rigid_from_vector
+from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Camera, Gaussians
 

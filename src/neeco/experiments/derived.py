@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.truth import MASK_FOLDERS
 from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
 from neeco.files import is_vacant, read_json, write_atomically, write_json
-from neeco.raster.geometry import rotation_from_vector
+from neeco.raster.rotations import rotation_from_vector
 
 RECIPE_FILE = "derived.json"
 

@@ -19,7 +19,7 @@ from scipy.spatial import QhullError
 
 from neeco.ingest.lens import Lens
 from neeco.ingest.sfm import SfmResult
-from neeco.raster.geometry import project, project_world
+from neeco.raster.pinhole import project, project_world
 
 STEP = 4  # px between the places where flow is compared
 NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with

@@ -35,7 +35,7 @@ from neeco.ingest.work import (
     states_at,
     states_for_choice,
 )
-from neeco.raster.geometry import project_world
+from neeco.raster.pinhole import project_world
 
 MOST_FRAMES = 400  # kept unless the recording asks for another number
 SCENE_MM = 100.0  # from the cameras to the tissue, taken when nothing measures it

@@ -9,8 +9,7 @@ from typing import Any
 
 import yaml
 
-from neeco.capture.nodes import as_float
-from neeco.capture.problems import shown
+from neeco.capture.documents import as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.columns import JointColumns, PoseColumns
@@ -163,7 +162,7 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"{shown(key.value)} is given twice; keep one of them", key.start_mark
+                    None, None, f"{printable(key.value)} is given twice; keep one of them", key.start_mark
                 )
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
@@ -222,7 +221,7 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
     for section, name in zip(sections, names, strict=True):
         assert name is not None
         if names.count(name) > 1:
-            raise section.error("name", f"{shown(name)} names two instruments; give each its own")
+            raise section.error("name", f"{printable(name)} names two instruments; give each its own")
         poses = section.value.get("poses")
         columns = None if poses is None else pose_columns(section, "poses", poses, TRACKER_CLOCK)
         joints = {}
@@ -273,9 +272,9 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
         clock = _clock_of(source, place, str(key).removesuffix(_SUFFIX), clocks)
         seconds = as_float(number)
         if seconds is None or not abs(seconds) < LARGEST:
-            raise source.error(place, f"{shown(number)} is not an offset in seconds; t_log = t_video + offset")
+            raise source.error(place, f"{printable(number)} is not an offset in seconds; t_log = t_video + offset")
         if clock is None:
-            notes.append(f"{source.file.name}: {shown(place)} belongs to no log of this recording; ignored")
+            notes.append(f"{source.file.name}: {printable(place)} belongs to no log of this recording; ignored")
         else:
             offsets[clock] = seconds
     return offsets, tuple(notes)
@@ -290,7 +289,9 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
         return longer[0]
     likely = close_match(name, clocks)
     if likely or len(longer) > 1:
-        raise source.error(place, f"no log has the clock {shown(name)}; did you mean {likely or ' or '.join(longer)}?")
+        raise source.error(
+            place, f"no log has the clock {printable(name)}; did you mean {likely or ' or '.join(longer)}?"
+        )
     return None
 
 
@@ -303,7 +304,7 @@ def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | N
     joints = [joint for instrument in instruments for joint in instrument.joints]
     if by is not None and by not in joints:
         raise section.error(
-            "unseen_by", f"no joint is called {shown(by)}; the joints are {', '.join(joints) or 'none'}"
+            "unseen_by", f"no joint is called {printable(by)}; the joints are {', '.join(joints) or 'none'}"
         )
     fraction = section.number("unseen_fraction", least=0.0, below=0.9)
     return Splits(section.integer("test_every", 0), fraction, by, section.ranges("test"), section.ranges("unseen"))

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.poses import rotation_error
 from neeco.ingest.columns import EULER, MATRIX, QUATERNION_WXYZ, QUATERNION_XYZW, ROTATION_MATRIX
+from neeco.raster.rotations import rotation_error
 
 NORM_TOLERANCE = 0.02  # of a quaternion's length: two decimals pass
 ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals, and the rows become exact rotations here

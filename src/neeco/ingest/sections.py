@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from neeco.capture.nodes import Node
-from neeco.capture.problems import Refusal, shown
+from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
 from neeco.ingest.columns import EULER, FORMS, MATRIX, JointColumns, PoseColumns, Units, quaternion_form
 from neeco.ingest.units import KINDS, canonical_unit
@@ -30,15 +29,15 @@ class Section:
 
     def __init__(self, file: Path, place: str, value: Any, keys: tuple[str, ...]) -> None:
         self.file, self.place = file, place
-        self.node = Node(value, str(file), place, Refusal())
+        self.node = Node(value, str(file), place, RaisingReport())
         if not isinstance(value, dict):
-            self.node.error(f"expected keys such as `{keys[0]}:`, found {shown(value)}", "write them as key: value")
+            self.node.error(f"expected keys such as `{keys[0]}:`, found {printable(value)}", "write them as key: value")
         self.value: dict[str, Any] = value
         for key in value:
             if key not in keys:
                 likely = close_match(str(key), keys)
                 hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
-                raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
+                raise self.error(printable(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
 
     def error(self, key: str, message: str) -> NeecoError:
         return NeecoError(" ".join(f"{self.file}: {self.at(key)}: {message}".split()))
@@ -74,7 +73,9 @@ class Section:
         except (OSError, ValueError, RuntimeError):
             found = False
         if not found:
-            raise self.error(key, f"no such file: {shown(text, 120)}; correct the path (relative to {self.file.name})")
+            raise self.error(
+                key, f"no such file: {printable(text, 120)}; correct the path (relative to {self.file.name})"
+            )
         return path
 
     def number(
@@ -98,7 +99,7 @@ class Section:
         good = all(isinstance(item, str | int) and not isinstance(item, bool) for item in items)
         if not good or len(items) not in counts:
             wanted = "the name of a column" if counts == (1,) else f"{' or '.join(map(str, counts))} names of columns"
-            raise self.error(key, f"expected {wanted}, found {shown(value)}; list them")
+            raise self.error(key, f"expected {wanted}, found {printable(value)}; list them")
         if len({str(item) for item in items}) < len(items):
             raise self.error(key, "names a column twice; list different columns")
         return tuple(str(item) for item in items)
@@ -112,7 +113,7 @@ class Section:
         for item in value if isinstance(value, list) else [value]:
             match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
             if match is None or int(match[2] or match[1]) < int(match[1]):
-                raise self.error(key, f"{shown(item)} is no range of frames; write 12 or 30-40")
+                raise self.error(key, f"{printable(item)} is no range of frames; write 12 or 30-40")
             found.append((int(match[1]), int(match[2] or match[1])))
         return tuple(found)
 
@@ -139,7 +140,7 @@ def pose_columns(parent: Section, key: str, value: Any, clock: str) -> PoseColum
         not _EULER.match(convention) or convention[0] == convention[1] or convention[1] == convention[2]
     ):
         raise columns.error(
-            "euler_convention", f"{shown(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
+            "euler_convention", f"{printable(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
         )
     if form == EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
@@ -182,5 +183,5 @@ def _units(section: Section) -> Units:
         text = given.text(kind)
         found[kind] = None if text is None else canonical_unit(text)
         if found[kind] is not None and found[kind] not in units:
-            raise given.error(kind, f"{shown(text)} is no unit of {kind}; use {', '.join(units)}")
+            raise given.error(kind, f"{printable(text)} is no unit of {kind}; use {', '.join(units)}")
     return Units(found["time"], found["length"], found["angle"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.problems import shown
+from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
 
@@ -116,7 +116,7 @@ def read_table(path: Path) -> Table:
     header = _unique(cells[0])
     if not any(header) or all(_is_number(name) for name in header if name):
         raise NeecoError(
-            f"{path}: line {lines[0][0]}: no header (found {shown(lines[0][1][:40])}); "
+            f"{path}: line {lines[0][0]}: no header (found {printable(lines[0][1][:40])}); "
             "add a first line naming the columns"
         )
     if len(lines) == 1:
@@ -142,7 +142,7 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
             text = cells[index].replace(",", ".") if table.decimal_comma else cells[index]
             value = parse_number(text)
             if value is None:
-                bad.append((row, f"{columns[slot]} is {shown(cells[index], 24)}, not a number"))
+                bad.append((row, f"{columns[slot]} is {printable(cells[index], 24)}, not a number"))
                 break
             values[row, slot] = value
     missing |= np.isnan(values).any(axis=1)
@@ -155,7 +155,7 @@ def column_index(table: Table, name: str) -> int:
     index = table.index(name)
     if index is None:
         names = ", ".join(table.header[:16]) + (", ..." if len(table.header) > 16 else "")
-        raise NeecoError(f"{table.path}: has no column {shown(name)}; its columns are {shown(names, 200)}")
+        raise NeecoError(f"{table.path}: has no column {printable(name)}; its columns are {printable(names, 200)}")
     return index
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.geometry import field_slopes
+from neeco.raster.pinhole import field_slopes
 from neeco.raster.sh import headlight_factor, rotation_matrices, sh_colors
 from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neeco.raster.geometry import field_slopes
+from neeco.raster.pinhole import field_slopes
 from neeco.raster.types import Camera, Headlight
 
 SH_C0 = 0.28209479177387814  # the constant harmonic

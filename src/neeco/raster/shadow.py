@@ -17,8 +17,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
 from neeco.raster.devices import constant
-from neeco.raster.geometry import project
 from neeco.raster.native import all_run_native, native
+from neeco.raster.pinhole import project
 from neeco.raster.types import Camera, Gaussians, Rendering
 
 RESOLUTION = 0.5  # of the image's

@@ -37,7 +37,7 @@ from neeco.report.downstream_figures import (
     with_labelled,
 )
 from neeco.report.downstream_shots import Gallery, galleries
-from neeco.report.render import REPORT_FILE, split_counts, write_page
+from neeco.report.page import REPORT_FILE, split_counts, write_page
 
 FAILED = "failed: "  # how notes on failed trainings begin; they are listed by themselves
 ALONE = " labelled frames alone"  # how `equivalent` ends

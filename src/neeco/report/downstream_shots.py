@@ -23,7 +23,7 @@ from neeco.experiments.downstream.scores import CONFIDENT
 from neeco.experiments.downstream.tables import described
 from neeco.files import read_json
 from neeco.report.downstream_figures import question, sets_in, signed, with_labelled
-from neeco.report.figures import MAX_WIDTH, jpeg
+from neeco.report.page import MAX_WIDTH, jpeg
 
 SHOWN = 2  # frames of each kind
 MOST = 4  # conditions side by side

@@ -12,9 +12,9 @@ from torch import Tensor
 from neeco.capture.model import Capture, Frame
 from neeco.evaluation.difference import outline
 from neeco.ingest.moving import RoughShape
-from neeco.raster.geometry import project_world
+from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
-from neeco.report.figures import MAX_WIDTH, jpeg, to_bytes
+from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 from neeco.report.tracks import round_length
 
 FIGURES = 8

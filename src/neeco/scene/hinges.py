@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from neeco.raster.geometry import rotate_about
 from neeco.raster.posing import HingedBody, part_weights
+from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
 
 BEHIND_HINGE = 1.0  # radii of the shaft: how far behind its hinge a jaw may reach

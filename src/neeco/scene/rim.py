@@ -14,7 +14,7 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from neeco.raster.geometry import in_image, pixel_centers, project_world, unproject_world
+from neeco.raster.pinhole import in_image, pixel_centers, project_world, unproject_world
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, seed_gaussians
 

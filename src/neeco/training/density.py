@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neeco.raster.devices import constant
-from neeco.raster.geometry import quat_to_matrix
 from neeco.raster.optimizer import Adam
+from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import CanonicalGaussians
 
 MIN_OPACITY = 0.005

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Camera, Frame, InstrumentState, State
-from neeco.raster.geometry import rigid_from_vector, vector_from_rotation
 from neeco.raster.optimizer import adam_update
+from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
 from neeco.training.config import RefineConfig
 

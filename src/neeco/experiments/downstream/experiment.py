@@ -19,13 +19,12 @@ from neeco.experiments.downstream.samples import (
     DataSet,
 )
 from neeco.experiments.machine import machine
-from neeco.experiments.running import run_jobs, threads_per_worker
-from neeco.experiments.work import JobNews
+from neeco.experiments.study import JobEvent, run_jobs, threads_per_worker
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 
 
-def run_downstream(plan: DownstreamPlan, news: Callable[[JobNews], None] | None = None) -> dict[str, Any]:
+def run_downstream(plan: DownstreamPlan, news: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
     """Teach and test every model in every condition on every fold; writes downstream.json, and returns what it holds.
 
     Given again after an interruption it goes on where it stopped; given again with more models, sets, conditions,
@@ -38,7 +37,7 @@ def run_downstream(plan: DownstreamPlan, news: Callable[[JobNews], None] | None 
             if (file := job.folder / JOB_FILE).exists():
                 finished[index] = read_json(file)
 
-        def keep(latest: JobNews) -> None:
+        def keep(latest: JobEvent) -> None:
             if latest.result is not None:
                 finished[latest.index] = latest.result
                 write_json(output / FILE, document(plan, [finished[k] for k in sorted(finished)]))

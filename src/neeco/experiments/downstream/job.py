@@ -32,7 +32,7 @@ from neeco.experiments.downstream.samples import (
     recorded_samples,
 )
 from neeco.experiments.downstream.scores import box_scores, mask_scores, mean_scores, near
-from neeco.experiments.work import JobProgress
+from neeco.experiments.study import JobProgress
 from neeco.files import read_json, write_json
 from neeco.raster.devices import device_of
 

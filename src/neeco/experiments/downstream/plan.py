@@ -26,8 +26,7 @@ from neeco.experiments.downstream.samples import (
     has_labels,
     recorded_samples,
 )
-from neeco.experiments.running import check_workers
-from neeco.experiments.work import check_output
+from neeco.experiments.study import check_output, check_workers
 from neeco.raster.devices import device_of
 
 SCHEMA = "neeco-downstream/1"

@@ -11,7 +11,7 @@ from scipy import stats
 
 from neeco.experiments.downstream.conditions import AUGMENT, REAL
 from neeco.experiments.downstream.scores import BOX_SCORES, MASK_SCORES
-from neeco.experiments.summary import spread
+from neeco.experiments.study import spread
 
 MAIN = {"masks": "iou", "boxes": "ap"}
 TITLES = {

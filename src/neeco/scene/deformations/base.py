@@ -14,7 +14,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import HingeMotion, Learned
 from neeco.scene.method import Method, Stored
 from neeco.scene.training_session import GaussianTraining
 
@@ -70,11 +70,15 @@ class Deformation(nn.Module, Method):
     Training calls the hooks without knowing whose they are: `fit_ranges` and `initial_extras`, then `begin`,
     in every step `disturbed`, `training_channels` and `regularisation`, between steps `between_steps`, where density is
     controlled `lost`, and at the end `finish`.
+
+    `separates_instruments`: tissue and instruments are bodies of their own, and instruments of several scenes can be
+    combined in one (`combined`, `fit_extras`).
     """
 
     label_names: tuple[tuple[str, str], ...] = ()
     extra_rates: ClassVar[Mapping[str, float]] = {}
     learns_from: ClassVar[int] = 0
+    separates_instruments: ClassVar[bool] = False
     warm_up: float = 0.0
     resting: bool = False
 
@@ -82,6 +86,10 @@ class Deformation(nn.Module, Method):
         super().__init__()
         self.instruments = instruments
         self.settings = self.Settings() if settings is None else settings
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
 
     @classmethod
     def load(cls, stored: Stored) -> Learned:
@@ -103,6 +111,21 @@ class Deformation(nn.Module, Method):
 
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
+        return {}
+
+    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion | None:
+        """How Gaussians move, where hinges say all of it; None otherwise. Subclasses do not inherit it: they may pose
+        otherwise."""
+        return None
+
+    @classmethod
+    def combined(cls, deformations: Sequence[Deformation]) -> Deformation:
+        """One deformation of the instruments of several of this method, in their order."""
+        raise NotImplementedError
+
+    def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The per-Gaussian parameters of the method, of a deformation that was combined into this one, in this one's
+        shapes."""
         return {}
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:

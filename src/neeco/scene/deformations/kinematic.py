@@ -6,6 +6,7 @@ parts about hinges that are learned from the images, with soft part assignment p
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from neeco.scene.deformations.base import (
     floored_decay,
     state_of,
 )
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
@@ -71,6 +73,7 @@ class Kinematic(Deformation):
 
     method = "kinematic"
     Settings = KinematicSettings
+    separates_instruments = True
     learns_from = 600  # hinges hold still until Gaussians have taken shape around them, or unformed ones drag them off
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
@@ -159,6 +162,36 @@ class Kinematic(Deformation):
             pose = given.pose.to(origin)
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
+
+    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
+        log_scales = canonical.log_scales.clone()
+        joints = max((len(instrument.joints) for instrument in self.instruments), default=0)
+        turns = canonical.means.new_zeros(len(canonical), joints, 2)
+        for index, instrument in enumerate(self.instruments):
+            if not instrument.joints:
+                continue
+            hinges, rows = self.hinges_of(index), canonical.body(index + 1)
+            weights = self.part_weights(canonical, index)
+            log_scales[rows] = torch.minimum(log_scales[rows], hinges.longest(weights).log())
+            for joint in range(len(hinges.joint_names)):
+                pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
+                turns[rows, joint, 0] = pair @ hinges.turns(joint, 0.0)
+                turns[rows, joint, 1] = pair @ hinges.gains[joint]
+        bodies = [self.hinges_of(index) for index in range(len(self.instruments))]
+        found = tuple(tuple(body.hinge(joint) for joint in range(len(body.joint_names))) for body in bodies)
+        return HingeMotion(log_scales, turns, found)
+
+    @classmethod
+    def combined(cls, deformations: Sequence[Deformation]) -> Kinematic:
+        parts = [part for part in deformations if isinstance(part, Kinematic)]
+        instruments = tuple(instrument for part in parts for instrument in part.instruments)
+        made = cls(instruments, copy.deepcopy(parts[0].settings))
+        made.hinges = nn.ModuleList(copy.deepcopy(hinges) for part in parts for hinges in part.hinges)
+        return made
+
+    def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        logits, columns = extras[PART_LOGITS], self.logit_count
+        return {PART_LOGITS: nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]}
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}

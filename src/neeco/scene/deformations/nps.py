@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
-from neeco.raster.geometry import matrix_to_quat
+from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations.base import (
@@ -39,7 +39,6 @@ from neeco.scene.training_session import GaussianTraining
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
 SHAPE_UNIT = 0.1  # of quaternion and log scale
-WARM_UP = 0.075  # share of the training: Deformable-3DGS rests for 3,000 of 40,000 iterations
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class NPSSettings:
     state: Literal["full", "rotation_jaw"] = "full"
     half: bool = False
     chunk: int = 65536
-    warm_up: float = WARM_UP
+    warm_up: float = 0.075
     gate_mm: float | None = None
 
     def __post_init__(self) -> None:

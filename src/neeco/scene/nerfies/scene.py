@@ -106,6 +106,9 @@ class NerfScene(nn.Module):
         """The recorded one."""
         return camera
 
+    def hinge_motion(self) -> None:
+        """A field has no Gaussians that could move."""
+
     def torch_threads(self) -> AbstractContextManager[None]:
         """All of torch's threads: a drawing is a few large products."""
         return nullcontext()
@@ -148,7 +151,7 @@ class NerfScene(nn.Module):
         return Drawn(coarse, seen(self.fine, finer, self.places(rays, finer)), places, codes)
 
     @torch.no_grad()
-    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+    def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """The image at `state.time`, `settings.chunk` rays at once, without gradients. The field has no labels."""
         rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []

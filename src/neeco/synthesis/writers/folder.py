@@ -30,9 +30,9 @@ DEPTH_MM_PER_COUNT = 0.05
 SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
-SEAL = "sha256"  # of the rest of a record
+CHECKSUM = "sha256"  # of the rest of a record
 PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MOST_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
+MAX_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
 FOLDERS = (*PIXELS, RECORDS)
 VALIDATION_EVERY = 5  # every fifth image is for validation
 
@@ -75,7 +75,7 @@ def write_sample(
         **state_to_json(drawing.state),
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "made_up": round(float(drawing.made_up.mean()), 4),
+        "made_up": round(float(drawing.unobserved.mean()), 4),
         "labels": [label.to_json() for label in labels],
         **facts,
         "refused": dict(sorted(refused.items())),
@@ -88,8 +88,8 @@ def write_sample(
 def silhouettes(drawing: LayeredDrawing) -> torch.Tensor:
     """uint8 [H, W]: bit k is set where instrument k of the labels would be seen if nothing else were there."""
     bits = np.zeros(drawing.depth.shape, np.uint8)
-    for k, alone in enumerate(list(drawing.alone.values())[:MOST_INSTRUMENTS]):
-        bits |= alone.mask.astype(np.uint8) << k
+    for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
+        bits |= layer.mask.astype(np.uint8) << k
     return torch.from_numpy(bits)
 
 
@@ -103,7 +103,7 @@ def write_skipped(
 
 
 def _write_record(root: Path, record: Record) -> None:
-    write_text(record_path(root, record["index"]), json.dumps(record | {SEAL: _digest(record)}, allow_nan=False))
+    write_text(record_path(root, record["index"]), json.dumps(record | {CHECKSUM: _digest(record)}, allow_nan=False))
 
 
 def _digest(record: Record) -> str:
@@ -122,7 +122,7 @@ def load_record(root: Path, index: int) -> Record | None:
     """
     try:
         record = json.loads(read_text(record_path(root, index), "the record of an image"))
-        if record.pop(SEAL, None) != _digest(record):
+        if record.pop(CHECKSUM, None) != _digest(record):
             return None
         files = () if record.get("skipped") else files_of(index)
         sizes = {name: (root / name).stat().st_size for name in files}
@@ -163,14 +163,14 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        line = told(record)
+        line = public_record(record)
         line["labels"] = [_without_polygons(label) for label in record["labels"]]
         lines.append(json.dumps(line, allow_nan=False))
     write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
 
 
-def told(record: Record) -> dict[str, Any]:
-    """What a record says of its image, without what it says of the making."""
+def public_record(record: Record) -> dict[str, Any]:
+    """A record without what it says of the making."""
     return {key: value for key, value in record.items() if key not in ("files", "refused")}
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neeco.raster import rasterize
-from neeco.raster.geometry import pixel_centers, unproject_world
+from neeco.raster.pinhole import pixel_centers, unproject_world
 from neeco.raster.types import Camera
 from neeco.scene.hinges import Hinged, Hinges
 from neeco.training.instruments.solid import solid_extent, spread

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 from neeco.raster import rasterize
-from neeco.raster.geometry import project
+from neeco.raster.pinhole import project
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 

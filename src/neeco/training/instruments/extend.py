@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from neeco.raster.geometry import in_image
+from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.hinges import Hinges
 from neeco.scene.recorded import Recorded

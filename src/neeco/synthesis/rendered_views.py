@@ -19,8 +19,7 @@ from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
-from neeco.synthesis.samplers import states_file
-from neeco.synthesis.views import moved_camera
+from neeco.synthesis.samplers import moved_camera, states_file
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
@@ -40,7 +39,7 @@ class Rendered:
 
 @dataclass(frozen=True)
 class View:
-    """One picture to draw."""
+    """One image to draw."""
 
     name: str
     state: State
@@ -63,12 +62,12 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
 
 def state_views(scene: Drawable, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
-    lines = read_states(states_file(str(path)), scene.instruments)
     first = scene.recorded.cameras[0]
-    cameras = [
-        first if line.world_from_camera is None else moved_camera(first, line.world_from_camera) for line in lines
-    ]
-    return [View(f"{k:06d}", line.state, camera) for k, (line, camera) in enumerate(zip(lines, cameras, strict=True))]
+    views = []
+    for k, line in enumerate(read_states(states_file(str(path)), scene.instruments)):
+        camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
+        views.append(View(f"{k:06d}", line.state, camera))
+    return views
 
 
 def render(
@@ -78,13 +77,12 @@ def render(
     mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
     labelled = bool(scene.label_names)
     done = 0
-    for view in views:
+    for done, view in enumerate(views, 1):
         drawing = draw(scene, view.state, view.camera)
         write_image(folder / f"{view.name}.png", drawing.image)
         if drawing.parts is not None:
             write_labels(folder / f"{view.name}_parts.png", drawing.parts)
             write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
-        done += 1
         on_progress(done)
     if labelled:
         names = [
