@@ -329,7 +329,9 @@ def test_a_logarithmic_axis_has_the_points_as_ticks():
 def test_the_command_makes_the_same_experiment(experiment):
     told = command_of(experiment)
     assert told.startswith("neeco downstream ")
-    assert "--sets kinematic=/sets/kinematic --models unet dfine --num-real 0 5 all --folds 2 --splits test unseen" in told
+    assert (
+        "--sets kinematic=/sets/kinematic --models unet dfine --num-real 0 5 all --folds 2 --splits test unseen" in told
+    )
     assert "--conditions" not in told
     experiment["jobs"][0]["condition"] = "kinematic+soft"
     assert "--conditions kinematic+soft real real+augment kinematic kinematic+real" in command_of(experiment)
