@@ -23,7 +23,7 @@ from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
 from neeco.labels.drawing import draw
 from neeco.labels.labellers import threshold_of
-from neeco.raster.threads import synchronise
+from neeco.raster.native import synchronise
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 

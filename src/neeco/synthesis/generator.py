@@ -22,7 +22,7 @@ from neeco.errors import NeecoError
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
 from neeco.labels.drawing import MOSTLY, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
-from neeco.raster.threads import keep_freed_memory, set_threads
+from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_scene
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import (

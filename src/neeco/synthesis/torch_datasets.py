@@ -45,7 +45,7 @@ from neeco.files import read_json, require_inside, require_like
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.labelled_image import LabelledImage
 from neeco.labels.labellers import instruments_of
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
 from neeco.scene import Drawable
 from neeco.scene.io import load_scene, save_scene

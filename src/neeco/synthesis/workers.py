@@ -25,7 +25,7 @@ from typing import Any
 from neeco.cluster import joined
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
@@ -147,7 +147,7 @@ def _work(spec: GeneratorSpec, output: Path, threads: int, connection: Connectio
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
-        with failures_told():
+        with readable_failures():
             limit_threads(threads)
             generator = spec.open()
             with contextlib.suppress(EOFError):
@@ -254,7 +254,7 @@ def _result(ray: Any, reference: Any, task: tuple[int, ...]) -> list[tuple[Recor
 def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[Record, dict[str, bytes]]] | str:
     """In a cluster's worker: record and files of every image, or an error message."""
     try:
-        with failures_told(), tempfile.TemporaryDirectory() as folder:
+        with readable_failures(), tempfile.TemporaryDirectory() as folder:
             generator = _opened(packed)
             drawn = []
             for index in indices:
