@@ -15,7 +15,6 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +22,13 @@ import torch
 
 from neeco.capture.check import read_checked
 from neeco.raster import cpu, losses, posing, shadow
+from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam
-from neeco.raster.threads import keep_freed_memory, set_threads
-from neeco.scene.learning import Start
-from neeco.scene.methods import method_class
+from neeco.scene.training_views import TrainingViews
 from neeco.training import session as steps
 from neeco.training.checkpoint import read_checkpoint, restore_session
-from neeco.training.initial import gaussian_session
+from neeco.training.initial import begin_session
 from neeco.training.run import read_config, stored_config
-from neeco.training.views import TrainingViews
 
 PARTS: list[tuple[Any, str, str]] = [
     (steps.Scene, "at", "Scene.at beside posing"),
@@ -83,9 +80,8 @@ def session_of(run: Path) -> Any:
     config = stored_config(run, stored)
     capture = read_checked(Path(stored["capture"]), config.transforms)
     views = TrainingViews.read(capture.split("train"))
-    start = Start(capture, views, config, print, partial(gaussian_session, capture, views, config, print))
     scene, header, tensors = read_checkpoint(run)
-    session = method_class(config.method).session(start, scene)
+    session = begin_session(capture, views, config, print, scene)
     restore_session(session, header, tensors)
     return session
 

@@ -51,8 +51,8 @@ def joined(cores: int) -> Iterator[Any]:
         try:
             ray.init(address=given, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            told = " ".join(str(error).split()) or type(error).__name__
-            raise NeecoError(f"RAY_ADDRESS: {given} is no cluster that can be joined: {told}") from None
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise NeecoError(f"RAY_ADDRESS: {given} is no cluster that can be joined: {reason}") from None
     else:
         _start_here(ray, cores, quiet)
     try:

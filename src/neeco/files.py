@@ -78,16 +78,16 @@ def new_folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def own_folder(path: Path, told: Path | None = None) -> Iterator[None]:
+def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
     """`new_folder` for this process alone, rid of what killed processes left half-written there.
 
-    Others that ask for the same folder meanwhile are refused (NeecoError naming `told`, by default the folder), and so
+    Others that ask for the same folder meanwhile are refused (NeecoError naming `named`, by default the folder), and so
     is a folder that holds a link out of it. The lock goes with the process that holds it, however that ends; a file
     system without locks refuses nobody. On Windows there is none: nobody is refused, and nothing is swept, which
     another may be writing.
     """
     path = Path(path)
-    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if told is None else told)
+    lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named)
     with new_folder(path), lock:
         halves = []
         for entry in path.rglob("*"):  # which follows no link
@@ -110,7 +110,7 @@ def is_vacant(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path, told: Path) -> Iterator[None]:
+def _locked(folder: Path, named: Path) -> Iterator[None]:
     lock = folder / LOCK
     while True:
         try:
@@ -122,7 +122,7 @@ def _locked(folder: Path, told: Path) -> Iterator[None]:
         except BlockingIOError as error:
             os.close(handle)
             raise NeecoError(
-                f"{told}: another neeco process is writing there; wait for its end, or give another folder"
+                f"{named}: another neeco process is writing there; wait for its end, or give another folder"
             ) from error
         except OSError:
             pass  # a file system without locks

@@ -66,6 +66,14 @@ def warn_renamed(old: str, new: str) -> None:
         warnings.warn(f"{old} is called {new} now; the old name goes with the next version", RenamedWarning, 3)
 
 
+def name_and_value(option: str, text: str, example: str) -> tuple[str, str]:
+    """NAME=VALUE in two. Raises NeecoError naming `option`, with an `example` of what to write."""
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise NeecoError(f"{option}: {text!r} is not NAME=VALUE; write such as {example}")
+    return name, value
+
+
 def plain(settings: Any) -> dict[str, Any]:
     """`settings` as dicts, lists and scalars; `structure` is the inverse."""
     value = _plain(dataclasses.asdict(settings))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from neeco.cli._bars import counting
+from neeco.cli._progress import counting
 from neeco.errors import NeecoError
 
 

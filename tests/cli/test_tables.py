@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from neeco.cli._tables import fitted
+from neeco.cli._output import fitted
 from neeco.experiments.tables import Cell, Column, Row, Table
 
 

@@ -7,7 +7,7 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, to_truth_ids
-from neeco.labels.composited import composited_parts
+from neeco.labels.labellers import composited_parts
 from neeco.raster.types import Rendering
 
 

@@ -59,8 +59,11 @@ class TinyScene:
     def camera(self, camera: Camera) -> Camera:
         return camera
 
-    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+    def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         return rasterize(self.at(state), camera, channels=self.label_channels() if labels and self.labelled else None)
+
+    def hinge_motion(self) -> None:
+        return None
 
     def torch_threads(self) -> AbstractContextManager[None]:
         return self.deformation.torch_threads()

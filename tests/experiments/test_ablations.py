@@ -14,7 +14,7 @@ import torch
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.truth import load_reference
-from neeco.experiments import ablation_run, jobs
+from neeco.experiments import ablation_run, training_job
 from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
 from neeco.experiments.ablation_run import chosen_ablations, distinct_variants, run_ablations
 from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
@@ -70,19 +70,19 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
 
 def test_a_second_start_trains_nothing_and_says_the_same(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
     first = run_ablations(plan)
-    monkeypatch.setattr(jobs, "train", lambda *_, **__: pytest.fail("trained again"))
+    monkeypatch.setattr(training_job, "train", lambda *_, **__: pytest.fail("trained again"))
     assert run_ablations(plan) == first
 
 
 def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = jobs.train
+    real = training_job.train
 
     def fails(path, folder, *rest, **more):
         if folder.name == "neeco-no-density":
             raise NeecoError("the loss became nan")
         return real(path, folder, *rest, **more)
 
-    monkeypatch.setattr(jobs, "train", fails)
+    monkeypatch.setattr(training_job, "train", fails)
     ablation = run_ablations(plan)
     assert ablation["failures"] == [{"run": "neeco-no-density", "error": "the loss became nan"}]
     off, on = ablation["tables"][1]["rows"]
@@ -113,7 +113,7 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
     labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
-    monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
+    monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
     monkeypatch.setattr(ablation_run, "score_label_ways", score)
     for _ in range(2):

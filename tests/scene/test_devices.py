@@ -92,7 +92,7 @@ def test_a_field_and_its_losses_stay_on_the_device() -> None:
     loss = drawn.fine.color.mean() + drawn.coarse.color.mean() + elastic + robust(moved.square().sum(-1)).mean()
     loss.backward()
     assert all_meta(loss, *(parameter.grad for parameter in scene.parameters()))
-    rendering = scene.draw(scene.recorded.states[0], scene.recorded.cameras[0])
+    rendering = scene.render(scene.recorded.states[0], scene.recorded.cameras[0])
     assert all_meta(rendering.color, rendering.alpha, rendering.depth)
 
 
@@ -108,7 +108,7 @@ class TestProducts:
             return nullcontext()
 
         for module in (nps, time_mlp, hexplane, nerf_scene, warp):
-            monkeypatch.setattr(module, "quick_products", note)
+            monkeypatch.setattr(module, "tf32_products", note)
         return asked
 
     def test_a_network_that_moves_gaussians(self, scene: Scene, asked: list[torch.device]) -> None:

@@ -61,11 +61,11 @@ def test_the_untrained_warp_is_nearly_nothing_and_a_zero_one_the_template() -> N
 def test_a_scene_without_warp_looks_the_same_at_all_times() -> None:
     scene = make_nerf()
     camera = scene.recorded.cameras[0]
-    first, last = (scene.draw(State({}, time), camera).color for time in (0.0, 3.0))
+    first, last = (scene.render(State({}, time), camera).color for time in (0.0, 3.0))
     assert float((first - last).abs().max()) > 1e-4
     for head in (scene.warp.rotation, scene.warp.velocity):
         torch.nn.init.zeros_(head.weight)
-    first, last = (scene.draw(State({}, time), camera).color for time in (0.0, 3.0))
+    first, last = (scene.render(State({}, time), camera).color for time in (0.0, 3.0))
     assert torch.equal(first, last)
 
 
@@ -151,12 +151,12 @@ def test_codes_lie_between_their_neighbours_in_time() -> None:
 def test_drawing_in_chunks_changes_nothing_and_says_where_things_are() -> None:
     scene = make_nerf()
     state, camera = scene.recorded.states[1], scene.recorded.cameras[1]
-    drawn = scene.draw(state, camera, labels=True)
+    drawn = scene.render(state, camera, labels=True)
     assert drawn.color.shape == (6, 8, 3)
     assert drawn.channels is None
     assert bool(((drawn.depth >= 20) & (drawn.depth <= 80))[drawn.alpha > 1e-6].all())
     scene.settings = replace(scene.settings, chunk=1000)
-    torch.testing.assert_close(scene.draw(state, camera).color, drawn.color, atol=1e-4, rtol=0)
+    torch.testing.assert_close(scene.render(state, camera).color, drawn.color, atol=1e-4, rtol=0)
 
 
 def test_what_needs_gaussians_is_refused_in_one_line() -> None:

@@ -42,8 +42,8 @@ def test_a_view_beyond_the_rim_shows_the_continued_wall() -> None:
     canonical = wall()
     beyond = moved(x=25.0)
     with torch.no_grad():
-        before = scene_of(canonical).draw(State(), beyond)
-        after = scene_of(continue_tissue(canonical, [CAMERA])).draw(State(), beyond)
+        before = scene_of(canonical).render(State(), beyond)
+        after = scene_of(continue_tissue(canonical, [CAMERA])).render(State(), beyond)
     assert float(before.alpha[32, 75]) < 0.05
     assert float(after.alpha[8:56, 66:].min()) > 0.9
     assert torch.allclose(after.color[32, 75], torch.tensor(COLOR), atol=0.05)
@@ -55,8 +55,8 @@ def test_what_was_seen_looks_as_before() -> None:
     cameras = [CAMERA, moved(x=3.0), moved(y=-2.0)]
     with torch.no_grad():
         for camera in cameras:
-            before = scene_of(canonical).draw(State(), camera)
-            after = scene_of(continue_tissue(canonical, cameras)).draw(State(), camera)
+            before = scene_of(canonical).render(State(), camera)
+            after = scene_of(continue_tissue(canonical, cameras)).render(State(), camera)
             inner = (slice(6, -6), slice(6, -6))
             assert torch.allclose(after.color[inner], before.color[inner], atol=0.02)
 

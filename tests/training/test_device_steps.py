@@ -20,11 +20,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from neeco.capture.model import Frame
 from neeco.scene.methods import METHODS
+from neeco.scene.training_views import TrainingViews
 from neeco.training import session as module
 from neeco.training.options import training_config
 from neeco.training.refinement import Refinement
 from neeco.training.session import GaussianSession, pose_order
-from neeco.training.views import TrainingViews
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -91,15 +91,17 @@ def session_on_meta(method: str, views_per_step: int) -> GaussianSession:
     config = training_config(method, {"iterations": 20_000, "views_per_step": views_per_step}, refine)
     names = tuple(instrument.name for instrument in scene.instruments)
     session = GaussianSession(
-        config,
         scene,
+        config.length,
+        torch.Generator(),  # "meta" has none of its own
         TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
         print,
+        views_per_step,
+        config,
         pose_order(frames, names),
         50.0,
         Refinement(config.refine, frames, names, META),
         np.random.default_rng(0),
-        torch.Generator(),  # "meta" has none of its own
     )
     session.start()
     session.iteration = 5_000

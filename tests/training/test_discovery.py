@@ -15,6 +15,7 @@ from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.rotations import rigid, rigid_from_vector, rotate_about
 from neeco.scene.hinges import Hinges
+from neeco.scene.training_views import TrainingViews
 from neeco.training.initial import gaussian_session, initial_scene
 from neeco.training.instruments import discovery
 from neeco.training.instruments.carving import CarvedShape, carve
@@ -22,7 +23,6 @@ from neeco.training.instruments.discovery import at_middle, shape_around_frame, 
 from neeco.training.instruments.evidence import Evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.options import training_config
-from neeco.training.views import TrainingViews
 
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame

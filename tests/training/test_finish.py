@@ -17,6 +17,7 @@ from neeco.scene.hinges import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
 from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.instruments import wrist
 from neeco.training.instruments.border import color_boundary
@@ -25,7 +26,6 @@ from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.solid import measure_radius
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
-from neeco.training.views import TrainingViews
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -13,12 +12,12 @@ from capture_files import write_capture, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import kernels
 from neeco.raster.native import Family
-from neeco.scene.learning import Session, Start
 from neeco.scene.methods import METHODS
-from neeco.training.initial import gaussian_session
+from neeco.scene.training_session import Session
+from neeco.scene.training_views import TrainingViews
+from neeco.training.initial import begin_session
 from neeco.training.instruments import discovery
 from neeco.training.options import training_config
-from neeco.training.views import TrainingViews
 
 STEPS = 200
 SMALL = {
@@ -38,8 +37,7 @@ def begun(method: str, folder: Path) -> Session:
     capture = read_capture(folder)
     views = TrainingViews.read(capture.split("train"))
     torch.manual_seed(config.seed)
-    begin = partial(gaussian_session, capture, views, config, print)
-    return METHODS[method].session(Start(capture, views, config, print, begin), None)
+    return begin_session(capture, views, config, print)
 
 
 @pytest.mark.parametrize("method", list(METHODS))

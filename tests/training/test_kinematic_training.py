@@ -17,6 +17,7 @@ from neeco.evaluation.evaluate import evaluate_run
 from neeco.scene.deformations import kinematic
 from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
+from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training import train as module
@@ -26,7 +27,6 @@ from neeco.training.instruments.evidence import gather_evidence
 from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
-from neeco.training.views import TrainingViews
 
 SIZES = ((80, 64), (64, 72))
 # everything that a long run does happens within 40 iterations

@@ -12,10 +12,10 @@ from rod_world import CAMERA, make_scene
 from neeco.capture.model import Frame
 from neeco.raster import rasterize
 from neeco.scene import Scene
+from neeco.scene.training_views import TrainingViews
 from neeco.training.instruments.light import find_shadow
 from neeco.training.options import training_config
 from neeco.training.session import GaussianSession, new_session
-from neeco.training.views import TrainingViews
 
 OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the photographs
 OTHER = (-7.0, -7.0, 0.0)

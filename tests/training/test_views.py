@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from neeco.capture import read_capture
+from neeco.scene import training_views as module
 from neeco.scene.nerfies.rays import RayTable
-from neeco.training import views as module
+from neeco.scene.training_views import Copies, TrainingViews
 from neeco.training.initial import gaussian_session
 from neeco.training.options import training_config
-from neeco.training.views import Copies, TrainingViews
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 

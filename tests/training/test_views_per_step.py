@@ -11,13 +11,13 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.raster.optimizer import Adam
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.initial import gaussian_session
 from neeco.training.options import training_config
 from neeco.training.schedule import due
 from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, train
-from neeco.training.views import TrainingViews
 
 NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0", "refine.start=0"]
 

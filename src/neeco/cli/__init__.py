@@ -42,6 +42,9 @@ RENAMED = {
     ("train", "--views-per-step"): "--batch-size",
     ("train", "--tissue-budget"): "--max-tissue-gaussians",
     ("train", "--instrument-budget"): "--max-instrument-gaussians",
+    ("synthesize", "--speckle"): "--min-component",
+    ("synthesize", "--max-unseen"): "--max-unobserved",
+    ("synthesize", "--tries"): "--max-attempts",
     ("compare", "--processor-minutes"): "--cpu-minutes",
     ("downstream", "--pick"): "--frame-selection",
     ("downstream", "--real"): "--num-real",
@@ -56,13 +59,13 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line (default: this process's) and return its exit status.
 
-    0 done; 1 bad input, told in one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our output went
+    0 done; 1 bad input, one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our output went
     away. Usage errors (2) and `--help` (0) leave through SystemExit.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminate = None
     if threading.current_thread() is threading.main_thread():
-        # told to end, end as on Ctrl-C: tidily
+        # SIGTERM ends as Ctrl-C does: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with warnings.catch_warnings():
@@ -80,12 +83,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return PIPE_CLOSED
         where = f"{error.filename}: " if error.filename else ""
-        told = f"{where}{error.strerror or error}; check that path and the disk"
-        print(f"neeco: error: {_printable(told)}", file=sys.stderr)
+        message = f"{where}{error.strerror or error}; check that path and the disk"
+        print(f"neeco: error: {_printable(message)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as interrupt:
-        told = " ".join(map(str, interrupt.args)) or "run the same command again"
-        print(f"\nneeco: interrupted: {told}", file=sys.stderr)
+        message = " ".join(map(str, interrupt.args)) or "run the same command again"
+        print(f"\nneeco: interrupted: {message}", file=sys.stderr)
         return INTERRUPTED
     finally:
         if terminate is not None:
@@ -113,11 +116,11 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
-    from neeco.raster.devices import failures_told
-    from neeco.raster.threads import keep_freed_memory
+    from neeco.raster.devices import readable_failures
+    from neeco.raster.native import keep_freed_memory
 
     keep_freed_memory()
-    with failures_told():
+    with readable_failures():
         return run(parsed)
 
 

@@ -6,13 +6,13 @@ from typing import Any
 
 from rich.console import Console
 
-from neeco.cli._tables import fitted
+from neeco.cli._output import fitted
 from neeco.experiments.plans import AblationPlan
 
 
 def run(plan: AblationPlan) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
-    from neeco.cli._bars import Bars
+    from neeco.cli._progress import Bars
     from neeco.experiments.ablation_run import run_ablations
     from neeco.experiments.ablation_tables import write_tables
     from neeco.report.ablation_page import write_ablation_report

@@ -34,8 +34,7 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Annotate, write the page, and say where both lie."""
     from neeco.capture.check import read_checked
-    from neeco.cli._bars import counting
-    from neeco.cli._kept import kept
+    from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
     from neeco.report.annotated_page import write_annotated_page
     from neeco.synthesis.annotated import annotate_capture
@@ -43,7 +42,10 @@ def run(arguments: Arguments) -> int:
 
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
-        with counting("annotate") as advance, kept("what was done is kept; run the same command again with --resume"):
+        with (
+            counting("annotate") as advance,
+            resumable("what was done is kept; run the same command again with --resume"),
+        ):
             annotated = annotate_capture(
                 trained,
                 arguments.output,

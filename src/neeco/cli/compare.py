@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from neeco.cli._outcome import tell_outcome
-from neeco.cli._tables import fitted
-from neeco.settings import Device
+from neeco.cli._output import fitted, print_outcome
+from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Compare:
 
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
-    from neeco.cli._bars import Bars
+    from neeco.cli._progress import Bars
     from neeco.experiments.comparison import compare, failures, plan_comparison
     from neeco.experiments.comparison_tables import absent_notes, budget_words, tables_of
     from neeco.report.comparison_page import write_comparison_report
@@ -74,7 +73,7 @@ def run(args: Compare) -> int:
         for part in fitted(table, console.width):
             console.print(part)
     notes, failed = absent_notes(comparison), failures(comparison)
-    return tell_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison['jobs'])} runs")
+    return print_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison['jobs'])} runs")
 
 
 def _spec(args: Compare) -> ComparisonSpec:
@@ -84,21 +83,19 @@ def _spec(args: Compare) -> ComparisonSpec:
 
     masks: dict[str, Path] = {}
     for word in args.masks:
-        name, equals, folder = word.partition("=")
-        if not (name and equals and folder):
-            raise NeecoError(f"--masks: {word!r} is not NAME=FOLDER; write such as sam2=masks/sam2")
+        name, folder = name_and_value("--masks", word, "sam2=masks/sam2")
         if name in masks:
             raise NeecoError(f"--masks: {name!r} is given twice; name each folder differently")
         masks[name] = Path(folder)
-    told = {field.name for field in fields(args)} & {field.name for field in fields(ComparisonSpec)}
-    given = {name: getattr(args, name) for name in told}
+    shared = {field.name for field in fields(args)} & {field.name for field in fields(ComparisonSpec)}
+    given = {name: getattr(args, name) for name in shared}
     given |= {"methods": tuple(dict.fromkeys(args.methods)), "masks": masks, "assignments": args.set}
     return ComparisonSpec(**given, budget=_budget(args))
 
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
     options = {
         "--minutes": args.minutes,
@@ -107,9 +104,9 @@ def _budget(args: Compare) -> Budget:
     }
     given = [option for option, value in options.items() if value is not None]
     if len(given) != 1:
-        told = f"{' and '.join(given)} are given" if given else "no budget is given"
+        found = f"{' and '.join(given)} are given" if given else "no budget is given"
         raise NeecoError(
-            f"{told}; every method trains equally long: give one of {', '.join(options)} (try --minutes 5)"
+            f"{found}; every method trains equally long: give one of {', '.join(options)} (try --minutes 5)"
         )
     if args.cpu_minutes is not None:
         return Budget(args.cpu_minutes, None, "processor")

@@ -96,7 +96,7 @@ def _check(path: Path) -> None:
 def _train(capture: Path, output: Path, minutes: float, device: torch.device) -> Path:
     from dataclasses import replace
 
-    from neeco.cli._training import train_with_progress
+    from neeco.cli._progress import train_with_progress
     from neeco.training.config import method_defaults
 
     print(f"2/4 train for {minutes:g} minutes")
@@ -105,7 +105,7 @@ def _train(capture: Path, output: Path, minutes: float, device: torch.device) ->
 
 
 def _synthesize(trained: Run, output: Path) -> None:
-    from neeco.cli._bars import counting
+    from neeco.cli._progress import counting
     from neeco.synthesis.dataset import synthesize
     from neeco.synthesis.settings import Settings
 

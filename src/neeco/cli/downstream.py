@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from neeco.cli._outcome import tell_outcome
-from neeco.cli._tables import fitted
-from neeco.settings import Device
+from neeco.cli._output import fitted, print_outcome
+from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
-    from neeco.experiments.downstream.plan import DownstreamSpec
+    from neeco.experiments.downstream.job import DownstreamSettings
     from neeco.experiments.downstream.samples import DataSet
 
 
@@ -66,15 +65,14 @@ class Downstream:
 
 
 def run(args: Downstream) -> int:
-    """Teach and test with progress bars; print tables, answers and where the files lie; 1 when a training failed."""
-    from neeco.cli._bars import Bars
-    from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
-    from neeco.experiments.downstream.plan import plan_downstream
-    from neeco.experiments.downstream.tables import tables_of, write_tables
+    """Train and test with progress bars; print tables, findings and where the files are; 1 when a training failed."""
+    from neeco.cli._progress import Bars
+    from neeco.experiments.downstream.experiment import plan_downstream, run_downstream
+    from neeco.experiments.downstream.results import failed_jobs, tables_of, write_tables
     from neeco.report.downstream_page import write_downstream_report
 
     with Bars() as bars:
-        plan = plan_downstream(_spec(args))
+        plan = plan_downstream(_settings(args))
         experiment = run_downstream(plan, bars.job)
         write_tables(args.output, experiment)
         bars.stage("report", 0, 1)
@@ -87,38 +85,24 @@ def run(args: Downstream) -> int:
     for sentence in experiment["answers"]:
         console.print(sentence, markup=False, highlight=False)
     notes, failed = experiment["notes"], failed_jobs(experiment)
-    return tell_outcome(console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings")
-
-
-def _spec(args: Downstream) -> DownstreamSpec:
-    """What the words mean. Raises NeecoError for sets and weights that cannot be understood."""
-    from neeco.experiments.downstream.job import Teaching
-    from neeco.experiments.downstream.plan import DownstreamSpec
-
-    teaching = Teaching(
-        capture=args.capture,
-        sets=tuple(_data_set(word) for word in args.sets),
-        classes=args.classes,
-        splits=args.splits,
-        labels=args.labels,
-        transforms=args.transforms,
-        pick=args.frame_selection,
-        steps=args.steps,
-        side=args.size,
-        batch=args.batch,
-        device=args.device,
+    return print_outcome(
+        console, args.output, "downstream", page, notes, failed, f"{len(experiment['jobs'])} trainings"
     )
-    weights = dict(_named("--weights", word, "unet=unet.safetensors") for word in args.weights)
-    return DownstreamSpec(
-        teaching,
-        args.output,
-        tuple(dict.fromkeys(args.models)),
-        tuple(dict.fromkeys(args.num_real)),
-        args.folds,
-        args.conditions or None,
-        {name: Path(file) for name, file in weights.items()},
-        args.workers,
-    )
+
+
+def _settings(args: Downstream) -> DownstreamSettings:
+    """The study that these words describe. Raises NeecoError for sets and weights that cannot be understood."""
+    from neeco.experiments.downstream.job import DownstreamSettings
+
+    weights = dict(name_and_value("--weights", word, "unet=unet.safetensors") for word in args.weights)
+    given = vars(args) | {
+        "sets": tuple(_data_set(word) for word in args.sets),
+        "models": tuple(dict.fromkeys(args.models)),
+        "num_real": tuple(dict.fromkeys(args.num_real)),
+        "conditions": args.conditions or None,
+        "weights": {name: Path(file) for name, file in weights.items()},
+    }
+    return DownstreamSettings(**given)
 
 
 def _data_set(word: str) -> DataSet:
@@ -126,19 +110,10 @@ def _data_set(word: str) -> DataSet:
     from neeco.errors import NeecoError
     from neeco.experiments.downstream.samples import DataSet
 
-    name, place = _named("--sets", word, "kinematic=dataset")
+    name, place = name_and_value("--sets", word, "kinematic=dataset")
     folder, colon, count = place.rpartition(":")
     if not colon or not count.isdecimal() or Path(place).exists():
         return DataSet(name, Path(place))
     if int(count) < 1:
         raise NeecoError(f"--sets {word}: {count} images is nothing to learn from; give at least 1")
     return DataSet(name, Path(folder), int(count))
-
-
-def _named(option: str, word: str, example: str) -> tuple[str, str]:
-    from neeco.errors import NeecoError
-
-    name, equals, value = word.partition("=")
-    if not (name and equals and value):
-        raise NeecoError(f"{option}: {word!r} is not NAME=PATH; write such as {example}")
-    return name, value

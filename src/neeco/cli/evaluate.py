@@ -45,8 +45,8 @@ class Evaluate:
 
 def run(args: Evaluate) -> int:
     """Evaluate, write the report, print a table."""
-    from neeco.cli._bars import Bars
-    from neeco.cli._json import ready_for_json
+    from neeco.cli._output import ready_for_json
+    from neeco.cli._progress import Bars
     from neeco.evaluation.evaluate import evaluate_run
     from neeco.evaluation.lpips import find_lpips
     from neeco.files import new_folder, write_json

@@ -41,8 +41,8 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Score, print a table."""
-    from neeco.cli._bars import counting
-    from neeco.cli._json import ready_for_json
+    from neeco.cli._output import ready_for_json
+    from neeco.cli._progress import counting
     from neeco.evaluation.mask_folders import parse_classes
     from neeco.evaluation.mask_scores import score_masks
     from neeco.files import write_json

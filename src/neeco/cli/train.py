@@ -47,7 +47,7 @@ class Arguments:
 
 def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
-    from neeco.cli._training import train_with_progress
+    from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
     from neeco.training.options import variant_config
 
@@ -75,10 +75,10 @@ def explain() -> str:
     from neeco.scene.methods import METHODS
     from neeco.settings import described
 
-    told = ["Settings of each method, as --set deformation.NAME=VALUE:"]
+    paragraphs = ["Settings of each method, as --set deformation.NAME=VALUE:"]
     for name, method in METHODS.items():
         fields = [f"{field}: {kind} = {default}" for field, kind, default in described(method.Settings)]
         if fields:
             words = " ".join((method.Settings.__doc__ or "").split())
-            told.append(f"{name}: {', '.join(fields)}. {words}")
-    return "\n\n".join(told)
+            paragraphs.append(f"{name}: {', '.join(fields)}. {words}")
+    return "\n\n".join(paragraphs)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 from neeco.evaluation.resize import resize_camera, resize_mask
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.pinhole import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
 
@@ -76,7 +76,7 @@ def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
     drawn = []
     for frame in chosen:
         camera = _small(frame.camera)
-        rendering = scene.draw(frame.state, camera)
+        rendering = scene.render(frame.state, camera)
         drawn.append((scene.camera(camera), _filled(rendering)))
     height = max((camera.height for camera, _ in drawn), default=1)
     width = max((camera.width for camera, _ in drawn), default=1)
@@ -100,7 +100,7 @@ def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Te
     nearest drawn pixel. Instrument pixels (by the composited label) move with the state and are in neither mask.
     """
     camera = _small(frame.camera)
-    rendering = scene.draw(frame.state, camera, labels=True)
+    rendering = scene.render(frame.state, camera, labels=True)
     tissue = torch.ones(camera.height, camera.width, dtype=torch.bool)
     if rendering.channels is not None:
         tissue = composited_parts(rendering, threshold_of(scene)).cpu() == 0

@@ -21,9 +21,9 @@ from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, m
 from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
 from neeco.evaluation.truth import load_reference
 from neeco.files import write_json
-from neeco.labels.composited import threshold_of
 from neeco.labels.drawing import draw
-from neeco.raster.threads import synchronise
+from neeco.labels.labellers import threshold_of
+from neeco.raster.native import synchronise
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 
@@ -181,7 +181,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     for index in range(TIMED_DRAWS + 2):
         frame = frames[index % len(frames)]
         start = time.perf_counter()
-        synchronise(scene.draw(frame.state, frame.camera).color.device)
+        synchronise(scene.render(frame.state, frame.camera).color.device)
         seconds.append(time.perf_counter() - start)
         if len(seconds) > 1 and sum(seconds) > TIMED_SECONDS:
             break

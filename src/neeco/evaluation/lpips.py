@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, max_pool2d, relu
 
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 
 WEIGHTS_VARIABLE = "NEECO_LPIPS_WEIGHTS"
 MIN_SIZE = 32  # px; below it the pooled maps vanish

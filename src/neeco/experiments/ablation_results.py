@@ -9,7 +9,7 @@ from typing import Any
 from neeco.experiments.ablations import CHECKPOINTS, PHASE_1_PSNR, Ablation, Comparison, Entry
 from neeco.experiments.families import PHASE_1_SHARE
 from neeco.experiments.masks import LabelScores
-from neeco.experiments.watching import CURVE_FILE, read_rows
+from neeco.experiments.training_job import CURVE_FILE, read_json_lines
 
 EVEN_DB = 0.1  # differences smaller than this say nothing about a direction
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
@@ -111,7 +111,7 @@ def _values(
     values: Values = {}
     if entry.variant.family.phased:
         values[PHASE_1_PSNR] = phase_1_psnr(folder, int(result["iterations"]))
-        curve = read_rows(folder / CURVE_FILE)
+        curve = read_json_lines(folder / CURVE_FILE)
         split = primary_split(splits)
         for percent in CHECKPOINTS:
             values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)
@@ -127,7 +127,7 @@ def phase_1_psnr(folder: Path, iterations: int) -> float | None:
     A row averages 50 steps; None when phase 1, or the whole run, was shorter than that.
     """
     end = PHASE_1_SHARE * iterations
-    rows = [row for row in read_rows(folder / "metrics.jsonl") if row["iteration"] <= end]
+    rows = [row for row in read_json_lines(folder / "metrics.jsonl") if row["iteration"] <= end]
     late = [row["psnr"] for row in rows if row["iteration"] > 0.75 * end or row is rows[-1]]
     return round(sum(late) / len(late), 4) if late else None
 
@@ -146,6 +146,6 @@ def _curves(table: Ablation, folders: Mapping[str, Path], split: str) -> list[di
         for comparison in table.comparisons
         for entry in comparison.entries
         if entry.variant.name in folders
-        for row in read_rows(folders[entry.variant.name] / CURVE_FILE)
+        for row in read_json_lines(folders[entry.variant.name] / CURVE_FILE)
         if row["split"] == split
     ]

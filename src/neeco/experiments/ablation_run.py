@@ -18,12 +18,11 @@ from neeco.experiments.ablation_results import table_of
 from neeco.experiments.ablations import ABLATIONS, OURS, PAPER, Ablation, Variant
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
-from neeco.experiments.jobs import Budget, Job, check_settings, settings_for
 from neeco.experiments.machine import machine
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.plans import AblationPlan
-from neeco.experiments.running import check_workers, run_jobs
-from neeco.experiments.work import JobNews
+from neeco.experiments.study import JobEvent, check_workers, run_jobs
+from neeco.experiments.training_job import Budget, TrainingJob, check_settings, settings_for
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.training.options import training_config
@@ -33,7 +32,7 @@ SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
 
 
-def run_ablations(plan: AblationPlan, progress: Callable[[JobNews], None] | None = None) -> dict[str, Any]:
+def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
     """Train and score every variant of the chosen tables, write DIR/ablation.json and return what it holds.
 
     Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
@@ -115,7 +114,7 @@ def _steps(plan: AblationPlan, family: Family) -> int:
     return given or max(family.least_steps, plan.iterations)
 
 
-def _job(plan: AblationPlan, variant: Variant) -> Job:
+def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
     """The job of one variant. Settings: its family's, then the user's, then what the variant is about."""
     family, steps = variant.family, _steps(plan, variant.family)
     values = {"iterations": steps, "seed": plan.seed, "transforms": plan.transforms}
@@ -127,7 +126,7 @@ def _job(plan: AblationPlan, variant: Variant) -> Job:
         capture = plan.output / "captures" / variant.derived.name
         config = replace(config, transforms="transforms.json")
     folder = plan.output / "runs" / variant.name
-    return Job(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
+    return TrainingJob(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
 
 
 def _label_scores(

@@ -11,27 +11,28 @@ from typing import Any
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
-from neeco.capture.fingerprint import fingerprint
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
 from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.comparison_tables import write_tables
-from neeco.experiments.jobs import (
+from neeco.experiments.machine import machine, measure_speed
+from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
+from neeco.experiments.study import JobEvent, check_output, check_workers, run_jobs, threads_per_worker
+from neeco.experiments.summary import distances_to_training, summarise
+from neeco.experiments.training_job import (
+    ANEW,
     BUDGET,
+    CURVE_FILE,
     JOB_FILE,
+    SECONDS_ON,
     Budget,
-    Job,
+    TrainingJob,
     check_settings,
+    read_json_lines,
     read_result,
     settings_for,
 )
-from neeco.experiments.machine import machine
-from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
-from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
-from neeco.experiments.speed import measure_speed
-from neeco.experiments.summary import distances_to_training, summarise
-from neeco.experiments.watching import ANEW, CURVE_FILE, TOTALS, read_rows
-from neeco.experiments.work import JobNews, check_output
 from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
@@ -69,7 +70,7 @@ class ComparisonPlan:
 
     spec: ComparisonSpec
     capture: Capture
-    jobs: tuple[Job, ...]
+    jobs: tuple[TrainingJob, ...]
     splits: tuple[str, ...]
     notes: tuple[str, ...]
     given_masks: tuple[dict[str, Any], ...]  # scores of the folders of masks
@@ -103,7 +104,7 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
 
 
 def compare(
-    plan: ComparisonPlan, news: Callable[[JobNews], None] | None = None, progress: Progress | None = None
+    plan: ComparisonPlan, news: Callable[[JobEvent], None] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
 
@@ -119,7 +120,7 @@ def compare(
         def write() -> None:  # what is known is on disk at every moment
             write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
 
-        def keep(latest: JobNews) -> None:
+        def keep(latest: JobEvent) -> None:
             if latest.result is not None:
                 finished[latest.index] = latest.result
                 write()
@@ -162,9 +163,9 @@ def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
-def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[Job, ...]:
+def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[TrainingJob, ...]:
     return tuple(
-        Job(
+        TrainingJob(
             name,
             seed,
             spec.capture,
@@ -245,8 +246,8 @@ def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[
     """Held-out PSNR of every finished job at about ten moments; seconds on the budget's clock."""
     rows = []
     for job in (job for job in results if "error" not in job):
-        for entry in read_rows(job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE):
-            row = {"name": job["name"], "seed": job["seed"], "seconds": entry[TOTALS[spec.budget.clock]]}
+        for entry in read_json_lines(job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE):
+            row = {"name": job["name"], "seed": job["seed"], "seconds": entry[SECONDS_ON[spec.budget.clock]]}
             rows.append(row | {key: entry[key] for key in ("iteration", "split", "psnr")})
     return rows
 

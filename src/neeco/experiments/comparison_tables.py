@@ -125,7 +125,7 @@ def summary_csv(comparison: Mapping[str, Any]) -> str:
 
 def budget_words(comparison: Mapping[str, Any]) -> str:
     """What every run was given, and how often."""
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
     seeds = len(comparison["seeds"])
     return f"{Budget(**comparison['budget'])} each, {seeds} seed{'s' if seeds > 1 else ''}"

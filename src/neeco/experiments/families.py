@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from neeco.scene.deformations.nps import WARM_UP
+from neeco.scene.methods import method_settings
 from neeco.training.config import TrainConfig
 from neeco.training.schedule import CLOSEST_RESETS
 from neeco.training.train import ROW_INTERVAL
@@ -35,7 +35,7 @@ class Family:
 def _paper_settings(iterations: int) -> tuple[str, ...]:
     """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network rests for its usual
     share of the run or REST_STEPS, whichever is longer."""
-    rest = max(WARM_UP, min(LONGEST_REST, REST_STEPS / iterations))
+    rest = max(method_settings("neeco", {}).warm_up, min(LONGEST_REST, REST_STEPS / iterations))
     return (
         f"schedule.published_steps={PUBLISHED_STEPS}",
         f"schedule.earliest={PHASE_1_STEPS}",

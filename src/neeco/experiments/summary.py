@@ -8,8 +8,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from neeco.capture.model import Capture
-from neeco.capture.similarity import RecordedStates
+from neeco.capture.model import Capture, RecordedStates
 
 SPLIT_METRICS = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou")
 RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import torch
 
+from neeco.capture.documents import Parsed, Problem, ProblemReport
 from neeco.capture.endonerf import MASKS, folder_images
 from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Frame
-from neeco.capture.parsed import Parsed
-from neeco.capture.problems import Problem, ProblemReport
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError

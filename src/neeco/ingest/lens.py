@@ -16,8 +16,7 @@ import torch
 import yaml
 from scipy import ndimage
 
-from neeco.capture.nodes import as_float
-from neeco.capture.problems import shown
+from neeco.capture.documents import as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.raster.types import Camera
@@ -193,7 +192,7 @@ def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], s
         for value in given:
             number = as_float(value)
             if number is None or not abs(number) < LARGEST:  # NaN compares false
-                raise NeecoError(f"{source}: {field}: {shown(value)} is not a usable number; calibrate again")
+                raise NeecoError(f"{source}: {field}: {printable(value)} is not a usable number; calibrate again")
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
@@ -211,7 +210,7 @@ def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
     if width is None or height is None:
         return None
     if not all(isinstance(value, int | float) and 1 <= value < 1e6 for value in (width, height)):
-        raise NeecoError(f"{path}: image size: {shown(width)} x {shown(height)} is not one; correct it")
+        raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
     return int(width), int(height)
 
 
@@ -253,13 +252,13 @@ def _numbers(path: Path, value: Any, field: str) -> list[float]:
     if value is None:
         raise NeecoError(f"{path}: {field}: missing; expected it as OpenCV writes it")
     if not isinstance(value, list):
-        raise NeecoError(f"{path}: {field}: expected numbers, found {shown(value)}; write it as OpenCV does")
+        raise NeecoError(f"{path}: {field}: expected numbers, found {printable(value)}; write it as OpenCV does")
     flat: list[float] = []
     for item in value:
         for entry in item if isinstance(item, list) else [item]:
             number = as_float(entry)
             if number is None:
-                raise NeecoError(f"{path}: {field}: {shown(entry)} is not a usable number; write it as OpenCV does")
+                raise NeecoError(f"{path}: {field}: {printable(entry)} is not a usable number; write it as OpenCV does")
             flat.append(number)
     return flat
 

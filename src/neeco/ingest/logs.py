@@ -13,7 +13,6 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.poses import rotation_error
 from neeco.errors import NeecoError
 from neeco.ingest.columns import (
     EULER,
@@ -34,6 +33,7 @@ from neeco.ingest.columns import (
     split_unit,
 )
 from neeco.ingest.formats import Table, column_index, count_rows, list_lines, numbers, read_table
+from neeco.raster.rotations import rotation_error
 
 MIN_SAMPLES = 4  # of a usable log
 WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused

@@ -11,8 +11,7 @@ from typing import Any
 
 import yaml
 
-from neeco.capture.nodes import Node, as_float
-from neeco.capture.problems import Refusal, shown
+from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest.columns import (
@@ -185,15 +184,15 @@ class Section:
 
     def __init__(self, file: Path, place: str, value: Any, keys: Sequence[str]) -> None:
         self.file, self.place = file, place
-        self.node = Node(value, str(file), place, Refusal())
+        self.node = Node(value, str(file), place, RaisingReport())
         if not isinstance(value, dict):
-            self.node.error(f"expected keys such as `{keys[0]}:`, found {shown(value)}", "write them as key: value")
+            self.node.error(f"expected keys such as `{keys[0]}:`, found {printable(value)}", "write them as key: value")
         self.value: dict[str, Any] = value
         for key in value:
             if key not in keys:
                 likely = _close_match(str(key), keys)
                 hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
-                raise self.error(shown(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
+                raise self.error(printable(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
 
     def error(self, key: str, message: str) -> NeecoError:
         return NeecoError(" ".join(f"{self.file}: {self.at(key)}: {message}".split()))
@@ -232,7 +231,9 @@ class Section:
         except (OSError, ValueError, RuntimeError):
             found = False
         if not found:
-            raise self.error(key, f"no such file: {shown(text, 120)}; correct the path (relative to {self.file.name})")
+            raise self.error(
+                key, f"no such file: {printable(text, 120)}; correct the path (relative to {self.file.name})"
+            )
         return path
 
     def number(
@@ -252,7 +253,7 @@ class Section:
         good = all(isinstance(item, str | int) and not isinstance(item, bool) for item in items)
         if not good or len(items) not in counts:
             wanted = "the name of a column" if counts == (1,) else f"{' or '.join(map(str, counts))} names of columns"
-            raise self.error(key, f"expected {wanted}, found {shown(value)}; list them")
+            raise self.error(key, f"expected {wanted}, found {printable(value)}; list them")
         if len({str(item) for item in items}) < len(items):
             raise self.error(key, "names a column twice; list different columns")
         return tuple(str(item) for item in items)
@@ -266,7 +267,7 @@ class Section:
         for item in value if isinstance(value, list) else [value]:
             match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
             if match is None or int(match[2] or match[1]) < int(match[1]):
-                raise self.error(key, f"{shown(item)} is no range of frames; write 12 or 30-40")
+                raise self.error(key, f"{printable(item)} is no range of frames; write 12 or 30-40")
             found.append((int(match[1]), int(match[2] or match[1])))
         return tuple(found)
 
@@ -283,7 +284,7 @@ class _Loader(yaml.SafeLoader):
         seen: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                problem = f"{shown(key.value)} is given twice; keep one of them"
+                problem = f"{printable(key.value)} is given twice; keep one of them"
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
@@ -341,7 +342,7 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
     found = []
     for section, name in zip(sections, names, strict=True):
         if names.count(name) > 1:
-            raise section.error("name", f"{shown(name)} names two instruments; give each its own")
+            raise section.error("name", f"{printable(name)} names two instruments; give each its own")
         poses = section.value.get("poses")
         columns = None if poses is None else _pose_columns(section, "poses", poses)
         joints = {}
@@ -380,7 +381,7 @@ def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
         raise columns.error("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
     convention = columns.text("euler_convention")
     if convention is not None and not _EULER.fullmatch(convention):
-        problem = f"{shown(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
+        problem = f"{printable(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
         raise columns.error("euler_convention", problem)
     if form == EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
@@ -420,7 +421,7 @@ def _units(section: Section) -> Units:
         text = given.text(kind)
         found[kind] = None if text is None else canonical_unit(text)
         if found[kind] is not None and found[kind] not in units:
-            raise given.error(kind, f"{shown(text)} is no unit of {kind}; use {', '.join(units)}")
+            raise given.error(kind, f"{printable(text)} is no unit of {kind}; use {', '.join(units)}")
     return Units(**found)
 
 
@@ -453,9 +454,9 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
         clock = _clock_of(source, place, str(key).removesuffix(_OFFSET_SUFFIX), clocks)
         seconds = as_float(number)
         if seconds is None or not abs(seconds) < LARGEST:
-            raise source.error(place, f"{shown(number)} is not an offset in seconds; t_log = t_video + offset")
+            raise source.error(place, f"{printable(number)} is not an offset in seconds; t_log = t_video + offset")
         if clock is None:
-            notes.append(f"{source.file.name}: {shown(place)} belongs to no log of this recording; ignored")
+            notes.append(f"{source.file.name}: {printable(place)} belongs to no log of this recording; ignored")
         else:
             offsets[clock] = seconds
     return offsets, tuple(notes)
@@ -470,7 +471,9 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
         return longer[0]
     likely = _close_match(name, clocks)
     if likely or len(longer) > 1:
-        raise source.error(place, f"no log has the clock {shown(name)}; did you mean {likely or ' or '.join(longer)}?")
+        raise source.error(
+            place, f"no log has the clock {printable(name)}; did you mean {likely or ' or '.join(longer)}?"
+        )
     return None
 
 
@@ -482,7 +485,7 @@ def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | N
     joints = [joint for instrument in instruments for joint in instrument.joints]
     if by is not None and by not in joints:
         raise section.error(
-            "unseen_by", f"no joint is called {shown(by)}; the joints are {', '.join(joints) or 'none'}"
+            "unseen_by", f"no joint is called {printable(by)}; the joints are {', '.join(joints) or 'none'}"
         )
     fraction, every = section.number("unseen_fraction", least=0.0, below=0.9), section.integer("test_every", 0)
     given: dict[str, Any] = {} if fraction is None else {"unseen_fraction": fraction}

@@ -13,7 +13,7 @@ from neeco.experiments.families import NEECO_RUNS, PHASE_1_SHARE, PUBLISHED_STEP
 from neeco.experiments.machine import hardware_words
 from neeco.experiments.tables import csv_text as csv_of
 from neeco.report.charts import Series, legend, line_chart
-from neeco.report.render import REPORT_FILE, write_page
+from neeco.report.page import REPORT_FILE, write_page
 
 LEVEL_SCORES = (("psnr", "PSNR, dB"), ("psnr_instrument", "PSNR in the instrument, dB"), ("mask_iou", "IoU"))
 Figure = dict[str, Any]  # chart, legend, data (a CSV) and file (its name)

@@ -28,7 +28,7 @@ from neeco.experiments.tables import UNKNOWN, Table, csv_text
 from neeco.files import write_text
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.comparison_shots import FrameRow, frame_rows
-from neeco.report.render import REPORT_FILE, split_counts, write_page
+from neeco.report.page import REPORT_FILE, split_counts, write_page
 from neeco.report.standings import standings
 
 BINS = 6

@@ -17,7 +17,7 @@ from neeco.evaluation.mask_metrics import mean_of
 from neeco.evaluation.truth import load_reference
 from neeco.experiments.comparison import job_folder
 from neeco.labels.drawing import draw
-from neeco.report.figures import difference, jpeg, to_bytes
+from neeco.report.page import difference, jpeg, to_bytes
 from neeco.training.run import open_run
 
 

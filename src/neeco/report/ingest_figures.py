@@ -14,7 +14,7 @@ from neeco.evaluation.difference import outline
 from neeco.ingest.motion import RoughShape
 from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
-from neeco.report.figures import MAX_WIDTH, jpeg, to_bytes
+from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 from neeco.report.tracks import round_length
 
 FIGURES = 8

@@ -31,7 +31,7 @@ from neeco.report.ingest_figures import (
     main_axes,
     sample_figures,
 )
-from neeco.report.render import split_counts, write_page
+from neeco.report.page import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -12,6 +13,18 @@ from torch import Tensor
 from neeco.capture.model import Camera, Instrument, State
 from neeco.raster.types import Rendering
 from neeco.scene.recorded import Recorded
+
+
+@dataclass(frozen=True)
+class HingeMotion:
+    """All that posing takes where bodies move rigidly with their instruments and turn about hinges, for renderers
+    other than this program's."""
+
+    log_scales: Tensor  # [N, 3], as drawn
+    turns: Tensor  # [N, J, 2] rad by which joint j turns a Gaussian: at a reading of 0, and per unit of the reading
+    hinges: tuple[
+        tuple[tuple[Tensor, Tensor], ...], ...
+    ]  # per moving instrument and joint: pivot [3] mm, unit axis [3]
 
 
 class Drawable(Protocol):
@@ -38,8 +51,11 @@ class Drawable(Protocol):
     def camera(self, camera: Camera) -> Camera:
         """The camera to draw with for a recorded one."""
 
-    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """Draw `state` as the recorded `camera` sees it; `labels`: with label channels where the scene has them."""
+    def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+        """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
+
+    def hinge_motion(self) -> HingeMotion | None:
+        """How the Gaussians move, where hinges say all of it; None otherwise."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
         """As many of torch's threads as pay where the scene is drawn."""

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from neeco.capture.model import Instrument
-from neeco.raster.threads import torch_threads
+from neeco.capture.model import Capture, Instrument
+from neeco.raster.native import torch_threads
 from neeco.scene.drawable import Learned
-from neeco.scene.learning import Session, Start
 from neeco.scene.recorded import Recorded
+from neeco.scene.training_session import RunLength, Session
+from neeco.scene.training_views import TrainingViews
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
 PLAIN_TRAINING: Mapping[str, Any] = {
@@ -65,10 +66,14 @@ class Method:
         return nullcontext() if cls.large_operations else torch_threads(1)
 
     @classmethod
-    def session(cls, start: Start, scene: Any | None) -> Session:
-        """A session at iteration 0: around a new scene, or around `scene`, which a checkpoint held.
+    def session(
+        cls, capture: Capture, views: TrainingViews, settings: Any, length: RunLength, seed: int, scene: Any | None
+    ) -> Session:
+        """A session at iteration 0 of a method without Gaussians, on the views' device: around a new scene, or around
+        `scene`, which a checkpoint held. `settings` are the method's own. Methods with Gaussians share one session
+        (`neeco.training.session`).
 
-        Raises NeecoError where the capture does not do.
+        Raises NeecoError where the capture lacks what the method needs.
         """
         raise NotImplementedError
 

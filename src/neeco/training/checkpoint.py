@@ -16,7 +16,7 @@ from neeco.errors import NeecoError
 from neeco.files import require_file, require_like
 from neeco.scene.drawable import Learned
 from neeco.scene.io import DAMAGED, pack_scene, save_tensors, unpack_scene
-from neeco.scene.learning import Session, StepResult
+from neeco.scene.training_session import Session, StepResult
 from neeco.training.session import members
 
 SCHEMA = "neeco-checkpoint/1"

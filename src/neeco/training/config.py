@@ -8,6 +8,7 @@ from typing import Any
 
 from neeco.errors import NeecoError
 from neeco.scene.methods import DEFAULT, method_class, method_settings
+from neeco.scene.training_session import RunLength
 from neeco.settings import plain, structure, with_fields
 from neeco.training.schedule import ScheduleConfig
 
@@ -48,12 +49,10 @@ class TrainConfig:
         if self.deformation is None:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
 
-    def done_share(self, iteration: int, seconds: float) -> float:
-        """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
-        done = iteration / self.iterations
-        if self.minutes is not None:
-            done = max(done, seconds / (60 * self.minutes))
-        return min(1.0, done)
+    @property
+    def length(self) -> RunLength:
+        """When the run ends."""
+        return RunLength(self.iterations, self.minutes)
 
 
 def method_defaults(method: str) -> TrainConfig:

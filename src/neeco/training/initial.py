@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -9,16 +11,33 @@ from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
-from neeco.scene.learning import Report
-from neeco.scene.methods import make_deformation
+from neeco.scene.drawable import Learned
+from neeco.scene.methods import make_deformation, method_class
 from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
+from neeco.scene.training_session import InstrumentSearch, Report, Session
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
-from neeco.training.instruments.search import SessionSearch
+from neeco.training.instruments.discovery import find_instruments
+from neeco.training.instruments.finish import conclude
+from neeco.training.instruments.gate import close_gate
+from neeco.training.instruments.light import find_shadow
+from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
-from neeco.training.views import TrainingViews
 
 REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
+
+
+def begin_session(
+    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Learned | None = None
+) -> Session:
+    """A session at iteration 0, of any method, on the device of the views: around a new scene, or around `scene`, which
+    a checkpoint held."""
+    method = method_class(config.method)
+    if method.has_gaussians:
+        assert scene is None or isinstance(scene, Scene)
+        return gaussian_session(capture, views, config, report, scene)
+    return method.session(capture, views, config.deformation, config.length, config.seed, scene)
 
 
 def gaussian_session(
@@ -30,7 +49,14 @@ def gaussian_session(
     if scene is None:
         scene = initial_scene(capture, views.frames, config, report)
     session = new_session(scene.to(views.device), views, config, report)
-    session.instruments = SessionSearch(session)
+    session.instruments = InstrumentSearch(
+        find=partial(find_instruments, session),
+        bound=partial(close_gate, session),
+        place_wrists=partial(place_wrists, session),
+        replace_wrists=partial(replace_wrists, session),
+        find_shadow=partial(find_shadow, session),
+        conclude=partial(conclude, session),
+    )
     if begins:
         scene.deformation.begin(session)
     session.start()

@@ -15,17 +15,17 @@ from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
+from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
-from neeco.raster.on_device import constant, quick_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
-from neeco.scene.learning import InstrumentSearch, Report, StepResult, check_finite, numbers
 from neeco.scene.scene import Scene
+from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, numbers
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule, due, order_by_pose
-from neeco.training.views import TrainingViews
 
 POSITION_RATE = 1.6e-4  # times the scene's extent (3DGS)
 GAUSSIAN_RATES = {
@@ -42,31 +42,23 @@ SETTLE_INTERVAL = 200  # iterations between prunings, and between re-centrings o
 
 
 @dataclass
-class GaussianSession:
+class GaussianSession(GaussianTraining):
     """One training run in memory, of any method that deforms Gaussians. Its hooks are `Deformation`'s."""
 
-    config: TrainConfig
     scene: Scene
-    views: TrainingViews
-    report: Report
+    config: TrainConfig
     pose_order: np.ndarray
     extent: float  # mm; positions' learning rates and the dense size scale with it
     refinement: Refinement
     rng: np.random.Generator
-    generator: torch.Generator
-    adam: Adam = field(init=False)
     schedule: Schedule = field(init=False)
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame, as recorded, on the views' device
     statistics: GradientStatistics = field(init=False)
-    instruments: InstrumentSearch = field(init=False)  # for hooks; a session without hooks to serve has none
     queue: list[int] = field(default_factory=list)
     queue_phase: int = 1
-    iteration: int = 0
-    seconds: float = 0.0
-    window: list[StepResult] = field(default_factory=list)  # steps since the last row of metrics.jsonl
 
     def __post_init__(self) -> None:
-        self.adam = Adam(self.config.views_per_step)
+        self.adam = Adam(self.batch_size)
         self.schedule = Schedule(self.config.schedule, self.config.iterations)
         device = self.views.device
         self.given = [(frame.state.to(device), frame.camera.to(device)) for frame in self.views.frames]
@@ -91,11 +83,6 @@ class GaussianSession:
         return GAUSSIAN_RATES | {f"extras.{name}": rate for name, rate in extras.items()}
 
     @property
-    def progress(self) -> float:
-        """Done share of the run in [0, 1], by iterations or minutes, whichever is further."""
-        return self.config.done_share(self.iteration, self.seconds)
-
-    @property
     def phase(self) -> int:
         """1 or 2 of the dynamic training adjustment."""
         return self.schedule.phase
@@ -110,7 +97,7 @@ class GaussianSession:
 
         Iterations count frames. Of the device's numbers a step asks once, when all its work has been handed over.
         """
-        views = self.config.views_per_step
+        views = self.batch_size
         self.iteration += views
         progress, scene = self.progress, self.scene
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
@@ -131,7 +118,7 @@ class GaussianSession:
 
     def _learn_from(self, index: int, progress: float, following: int | None) -> tuple[Tensor, Tensor, Tensor]:
         """Add one frame's share to all gradients; returns what it minimises, the image's loss and squared error."""
-        scene, views = self.scene, self.config.views_per_step
+        scene, views = self.scene, self.batch_size
         state, camera, penalty = self.refinement.apply(index, *self.given[index], self.iteration)
         channels = scene.deformation.training_channels(scene.canonical, self.iteration)
         rendering = rasterize(scene.at(state, self._perturbation(progress)), camera, channels=channels)
@@ -140,7 +127,7 @@ class GaussianSession:
             self.views.announce(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
-        with quick_products(self.views.device) if scene.deformation.large_operations else nullcontext():
+        with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             total.backward(torch.full_like(total, 1 / views))
         gradient = rendering.center_offsets.grad
         assert gradient is not None
@@ -228,13 +215,9 @@ class GaussianSession:
         if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.density_stop:
             reset_opacity(scene.canonical, self.adam)
 
-    def reached(self, iteration: int) -> bool:
-        """Was it this step that came to `iteration`, or past it?"""
-        return self.iteration - self.config.views_per_step < iteration <= self.iteration
-
     def _due(self, interval: int) -> bool:
         """Whether this step reached a multiple of `interval` iterations."""
-        return due(interval, self.iteration - self.config.views_per_step, self.iteration)
+        return due(interval, self.iteration - self.batch_size, self.iteration)
 
     def _limits(self) -> list[BodyLimit]:
         dense = 0.01 * self.extent
@@ -286,15 +269,17 @@ def new_session(
     """A session at iteration 0, on the device of the views; `start` it before the first step."""
     names = tuple(instrument.name for instrument in scene.instruments)
     return GaussianSession(
-        config,
         scene,
+        config.length,
+        torch.Generator(views.device).manual_seed(config.seed),
         views,
         report,
+        config.views_per_step,
+        config,
         pose_order(views.frames, names),
         scene_extent(views.frames, scene.center.cpu()),
         Refinement(config.refine, views.frames, names, views.device),
         np.random.default_rng(config.seed),
-        torch.Generator(views.device).manual_seed(config.seed),
     )
 
 

@@ -8,27 +8,26 @@ import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch
 
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
-from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Frame
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
-from neeco.scene.learning import Session, Start
 from neeco.scene.methods import method_class, unmet_need
+from neeco.scene.training_session import Session
+from neeco.scene.training_views import TrainingViews
 from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint, telling_damage
 from neeco.training.config import TrainConfig
-from neeco.training.initial import gaussian_session
+from neeco.training.initial import begin_session
 from neeco.training.interrupt import StopRequest, hearing_stops
 from neeco.training.run import read_config, require_same_capture, stored_config, write_config
 from neeco.training.schedule import due
-from neeco.training.views import TrainingViews
 
 CHECKPOINT_INTERVAL = 500  # iterations
 CPU = torch.device("cpu")
@@ -135,15 +134,13 @@ def _begin(
     views = TrainingViews.read(frames).to(device)
     started = log.clock()
     torch.manual_seed(config.seed)
-    start = Start(capture, views, config, log.note, partial(gaussian_session, capture, views, config, log.note))
-    method = method_class(config.method)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
         with telling_damage(checkpoint_path(output)):
-            session = method.session(start, scene)
+            session = begin_session(capture, views, config, log.note, scene)
             restore_session(session, header, tensors)
     else:  # interrupted before its first checkpoint, a resumed run begins again
-        session = method.session(start, None)
+        session = begin_session(capture, views, config, log.note)
     log.keep_until(session.iteration)
     session.seconds += log.clock() - started
     return session

@@ -102,7 +102,7 @@ def coarse_psnr(loaded: Loaded, index: int) -> float:
     mask = frame.load_mask()
     if mask is not None:
         mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
-    drawn = loaded.scene.draw(frame.state, camera).color.clamp(0, 1).cpu()
+    drawn = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
     return psnr(drawn, torch.from_numpy(photograph), mask)
 
 

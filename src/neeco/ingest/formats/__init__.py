@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from neeco.capture.problems import shown
+from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.registry import named_classes
 
@@ -76,7 +76,7 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
                 break
             value = parse_number(cells[index].replace(",", ".") if table.decimal_comma else cells[index])
             if value is None:
-                bad.append((row, f"{columns[slot]} is {shown(cells[index], 24)}, not a number"))
+                bad.append((row, f"{columns[slot]} is {printable(cells[index], 24)}, not a number"))
                 break
             values[row, slot] = value
     missing = np.isnan(values).any(axis=1)
@@ -91,7 +91,7 @@ def column_index(table: Table, name: str) -> int:
     matches = [index for index, other in enumerate(table.header) if other.lower() == name.lower()]
     if len(matches) != 1:
         names = ", ".join(table.header[:16]) + (", ..." if len(table.header) > 16 else "")
-        raise NeecoError(f"{table.path}: has no column {shown(name)}; its columns are {shown(names, 200)}")
+        raise NeecoError(f"{table.path}: has no column {printable(name)}; its columns are {printable(names, 200)}")
     return matches[0]
 
 

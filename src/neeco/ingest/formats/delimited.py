@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.problems import shown
+from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.ingest.formats import LogFormat, Table, parse_number
@@ -34,7 +34,7 @@ class DelimitedText(LogFormat):
         names, *rows = [_split(path, number, line, delimiter) for number, line in lines]
         header = _unique(names)
         if all(not name or parse_number(name) is not None for name in header):
-            found = shown(lines[0][1][:40])
+            found = printable(lines[0][1][:40])
             raise NeecoError(
                 f"{path}: line {lines[0][0]}: no header (found {found}); add a first line naming the columns"
             )

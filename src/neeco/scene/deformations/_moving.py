@@ -12,7 +12,7 @@ from torch import Tensor
 from neeco.capture.model import Instrument, State
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import Deformation
-from neeco.scene.learning import Training
+from neeco.scene.training_session import GaussianTraining
 
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
 STILL = 1e-6  # mm; what moves less does not move
@@ -33,7 +33,7 @@ class LabelledByMotion(Deformation):
             return super().label_channels(canonical)
         return canonical.extras[MEMBERSHIP][:, None]
 
-    def finish(self, training: Training) -> None:
+    def finish(self, training: GaussianTraining) -> None:
         scene = training.scene
         if self.instruments:
             scene.canonical = mark_moving(self, scene.canonical, list(scene.recorded.states[::EVERY]))

@@ -14,9 +14,9 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Learned
-from neeco.scene.learning import Session, Start, Training
+from neeco.scene.drawable import HingeMotion, Learned
 from neeco.scene.method import Method, Stored
+from neeco.scene.training_session import GaussianTraining
 
 FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are shorter)
 MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
@@ -70,11 +70,15 @@ class Deformation(nn.Module, Method):
     Training calls the hooks without knowing whose they are: `fit_ranges` and `initial_extras`, then `begin`,
     in every step `disturbed`, `training_channels` and `regularisation`, between steps `between_steps`, where density is
     controlled `lost`, and at the end `finish`.
+
+    `separates_instruments`: tissue and instruments are bodies of their own, and instruments of several scenes can be
+    combined in one (`combined`, `fit_extras`).
     """
 
     label_names: tuple[tuple[str, str], ...] = ()
     extra_rates: ClassVar[Mapping[str, float]] = {}
     learns_from: ClassVar[int] = 0
+    separates_instruments: ClassVar[bool] = False
     warm_up: float = 0.0
     resting: bool = False
 
@@ -83,9 +87,9 @@ class Deformation(nn.Module, Method):
         self.instruments = instruments
         self.settings = self.Settings() if settings is None else settings
 
-    @classmethod
-    def session(cls, start: Start, scene: Any | None) -> Session:
-        return start.gaussians(scene)
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
 
     @classmethod
     def load(cls, stored: Stored) -> Learned:
@@ -109,6 +113,21 @@ class Deformation(nn.Module, Method):
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
         return {}
 
+    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion | None:
+        """How Gaussians move, where hinges say all of it; None otherwise. Subclasses do not inherit it: they may pose
+        otherwise."""
+        return None
+
+    @classmethod
+    def combined(cls, deformations: Sequence[Deformation]) -> Deformation:
+        """One deformation of the instruments of several of this method, in their order."""
+        raise NotImplementedError
+
+    def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The per-Gaussian parameters of the method, of a deformation that was combined into this one, in this one's
+        shapes."""
+        return {}
+
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Take scales from the recorded states and the points [P, 3] mm, once before training; nothing by default."""
 
@@ -117,7 +136,7 @@ class Deformation(nn.Module, Method):
         density control carries them along."""
         return {}
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         """Once, before the first step of a new scene (not when a run goes on); may replace the canonical Gaussians."""
 
     def disturbed(
@@ -143,11 +162,11 @@ class Deformation(nn.Module, Method):
         """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
         return {}
 
-    def between_steps(self, training: Training, before: float) -> None:
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
         """After every step; `before` is the progress before it: for what is due once a mark has been passed. A step may
-        be several iterations (`views_per_step`)."""
+        be several iterations (`batch_size`)."""
 
-    def finish(self, training: Training) -> None:
+    def finish(self, training: GaussianTraining) -> None:
         """Find out what is found once learning has ended; may replace the canonical Gaussians."""
 
 

@@ -6,6 +6,7 @@ parts about hinges that are learned from the images, with soft part assignment p
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,10 +29,11 @@ from neeco.scene.deformations.base import (
     floored_decay,
     state_of,
 )
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.hinges import PART_LOGITS, Hinges
-from neeco.scene.learning import Training
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.rim import continue_tissue, never_in_view
+from neeco.scene.training_session import GaussianTraining
 
 LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
 SHARPENS_FROM = 1000  # iteration
@@ -71,6 +73,7 @@ class Kinematic(Deformation):
 
     method = "kinematic"
     Settings = KinematicSettings
+    separates_instruments = True
     learns_from = 600  # hinges hold still until Gaussians have taken shape around them, or unformed ones drag them off
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
@@ -160,10 +163,40 @@ class Kinematic(Deformation):
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
 
+    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
+        log_scales = canonical.log_scales.clone()
+        joints = max((len(instrument.joints) for instrument in self.instruments), default=0)
+        turns = canonical.means.new_zeros(len(canonical), joints, 2)
+        for index, instrument in enumerate(self.instruments):
+            if not instrument.joints:
+                continue
+            hinges, rows = self.hinges_of(index), canonical.body(index + 1)
+            weights = self.part_weights(canonical, index)
+            log_scales[rows] = torch.minimum(log_scales[rows], hinges.longest(weights).log())
+            for joint in range(len(hinges.joint_names)):
+                pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
+                turns[rows, joint, 0] = pair @ hinges.turns(joint, 0.0)
+                turns[rows, joint, 1] = pair @ hinges.gains[joint]
+        bodies = [self.hinges_of(index) for index in range(len(self.instruments))]
+        found = tuple(tuple(body.hinge(joint) for joint in range(len(body.joint_names))) for body in bodies)
+        return HingeMotion(log_scales, turns, found)
+
+    @classmethod
+    def combined(cls, deformations: Sequence[Deformation]) -> Kinematic:
+        parts = [part for part in deformations if isinstance(part, Kinematic)]
+        instruments = tuple(instrument for part in parts for instrument in part.instruments)
+        made = cls(instruments, copy.deepcopy(parts[0].settings))
+        made.hinges = nn.ModuleList(copy.deepcopy(hinges) for part in parts for hinges in part.hinges)
+        return made
+
+    def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        logits, columns = extras[PART_LOGITS], self.logit_count
+        return {PART_LOGITS: nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]}
+
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         training.instruments.find(self)
 
     def disturbed(
@@ -212,7 +245,7 @@ class Kinematic(Deformation):
         opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
         return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
 
-    def between_steps(self, training: Training, before: float) -> None:
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
         passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
         if self.settings.shadow and (passed or any(map(training.reached, SHADOW_AT))):
             training.instruments.find_shadow()
@@ -221,7 +254,7 @@ class Kinematic(Deformation):
         elif passed and self.settings.wrist_again:
             training.instruments.replace_wrists(self)
 
-    def finish(self, training: Training) -> None:
+    def finish(self, training: GaussianTraining) -> None:
         training.instruments.conclude(self)
         if self.settings.rim:
             scene = training.scene

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations._moving import LabelledByMotion
@@ -32,14 +32,13 @@ from neeco.scene.deformations.base import (
     state_of,
 )
 from neeco.scene.encoding import encode
-from neeco.scene.learning import Training
 from neeco.scene.swept import SweptVolume
+from neeco.scene.training_session import GaussianTraining
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
 SHAPE_UNIT = 0.1  # of quaternion and log scale
-WARM_UP = 0.075  # share of the training: Deformable-3DGS rests for 3,000 of 40,000 iterations
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class NPSSettings:
     state: Literal["full", "rotation_jaw"] = "full"
     half: bool = False
     chunk: int = 65536
-    warm_up: float = WARM_UP
+    warm_up: float = 0.075
     gate_mm: float | None = None
 
     def __post_init__(self) -> None:
@@ -144,7 +143,7 @@ class NPS(LabelledByMotion):
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
         self.mean_center, self.mean_halfwidth = point_box(means)
 
-    def begin(self, training: Training) -> None:
+    def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
             training.instruments.bound(self.gate)
 
@@ -197,7 +196,7 @@ class NPS(LabelledByMotion):
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         state = encoded_state[None]
         half = torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu")
-        with quick_products(means.device), half:
+        with tf32_products(means.device), half:
             features = torch.relu(self.mean_in(encoded) + self.state_in(state))
             for index, layer in enumerate(self.hidden, start=1):
                 summed = layer(features)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 from neeco.capture.model import State
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.method import PLAIN_TRAINING
 
 
@@ -26,3 +27,6 @@ class Static(Deformation):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
+
+    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
+        return HingeMotion(canonical.log_scales, canonical.means.new_zeros(len(canonical), 0, 2), ())

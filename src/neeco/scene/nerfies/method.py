@@ -6,11 +6,13 @@ from typing import Any
 
 import torch
 
-from neeco.scene.learning import Session, Start
+from neeco.capture.model import Capture
 from neeco.scene.method import Method, Stored
 from neeco.scene.nerfies.scene import NerfScene
 from neeco.scene.nerfies.session import NerfiesSession, initial_field
 from neeco.scene.nerfies.settings import NerfiesSettings
+from neeco.scene.training_session import RunLength, Session
+from neeco.scene.training_views import TrainingViews
 
 
 class Nerfies(Method):
@@ -23,9 +25,11 @@ class Nerfies(Method):
     large_operations = True  # one step is a few large products
 
     @classmethod
-    def session(cls, start: Start, scene: Any | None) -> Session:
-        field = initial_field(start.capture, start.views.frames, start.config) if scene is None else scene
-        return NerfiesSession.around(field.to(start.views.device), start)
+    def session(
+        cls, capture: Capture, views: TrainingViews, settings: Any, length: RunLength, seed: int, scene: Any | None
+    ) -> Session:
+        field = initial_field(cls.method, capture, views.frames, settings) if scene is None else scene
+        return NerfiesSession.around(field.to(views.device), capture, views, length, seed)
 
     @classmethod
     def load(cls, stored: Stored) -> NerfScene:

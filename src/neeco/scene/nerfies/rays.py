@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neeco.scene.learning import LearnedViews
 from neeco.scene.nerfies.render import Rays, directions_of
+from neeco.scene.training_views import TrainingViews
 
 
 class RayTable:
     """All pixels of frames of any size, on the views' device."""
 
-    def __init__(self, views: LearnedViews) -> None:
+    def __init__(self, views: TrainingViews) -> None:
         device = views.device
         self.pixels = torch.cat([image.flatten(0, 1) for image in views.images]).to(device)  # [P, 3]
         self.counted: Tensor | None = None  # [P], where the loss counts

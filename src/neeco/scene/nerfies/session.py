@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import log_linear
-from neeco.scene.learning import Config, Start, StepResult, check_finite, numbers
 from neeco.scene.nerfies.rays import RayTable
 from neeco.scene.nerfies.scene import Drawn, NerfScene
 from neeco.scene.nerfies.settings import NerfiesSettings
 from neeco.scene.recorded import Recorded
+from neeco.scene.training_session import RunLength, Session, StepResult, check_finite, numbers
+from neeco.scene.training_views import TrainingViews
 
 FINAL_RATE = 0.1  # of the first: 1e-3 to 1e-4, log-linear
 ROBUST_SCALE = 0.03  # c of both losses: log singular values, and template units
@@ -28,11 +28,11 @@ FAR_SHARE = 1.15  # of the farthest one's
 QUANTILES = (0.01, 0.99)  # of the points, against stray ones
 
 
-def initial_field(capture: Capture, frames: tuple[Frame, ...], config: Config) -> NerfScene:
+def initial_field(method: str, capture: Capture, frames: tuple[Frame, ...], settings: NerfiesSettings) -> NerfScene:
     """The untrained field, its box and depths taken from the sparse points and the training cameras. Raises NeecoError
     where a setting does not fit."""
     recorded = Recorded.of(frames, capture.instruments)
-    scene = NerfScene(config.method, config.deformation, capture.instruments, recorded)
+    scene = NerfScene(method, settings, capture.instruments, recorded)
     points = torch.from_numpy(capture.points.positions).float()
     near, far = depth_bounds(points, frames)
     eyes = torch.stack([frame.camera.world_from_camera[:3].float() for frame in frames])
@@ -72,36 +72,26 @@ def elastic_loss(jacobians: Tensor) -> Tensor:
 
 
 @dataclass
-class NerfiesSession:
+class NerfiesSession(Session):
     """One training run in memory. `points` [P, 3] mm are tissue; empty where none were measured."""
 
-    config: Config
     scene: NerfScene
     table: RayTable
     points: Tensor
-    generator: torch.Generator
-    adam: Adam = field(default_factory=Adam)
-    iteration: int = 0
-    seconds: float = 0.0
-    window: list[StepResult] = field(default_factory=list)
-    phase: int = 1
-    forced: bool = False
 
     @classmethod
-    def around(cls, scene: NerfScene, start: Start) -> NerfiesSession:
+    def around(
+        cls, scene: NerfScene, capture: Capture, views: TrainingViews, length: RunLength, seed: int
+    ) -> NerfiesSession:
         """A session at iteration 0."""
-        cloud, device = start.capture.points, start.views.device
+        cloud, device = capture.points, views.device
         points = torch.from_numpy(cloud.positions).float() if cloud.measured else torch.zeros(0, 3)
-        generator = torch.Generator(device).manual_seed(start.config.seed)
-        return cls(start.config, scene, RayTable(start.views), points.to(device), generator)
+        generator = torch.Generator(device).manual_seed(seed)
+        return cls(scene, length, generator, RayTable(views), points.to(device))
 
     def __post_init__(self) -> None:
+        self.adam = Adam()
         self.scene.requires_grad_(True)
-
-    @property
-    def progress(self) -> float:
-        """Done share of the run in [0, 1]."""
-        return self.config.done_share(self.iteration, self.seconds)
 
     @property
     def settings(self) -> NerfiesSettings:
@@ -120,7 +110,7 @@ class NerfiesSession:
         error = coarse if drawn.fine is None else _error(drawn.fine.color, colors, counted)
         loss = coarse if drawn.fine is None else coarse + error
         total = loss + self._elastic(drawn) + self._background()
-        with quick_products(total.device):
+        with tf32_products(total.device):
             total.backward()
         rate = log_linear(settings.rate, FINAL_RATE * settings.rate, progress)
         self.adam.step((name, parameter, rate) for name, parameter in scene.named_parameters() if parameter.numel())
@@ -153,16 +143,6 @@ class NerfiesSession:
         places = places + POINT_NOISE * noise
         moved = scene.warp(places, scene.codes[moments], scene.opened) - places
         return settings.background_weight * robust(moved.square().sum(-1)).mean()
-
-    def between_steps(self, before: float) -> None:
-        """Nothing is due."""
-
-    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Nothing beside what every checkpoint holds."""
-        return {}, {}
-
-    def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
-        """The inverse of `pack`."""
 
     def finish(self) -> None:
         """Hold the field still, and note how it was learned."""

@@ -11,15 +11,15 @@ from neeco.errors import NeecoError
 from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
 from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
-from neeco.scene.learning import Report
 from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
+from neeco.scene.training_session import Report
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import RefineConfig, TrainConfig, method_defaults
 from neeco.training.instruments.carving import MOVES, CarvedShape, carve, posed_views, score_points
 from neeco.training.instruments.evidence import Evidence, gather_evidence
 from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
 from neeco.training.session import GaussianSession, new_session
-from neeco.training.views import TrainingViews
 
 TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
 LONGER_STEPS = 1500  # of the one with density control, where the sparse points alone explain too little

@@ -15,7 +15,7 @@ from neeco.capture.model import Frame
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project
 from neeco.scene.scene import Scene
-from neeco.training.views import TrainingViews
+from neeco.scene.training_views import TrainingViews
 
 FLOOR, RANGE = 0.04, 0.06  # residual at which evidence begins, and over which it saturates (images in [0, 1])
 

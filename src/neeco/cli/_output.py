@@ -1,0 +1,101 @@
+"""What several verbs print: tables that fit the terminal, where files lie, what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Column, Table
+from rich.text import Text
+
+from neeco.errors import NeecoError
+from neeco.files import new_folder
+
+if TYPE_CHECKING:
+    from neeco.experiments.tables import Table as ResultTable
+
+BORDER = 3  # what a column takes beside its text
+
+
+def fitted(table: ResultTable, width: int) -> list[Table]:
+    """A table in as many pieces as a terminal of `width` characters needs; the keys' columns stand in each.
+
+    Bold are the best of a column, and a row that others are measured against; a row that failed says so in every piece.
+    """
+    headings, keys = [*table.keys, *(column.title for column in table.columns)], len(table.keys)
+    rows = []
+    for row in table.rows:
+        cells = [Text(str(cell), "bold" if cell.best or row.reference else "") for cell in row.cells]
+        shown = cells if row.failed is None else [Text("failed", "red")]
+        rows.append([*(Text(key, "bold" if row.reference else "") for key in row.keys), *shown])
+    return _pieces(table.title, headings, rows, keys, width)
+
+
+def _pieces(title: str, headings: Sequence[str], rows: Sequence[Sequence[Text]], keys: int, width: int) -> list[Table]:
+    """`fitted` of texts. A row of one cell behind its keys says the same in every piece."""
+    full = [[*row[:keys], *[row[keys]] * (len(headings) - keys)] if len(row) == keys + 1 else row for row in rows]
+    widths = [
+        max([*map(len, heading.split()), *(len(row[index]) for row in full)], default=0)
+        for index, heading in enumerate(headings)
+    ]
+    left = width - 1 - sum(BORDER + widths[index] for index in range(keys))
+    groups: list[list[int]] = [[]]
+    for index in range(keys, len(headings)):
+        if groups[-1] and sum(BORDER + widths[i] for i in (*groups[-1], index)) > left:
+            groups.append([])
+        groups[-1].append(index)
+    return [
+        _piece(title if group is groups[0] else f"{title}, continued", headings, rows, keys, group, widths)
+        for group in groups
+    ]
+
+
+def _piece(
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[Sequence[Text]],
+    keys: int,
+    group: list[int],
+    widths: Sequence[int],
+) -> Table:
+    """The columns of `group` behind the key columns, each as wide as its longest word."""
+    whole = Text(title, "italic", no_wrap=True, overflow="ignore")
+    table = Table(*(Column(headings[i], no_wrap=True) for i in range(keys)), title=whole, title_justify="left")
+    for index in group:
+        table.add_column(headings[index], justify="right", width=widths[index])
+    for row in rows:
+        table.add_row(*row[:keys], *(row[keys:] if len(row) == keys + 1 else [row[i] for i in group]))
+    return table
+
+
+def print_outcome(
+    console: Console, output: Path, stem: str, page: Path, notes: Sequence[str], failed: Sequence[str], runs: str
+) -> int:
+    """Print notes, the files named by `stem` and the report; returns 1 when any of `runs` (`3 runs`) failed, and prints
+    the first failure."""
+    for note in notes:
+        console.print(f"note: {note}", style="dim", markup=False, highlight=False)
+    for what, name in (("tables", f"{stem}.md, .csv, .tex"), ("all numbers", f"{stem}.json, data/")):
+        console.print(f"{what}: {output}/: {name}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report: {page}", markup=False, highlight=False, soft_wrap=True)
+    if not failed:
+        return 0
+    more = f" (and {len(failed) - 1} more, listed above)" if len(failed) > 1 else ""
+    text = f"neeco: error: {len(failed)} of {runs} failed: {failed[0]}{more}"
+    Console(stderr=True).print(text, markup=False, highlight=False, soft_wrap=True)
+    return 1
+
+
+@contextmanager
+def ready_for_json(path: Path | None) -> Iterator[None]:
+    """For the work whose numbers go to `--json`: checks before it that the file can be written.
+
+    Raises NeecoError for a folder, or a file whose folder cannot be written to.
+    """
+    if path is not None and path.is_dir():
+        raise NeecoError(f"--json: {path} is a folder; name a file")
+    with nullcontext() if path is None else new_folder(path.parent):
+        yield

@@ -1,0 +1,158 @@
+"""What a method and its training share. Training itself is above this room: `neeco.training`.
+
+`Session` is one run in memory, of any method. `GaussianTraining` is a session of a method that deforms Gaussians, as
+the hooks of its deformation see it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from neeco.errors import NeecoError
+from neeco.raster.optimizer import Adam
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.drawable import Learned
+from neeco.scene.hinges import Hinged
+from neeco.scene.swept import SweptVolume
+from neeco.scene.training_views import TrainingViews
+
+Report = Callable[[str], None]  # shows the user one line
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """When a run ends: after `iterations`, or after `minutes` if that is sooner."""
+
+    iterations: int
+    minutes: float | None = None
+
+    def progress(self, iteration: int, seconds: float) -> float:
+        """Share of the run in [0, 1] that is done, by iterations or minutes, whichever is further."""
+        done = iteration / self.iterations
+        if self.minutes is not None:
+            done = max(done, seconds / (60 * self.minutes))
+        return min(1.0, done)
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Loss and PSNR of one training step."""
+
+    loss: float
+    psnr: float
+
+    @classmethod
+    def of(cls, loss: float, squared_error: float) -> StepResult:
+        """From the image's loss and its mean squared error."""
+        return cls(loss, -10 * math.log10(max(squared_error, 1e-10)))
+
+    @classmethod
+    def mean(cls, results: Sequence[StepResult]) -> StepResult:
+        """Of several images, at least one."""
+        count = len(results)
+        return cls(sum(result.loss for result in results) / count, sum(result.psnr for result in results) / count)
+
+
+def numbers(*scalars: Tensor) -> list[float]:
+    """Values of scalars on one device, with a single synchronisation."""
+    values: list[float] = torch.stack([scalar.detach() for scalar in scalars]).tolist()
+    return values
+
+
+def check_finite(total: float, iteration: int, where: str = "") -> None:
+    """Raise NeecoError when the minimised loss is not finite."""
+    if not math.isfinite(total):
+        raise NeecoError(
+            f"training: the loss became {total} at iteration {iteration}{where}; run `neeco check` on the capture, or "
+            "train anew with another --seed (the last checkpoint is kept)"
+        )
+
+
+@dataclass
+class Session:
+    """One training run in memory, of any method."""
+
+    scene: Learned
+    length: RunLength
+    generator: torch.Generator
+    adam: Adam = field(init=False)
+    iteration: int = field(default=0, init=False)
+    seconds: float = field(default=0.0, init=False)
+    window: list[StepResult] = field(default_factory=list, init=False)  # steps since the last row of metrics.jsonl
+
+    @property
+    def progress(self) -> float:
+        """Share of the run in [0, 1] that is done."""
+        return self.length.progress(self.iteration, self.seconds)
+
+    @property
+    def phase(self) -> int:
+        """1 or 2 of the dynamic training adjustment; 1 for a method without it."""
+        return 1
+
+    @property
+    def forced(self) -> bool:
+        """Whether phase 2 began because the run was late."""
+        return False
+
+    def step(self) -> StepResult:
+        """Take one optimiser step. Raises NeecoError when the loss is not finite."""
+        raise NotImplementedError
+
+    def between_steps(self, before: float) -> None:
+        """Do what is due once `progress` has passed a mark; it was `before` at the last step."""
+
+    def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """(tensors as GROUP/NAME, JSON-able fields) of a checkpoint beside scene, optimiser and random numbers."""
+        return {}, {}
+
+    def restore(self, tensors: Mapping[str, Tensor], fields: Mapping[str, Any]) -> None:
+        """The inverse of `pack`."""
+
+    def finish(self) -> None:
+        """Compute what is derived from the learned scene after the last step."""
+
+
+class GaussianScene(Learned, Protocol):
+    """`neeco.scene.scene.Scene` as far as a deformation's hooks use it."""
+
+    canonical: CanonicalGaussians
+
+
+@dataclass(frozen=True)
+class InstrumentSearch:
+    """Functions that find instruments and their joints in the training views, without masks, CAD or labels."""
+
+    # carve every instrument, add its Gaussians to the scene as a body of its own, and start its hinges
+    find: Callable[[Hinged], None]
+    # bound the volume by what the carved instruments sweep
+    bound: Callable[[SweptVolume], None]
+    # find where each shaft ends and the wrist begins
+    place_wrists: Callable[[Hinged], None]
+    # find it again, and move a wrist where spinning the shaft behind it costs no more than before
+    replace_wrists: Callable[[Hinged], None]
+    # find lamps that explain the instruments' shadows, beside those found before
+    find_shadow: Callable[[], None]
+    # set each instrument's extent, prolong its shaft, and judge whether its joints were found
+    conclude: Callable[[Hinged], None]
+
+
+@dataclass
+class GaussianTraining(Session):
+    """A training session as a deformation's hooks see it."""
+
+    scene: GaussianScene
+    views: TrainingViews
+    report: Report
+    batch_size: int  # frames per step
+    instruments: InstrumentSearch = field(init=False)
+
+    def reached(self, iteration: int) -> bool:
+        """Whether the last step came to `iteration` or past it."""
+        return self.iteration - self.batch_size < iteration <= self.iteration
