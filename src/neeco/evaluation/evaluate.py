@@ -23,7 +23,7 @@ from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, d
 from neeco.files import write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
-from neeco.raster.threads import synchronise
+from neeco.raster.native import synchronise
 from neeco.scene.scene import gaussian_scene
 
 if TYPE_CHECKING:

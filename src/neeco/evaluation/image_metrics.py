@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
 
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]

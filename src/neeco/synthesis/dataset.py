@@ -23,7 +23,7 @@ from neeco.files import is_vacant, own_folder, read_json, require_inside, write_
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
-from neeco.raster.threads import threads
+from neeco.raster.native import threads
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import read_effects
 from neeco.synthesis.generator import (
