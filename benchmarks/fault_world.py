@@ -36,7 +36,7 @@ def still_the_clocks() -> None:
 
     from neeco.evaluation import evaluate
     from neeco.experiments import machine, training_job
-    from neeco.report import render
+    from neeco.report import page
     from neeco.training import train
 
     ticks = iter(range(10**12))
@@ -46,7 +46,7 @@ def still_the_clocks() -> None:
     training_job.peak_memory_mb = lambda: 1.0
     assert training_job.CLOCKS is training_job.CLOCKS
     train.train.__kwdefaults__["clock"] = lambda: 0.0
-    render.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
+    page.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
 
 
 def prepare() -> None:

@@ -42,10 +42,10 @@ from neeco.experiments.machine import machine
 from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.files import write_json, write_text
 from neeco.raster import Camera, Gaussians, rasterize
-from neeco.raster.devices import device_of, failures_told
+from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
+from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
-from neeco.raster.threads import synchronise
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.hinges import PART_LOGITS
@@ -331,7 +331,7 @@ def main(words: list[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else cuBLAS knows no fixed order
     try:
-        with failures_told():
+        with readable_failures():
             result = run(arguments)
         told = markdown(result)
         if arguments.output is not None:

@@ -48,7 +48,7 @@ def prepare() -> None:
         "neeco.report.ingest_page",
         "neeco.synthesis.annotated",
         "neeco.synthesis.dataset",
-        "neeco.synthesis.render",
+        "neeco.synthesis.rendered_views",
         "neeco.viewer.export",
         "neeco.viewer.splats",
         "neeco.evaluation.mask_scores",

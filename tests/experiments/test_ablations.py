@@ -13,7 +13,7 @@ import torch
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.experiments import ablation_study, training_job
 from neeco.experiments.ablation_study import (
     ablation_csv,

@@ -11,11 +11,11 @@ from typing import Any
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
-from neeco.capture.fingerprint import fingerprint
-from neeco.capture.similarity import RecordedStates
+from neeco.capture.model import RecordedStates
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
+from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
 from neeco.experiments.machine import machine, machine_words, measure_speed
 from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
 from neeco.experiments.study import JobEvent, Result, check_output, check_workers, run_and_record, spread

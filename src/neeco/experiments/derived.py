@@ -16,7 +16,7 @@ import torch
 from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import MASK_FOLDERS
+from neeco.evaluation.mask_folders import MASK_FOLDERS
 from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
 from neeco.files import is_vacant, read_json, write_atomically, write_json
 from neeco.raster.rotations import rotation_from_vector

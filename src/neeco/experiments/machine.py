@@ -17,7 +17,7 @@ import torch
 
 from neeco.capture.model import Capture, Frame
 from neeco.raster.devices import cuda_backend
-from neeco.raster.threads import simd, synchronise, threads
+from neeco.raster.native import simd, synchronise, threads
 from neeco.training.run import Run
 
 STATUS = Path("/proc/self/status")

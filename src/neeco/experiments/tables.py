@@ -213,11 +213,3 @@ def write_files(output: Path, stem: str, texts: Mapping[str, str], data: Mapping
     files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
     for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():
         write_text(path, text)
-
-
-markdown_lines = markdown_table
-
-
-def latex_lines(table: Table, caption: str) -> list[str]:
-    """The lines of `latex_table`."""
-    return latex_table(table, caption).splitlines()

@@ -13,10 +13,9 @@ import torch
 from markupsafe import Markup
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import FULL_SCALE, overlay_outline
-from neeco.evaluation.image_metrics import psnr
+from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
+from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.evaluation.truth import load_reference
 from neeco.experiments.ablation_study import EVEN_DB, ablation_csv, agreement, grid, primary_split
 from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.experiments.comparison import (
@@ -35,8 +34,7 @@ from neeco.experiments.tables import UNKNOWN, Table, csv_text
 from neeco.files import write_text
 from neeco.labels.drawing import draw
 from neeco.report.charts import Series, binned, legend, line_chart
-from neeco.report.figures import difference, jpeg, to_bytes
-from neeco.report.render import REPORT_FILE, split_counts, write_page
+from neeco.report.page import REPORT_FILE, difference, jpeg, split_counts, to_bytes, write_page
 from neeco.training.run import open_run
 
 BINS = 6  # groups of held-out frames by distance

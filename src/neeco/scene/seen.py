@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from neeco.capture.model import State
 from neeco.raster import rasterize
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
 from neeco.raster.rotations import quat_to_matrix
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians

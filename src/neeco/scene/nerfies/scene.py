@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.encoding import encode_by_octave
 from neeco.scene.nerfies.render import Composite, Rays, camera_rays, composite, even_depths, finer_depths
@@ -41,7 +41,7 @@ class Template(nn.Module):
     def forward(self, places: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
         """places [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
         conditions = conditions[:, None].expand(-1, places.shape[1], -1)
-        with quick_products(places.device):
+        with tf32_products(places.device):
             features = self.trunk(encode_by_octave(places, self.frequencies))
             seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
             density, color = self.density(features)[..., 0], self.color(seen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.scene.encoding import encode_by_octave
 
 HEAD_RANGE = 1e-4  # the heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
@@ -76,7 +76,7 @@ class WarpField(nn.Module):
     def forward(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
         """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; places in the template [M, 3]."""
         encoded = encode_by_octave(points, self.frequencies, opened)
-        with quick_products(points.device):
+        with tf32_products(points.device):
             features = self.trunk(torch.cat([encoded, codes], -1))
             rotation, velocity = self.rotation(features), self.velocity(features)
         return move_by_screw(points, rotation, velocity)
