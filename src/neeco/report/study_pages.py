@@ -16,7 +16,15 @@ from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.ablation_study import EVEN_DB, ablation_csv, agreement, grid, primary_split
+from neeco.experiments.ablation_study import (
+    EVEN_DB,
+    AblationResult,
+    AblationTable,
+    ablation_csv,
+    agreement,
+    grid,
+    primary_split,
+)
 from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
 from neeco.experiments.comparison import (
     MASK_METRICS,
@@ -380,82 +388,82 @@ def _configs(comparison: Mapping[str, Any], output: Path) -> list[tuple[str, str
     return listings
 
 
-def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
+def write_ablation_report(output: Path, ablation: AblationResult) -> Path:
     """Write DIR/report.html from what `run_ablations` returned; its path."""
-    name = Path(ablation["capture"]).name
-    steps = " and ".join(f"{count:,} steps of {method}" for method, count in ablation["iterations"].items())
-    settings = f", with {', '.join(ablation['settings'])}" if ablation["settings"] else ""
+    name = Path(ablation.capture).name
+    steps = " and ".join(f"{count:,} steps of {method}" for method, count in ablation.iterations.items())
+    settings = f", with {', '.join(ablation.settings)}" if ablation.settings else ""
     scaled = (
         f"The paper's schedule, stated for {PUBLISHED_STEPS:,}, is scaled to these runs, and phase 2 begins at "
         f"{PHASE_1_SHARE:.0%} of each; learning rates are not scaled. "
     )
     intro = [
         "What becomes of the result when one part is taken away or turned round. Runs have "
-        f"{steps}, seed {ablation['seed']}{settings}, on {hardware_words(ablation['machine'])}. "
-        f"{scaled if 'neeco' in ablation['iterations'] else ''}"
+        f"{steps}, seed {ablation.seed}{settings}, on {hardware_words(ablation.machine)}. "
+        f"{scaled if 'neeco' in ablation.iterations else ''}"
         "In brackets: the difference to the line in bold.",
         f"One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. The "
         "paper's numbers come from other recordings and longer runs; only directions are compared.",
     ]
     sections = []
-    if ablation["failures"]:
-        failed = [f"{item['run']}: {item['error']}" for item in ablation["failures"]]
+    if ablation.failures:
+        failed = [f"{item['run']}: {item['error']}" for item in ablation.failures]
         sections.append(Section(title="Not measured", notes=failed))
-    if ablation["notes"]:
-        sections.append(Section(title="Notes", notes=ablation["notes"]))
-    if judged := [table for table in ablation["tables"] if table["judged"]]:
+    if ablation.notes:
+        sections.append(Section(title="Notes", notes=ablation.notes))
+    if judged := [table for table in ablation.tables if table.judged]:
         link = Markup('<a href="#{}">{}</a>')
-        held = [(link.format(table["name"], table["title"]), agreement(table)) for table in judged]
+        held = [(link.format(table.name, table.title), agreement(table)) for table in judged]
         sections.append(Section(title="Do the paper's directions hold?", head=("table", "directions"), rows=held))
-    for table in ablation["tables"]:
+    for table in ablation.tables:
         section = Section(
-            title=table["title"],
-            anchor=table["name"],
-            text=table["question"],
+            title=table.title,
+            anchor=table.name,
+            text=table.question,
             results=grid(table),
-            figures=[*_learning_curves(table, ablation), *_levels(table, ablation["splits"])],
-            files={f"{table['name']}.csv": ablation_csv(table)},
+            figures=[*_learning_curves(table, ablation), *_levels(table, ablation.splits)],
+            files={f"{table.name}.csv": ablation_csv(table)},
             notes=[directions] if (directions := agreement(table)) else [],
         )
         sections.append(section)
     keys = ("name", "iterations", "seconds", "processor_seconds", "num_gaussians")
-    rows = [[f"{run[key]:,.0f}" if key != "name" else run[key] for key in keys] for run in ablation["runs"]]
+    rows = [[f"{run[key]:,.0f}" if key != "name" else run[key] for key in keys] for run in ablation.runs]
     sections.append(Section(title="Runs", head=("run", "steps", "training s", "CPU s", "Gaussians"), rows=rows))
     page = {"title": f"{name}: ablations", "name": name, "subtitle": "ablations"}
     return write_page(output / REPORT_FILE, "study.html", **page, intro=intro, findings=[], sections=sections)
 
 
-def _learning_curves(table: dict[str, Any], ablation: dict[str, Any]) -> list[Figure]:
+def _learning_curves(table: AblationTable, ablation: AblationResult) -> list[Figure]:
     """Held-out PSNR over steps, a figure for every comparison of a table of the paper."""
-    split = primary_split(tuple(ablation["splits"]))
+    split = primary_split(ablation.splits)
     figures = []
-    for comparison in dict.fromkeys(row["comparison"] for row in table["curves"]):
-        rows = [row for row in table["curves"] if row["comparison"] == comparison]
+    for comparison in dict.fromkeys(row["comparison"] for row in table.curves):
+        rows = [row for row in table.curves if row["comparison"] == comparison]
         labels = list(dict.fromkeys(row["label"] for row in rows))
         series = _series(labels, [(row["label"], row["iteration"], row["psnr"]) for row in rows])
-        phase_2 = (PHASE_1_SHARE * ablation["iterations"]["neeco"], "phase 2")
+        phase_2 = (PHASE_1_SHARE * ablation.iterations["neeco"], "phase 2")
         chart = line_chart(f"{comparison}: PSNR on {split}, dB", "steps", series, starts=[phase_2])
         data = [{"setting": r["label"], "iteration": r["iteration"], f"psnr_{split}": r["psnr"]} for r in rows]
         words = "".join(letter if letter.isalnum() else "-" for letter in comparison)
-        figures.append(_figure(chart, labels, series, data, f"{table['name']}-{words}-curves.csv"))
+        figures.append(_figure(chart, labels, series, data, f"{table.name}-{words}-curves.csv"))
     return figures
 
 
-def _levels(table: dict[str, Any], splits: Sequence[str]) -> list[Figure]:
+def _levels(table: AblationTable, splits: Sequence[str]) -> list[Figure]:
     """PSNR and IoU over the entries of a table whose entries are amounts."""
-    levels, over = ABLATIONS[table["name"]].levels, ABLATIONS[table["name"]].level_name
+    levels, over = ABLATIONS[table.name].levels, ABLATIONS[table.name].level_name
     figures = []
     for score, title in LEVEL_SCORES if levels else ():
         rows = [
-            (split, level, row["values"].get(f"{score}.{split}"))
+            (split, level, row.values.get(f"{score}.{split}"))
             for split in splits
-            for level, row in zip(levels, table["rows"], strict=True)
+            for level, row in zip(levels, table.rows, strict=True)
         ]
         series = _series(splits, rows)
         chart = line_chart(title, over, series)
         if chart:
             data = [{"split": split, "level": level, score: value} for split, level, value in rows]
-            figures.append(_figure(chart, splits, series, data, f"{table['name']}-{score}.csv"))
+            figures.append(_figure(chart, splits, series, data, f"{table.name}-{score}.csv"))
     return figures
 
 
