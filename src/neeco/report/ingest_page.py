@@ -33,7 +33,7 @@ from neeco.report.ingest_figures import (
 )
 from neeco.report.page import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
-from neeco.report.verdict import clock_cost_mm, give_verdict, rms
+from neeco.report.ingest_assessment import (clock_cost_mm, assess_ingest, rms)
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -55,7 +55,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         stamps=[result.capture],
         result=result,
         capture=capture,
-        verdict=give_verdict(result, capture),
+        verdict=assess_ingest(result, capture),
         splits=split_counts(capture),
         tiles=_tiles(result, capture),
         residuals=_residuals(result),
