@@ -29,7 +29,7 @@ from neeco.experiments.ablation_study import (
     table_of,
     write_tables,
 )
-from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, AblationPlan, Derived
+from neeco.experiments.ablations import CHECKPOINTS, AblationPlan, Derived, Variant, all_ablations
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.tables import latex_table
 from neeco.report.study_pages import write_ablation_report
@@ -124,7 +124,7 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
 
     labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
     monkeypatch.setattr(ablation_study, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
-    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [NEECO])
+    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [Variant("neeco")])
     monkeypatch.setattr(ablation_study, "score_label_ways", score)
     for _ in range(2):
         table = run_ablations(labels).tables[0]
@@ -171,14 +171,14 @@ def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
 
 
 def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_meanings() -> None:
-    for table in ABLATIONS.values():
+    for table in all_ablations().values():
         for comparison in table.comparisons:
             labels = [entry.label for entry in comparison.entries]
             assert comparison.reference in labels
             assert len(set(labels)) == len(labels)
     variants = distinct_variants(chosen_ablations(("paper", "ours")))
     assert len({variant.name for variant in variants}) == len(variants) == 26
-    published = [entry.paper for table in PAPER for item in table.comparisons for entry in item.entries]
+    published = [entry.paper for table in chosen_ablations(["paper"]) for entry in table.entries]
     assert sum(map(len, published)) == 9 + 4 * len(CHECKPOINTS) + 2
 
 
@@ -206,7 +206,7 @@ def test_a_checkpoint_is_the_nearest_row_of_its_split() -> None:
 
 
 def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> None:
-    table = table_of(ABLATIONS["sh-compensation"], {}, {}, {}, ("test",))
+    table = table_of(all_ablations()["sh-compensation"], {}, {}, {}, ("test",))
     rows = []
     for row, psnr in zip(table.rows, (20.0, 21.0, 23.0, 22.0), strict=True):
         filled = replace(row, values=dict.fromkeys(table.judged, psnr))

@@ -13,7 +13,7 @@ import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.experiments.ablation_study import AblationResult, direction, table_of
-from neeco.experiments.ablations import ABLATIONS
+from neeco.experiments.ablations import all_ablations
 from neeco.report.study_pages import write_ablation_report
 
 VOID = ("meta", "br", "img", "path", "circle")
@@ -23,7 +23,9 @@ SPLITS = ("test", "unseen")
 @pytest.fixture
 def ablation() -> AblationResult:
     """Made-up numbers in two tables of real shape."""
-    motion, noise = (table_of(ABLATIONS[name], {}, {}, {}, SPLITS) for name in ("uniform-motion", "tracker-noise"))
+    motion, noise = (
+        table_of(all_ablations()[name], {}, {}, {}, SPLITS) for name in ("uniform-motion", "tracker-noise")
+    )
     motion, noise = (
         replace(
             table,

@@ -21,10 +21,10 @@ from neeco.ingest.motion import RoughShape
 from neeco.ingest.pipeline import IngestResult
 from neeco.ingest.registration import ClockOffset, Registration
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
+from neeco.report.ingest_assessment import assess_ingest
 from neeco.report.ingest_figures import in_view, main_axes
 from neeco.report.ingest_page import write_ingest_page
 from neeco.report.tracks import read_tracks, round_length
-from neeco.report.ingest_assessment import assess_ingest
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}

@@ -17,11 +17,7 @@ from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.experiments.ablations import (
-    ABLATIONS,
     CHECKPOINTS,
-    OURS,
-    PAPER,
-    PHASE_1_PSNR,
     PHASE_1_SHARE,
     PHASE_1_STEPS,
     PUBLISHED_STEPS,
@@ -30,6 +26,7 @@ from neeco.experiments.ablations import (
     Comparison,
     Entry,
     Variant,
+    all_ablations,
 )
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.machine import machine
@@ -91,7 +88,7 @@ class AblationRow:
     reference: bool  # what the others of its comparison are measured against
     run: str
     values: Values
-    paper: Values
+    paper: dict[str, float]
     paper_direction: str  # "worse" where the paper shows it in a figure without numbers
     difference: Values
     agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
@@ -175,12 +172,13 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
 
 def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
     """The tables behind `paper`, `ours` or their own names, each once. Raises NeecoError for an unknown name."""
+    known = all_ablations()
+    groups = {group: [table for table in known.values() if table.group == group] for group in ("paper", "ours")}
     chosen: dict[str, Ablation] = {}
-    groups = {"paper": PAPER, "ours": OURS}
     for name in names:
-        if name not in groups and name not in ABLATIONS:
-            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(ABLATIONS)}")
-        chosen |= {ablation.name: ablation for ablation in groups.get(name) or (ABLATIONS[name],)}
+        if name not in groups and name not in known:
+            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(known)}")
+        chosen |= {table.name: table for table in groups.get(name) or [known[name]]}
     if not chosen:
         raise NeecoError("--tables: names none; leave it out for all of them")
     return tuple(chosen.values())
@@ -188,11 +186,7 @@ def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
 
 def distinct_variants(chosen: Sequence[Ablation]) -> list[Variant]:
     """Every run that the tables need, once."""
-    return list(dict.fromkeys(entry.variant for entry in _entries(chosen)))
-
-
-def _entries(chosen: Sequence[Ablation]) -> list[Entry]:
-    return [entry for table in chosen for comparison in table.comparisons for entry in comparison.entries]
+    return list(dict.fromkeys(entry.variant for table in chosen for entry in table.entries))
 
 
 def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
@@ -279,7 +273,8 @@ def _label_scores(
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     scores: dict[str, LabelScores] = {}
     failures = []
-    for name in dict.fromkeys(entry.variant.name for entry in _entries(chosen) if entry.label_way):
+    asked = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
+    for name in dict.fromkeys(asked):
         if name not in folders:
             continue
         file = folders[name] / LABELS_FILE
@@ -333,9 +328,7 @@ def _row(
 ) -> AblationRow:
     reference = next(item for item in comparison.entries if item.label == comparison.reference)
     ours, base = values[entry.label], values[reference.label]
-    paper, paper_base = (
-        {key.format(split=primary): value for key, value in item.paper.items()} for item in (entry, reference)
-    )
+    paper, paper_base = (dict(zip(judged, item.paper, strict=False)) for item in (entry, reference))
     difference: Values = {}
     agrees: dict[str, str | None] = {}
     if entry is not reference:
@@ -351,7 +344,7 @@ def _row(
         entry is reference,
         entry.variant.name,
         ours,
-        dict(paper),
+        paper,
         "worse" if entry.expected and entry is not reference else "",
         difference,
         agrees,
@@ -384,7 +377,7 @@ def _values(
     folder, result = folders[name], results[name]
     values: Values = {}
     if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
-        values[PHASE_1_PSNR] = phase_1_psnr(folder, int(result["iterations"]))
+        values["phase_1_psnr"] = phase_1_psnr(folder, int(result["iterations"]))
         curve, split = read_json_lines(folder / CURVE_FILE), primary_split(splits)
         for percent in CHECKPOINTS:
             values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)

@@ -25,7 +25,7 @@ from neeco.experiments.ablation_study import (
     grid,
     primary_split,
 )
-from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.ablations import PHASE_1_SHARE, PUBLISHED_STEPS, all_ablations
 from neeco.experiments.comparison import (
     MASK_METRICS,
     ComparisonResult,
@@ -142,14 +142,14 @@ def write_comparison_report(output: Path, comparison: ComparisonResult, capture:
         version=comparison.version,
         stamps=[machine_words(comparison.machine)],
         intro=[intro + (f" Masks of {masks} are scored beside theirs." if masks else "")],
-        findings=_split_findings(comparison),
+        findings=findings(comparison),
         sections=[*sections, Section(title="How it was made", facts=facts, listings=configs)],
     )
 
 
-def findings(comparison: ComparisonResult) -> list[str]:
-    """Who is first on each split and by how much, who draws fastest, and what failed. Higher is better in all."""
-    sentences = []
+def findings(comparison: ComparisonResult) -> list[tuple[str, str]]:
+    """(split or "", sentence): who is first on each split and by how much, who draws fastest, and what failed."""
+    found = []
     for split in comparison.splits:
         rows = [row for row in comparison.summary if row["split"] == split]
         clauses: dict[str, str] = {}  # by title: the first key that is known
@@ -157,15 +157,16 @@ def findings(comparison: ComparisonResult) -> list[str]:
             if title not in clauses and (clause := leader(rows, key, title, unit, digits)):
                 clauses[title] = clause
         if clauses:
-            sentences.append(f"{split}: {'; '.join(clauses.values())}.")
+            found.append((split, f"{'; '.join(clauses.values())}."))
     first_split = [row for row in comparison.summary if row["split"] == next(iter(comparison.splits), None)]
     if fastest := leader(first_split, "fps", "drawing speed", " FPS", 1):
-        sentences.append(f"{fastest}.")
-    if sentences and any(row["psnr"]["n"] and row["psnr"]["std"] is None for row in comparison.summary):
-        sentences.append("Of one seed the spread is not known: a small lead may be chance.")
+        found.append(("", f"{fastest}."))
+    if found and any(row["psnr"]["n"] and row["psnr"]["std"] is None for row in comparison.summary):
+        found.append(("", "Of one seed the spread is not known: a small lead may be chance."))
     if failed := comparison.failures:
-        sentences.append(f"{len(failed)} of {len(comparison.jobs)} runs failed; they are listed below.")
-    return sentences
+        found.append(("", f"{len(failed)} of {len(comparison.jobs)} runs failed; they are listed below."))
+    unfinished = ("", "Not all runs are finished: these are the numbers so far.")
+    return found if comparison.complete else [unfinished, *found]
 
 
 def leader(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, digits: int) -> str | None:
@@ -188,15 +189,6 @@ def leader(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, d
     if best["mean"] - next_best["mean"] <= best["std"] + next_best["std"]:
         return f"{name} and {second} level in {title}, {value}, {lead} apart (within the seeds' spread)"
     return f"{name} first in {title}, {value}, {lead} before {second} (clear of the seeds' spread)"
-
-
-def _split_findings(comparison: ComparisonResult) -> list[tuple[str, str]]:
-    """(split or "", sentence)."""
-    found = [] if comparison.complete else [("", "Not all runs are finished: these are the numbers so far.")]
-    for sentence in findings(comparison):
-        split, _, rest = sentence.partition(": ")
-        found.append((split, rest) if rest and split in comparison.splits else ("", sentence))
-    return found
 
 
 def _result_sections(comparison: ComparisonResult) -> list[Section]:
@@ -448,7 +440,8 @@ def _learning_curves(table: AblationTable, ablation: AblationResult) -> list[Fig
 
 def _levels(table: AblationTable, splits: Sequence[str]) -> list[Figure]:
     """PSNR and IoU over the entries of a table whose entries are amounts."""
-    levels, over = ABLATIONS[table.name].levels, ABLATIONS[table.name].level_name
+    definition = all_ablations()[table.name]
+    levels, over = definition.levels, definition.level_name
     figures = []
     for score, title in LEVEL_SCORES if levels else ():
         rows = [
