@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from neeco.capture.documents import Parsed, Place, ProblemReport, inside, printable, relative_name
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
@@ -75,8 +75,8 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
-        place = Place(file, printable(image.name))
-        frame = _frame(image, cameras, root, order, place, report)
+        place = Node(None, file, printable(image.name), report)
+        frame = _frame(image, cameras, root, order, place)
         if frame is not None:
             parsed.frames.append(frame)
             parsed.places.append(place)
@@ -86,56 +86,47 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
 def _add_points(
     path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
 ) -> None:
-    parsed.points_place = Place(relative_name(path, parsed.root), "")
+    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
     try:
-        rows = _parse(path, parse)
+        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
     except NeecoError as error:
-        report.error(parsed.points_place.file, "", str(error).removeprefix(f"{path}: "))
+        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
         return
-    positions = np.array([row[:3] for row in rows], dtype=np.float32).reshape(-1, 3)
-    colors = np.array([row[3:6] for row in rows], dtype=np.float32).reshape(-1, 3) / 255
+    positions = rows[:, :3].astype(np.float32)
     if not np.isfinite(positions).all():
-        report.error(parsed.points_place.file, "", "holds points that are NaN or infinite", "remove them")
+        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
         return
-    parsed.points = PointCloud(positions, colors.clip(0, 1))
+    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
 
 
-def _frame(
-    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: ProblemReport
-) -> Frame | None:
+def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Node) -> Frame | None:
     intrinsics, pose = cameras.get(image.camera_id), _world_from_camera(image)
     if intrinsics is None:
-        message = f"uses camera {image.camera_id}, which the model lacks"
-        report.error(place.file, place.field, message, "export it again")
+        place.error(f"uses camera {image.camera_id}, which the model lacks", "export it again")
         return None
     if pose is None:
-        report.error(place.file, place.field, "its pose is not a finite unit quaternion and translation", "drop it")
+        place.error("its pose is not a finite unit quaternion and translation", "drop it")
         return None
     try:
         focal = _pinhole(intrinsics)
         path = inside(root, root / "images", image.name)
     except NeecoError as error:
-        report.error_from(place.file, place.field, error)
+        place.error_from(error)
         return None
     if not path.is_file():
-        report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
+        place.error("no such file in images/", "put the undistorted images there")
         return None
     camera = Camera(torch.from_numpy(pose).float(), *focal, intrinsics.width, intrinsics.height)
-    split = "test" if order % TEST_EVERY == 0 else "train"
-    return Frame(path, camera, State(time=float(order)), split)
+    return Frame(path, camera, State(time=float(order)), "test" if order % TEST_EVERY == 0 else "train")
 
 
 def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy. Raises NeecoError for distorted or impossible cameras."""
-    if camera.model == "SIMPLE_PINHOLE":
-        fx, cx, cy = camera.params
-        fy = fx
-    elif camera.model == "PINHOLE":
-        fx, fy, cx, cy = camera.params
-    else:
+    if camera.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
         raise NeecoError(
             f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
         )
+    fx, fy, cx, cy = (camera.params[0], *camera.params)[-4:]  # a simple one has one focal length
     usable = all(np.isfinite(camera.params)) and fx > 0 and fy > 0
     if not (usable and 0 < cx < camera.width and 0 < cy < camera.height and max(camera.width, camera.height) < 65_536):
         raise NeecoError("its camera has impossible intrinsics; repair the cameras file")

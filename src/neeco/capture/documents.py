@@ -48,11 +48,6 @@ class ProblemReport:
     def error(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("error", file, field, message, remedy))
 
-    def error_from(self, file: str, field: str, error: NeecoError) -> None:
-        """Report an exception of the form "what is wrong; what to do" that does not say where."""
-        message, _, remedy = str(error).partition("; ")
-        self.error(file, field, message, remedy)
-
     def warning(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("warning", file, field, message, remedy))
 
@@ -101,7 +96,7 @@ def as_float(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Node:
-    """A value of a JSON or YAML file and where it lies. A reading that fails reports one error and returns None.
+    """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
 
     Whether that ends the reading is the report's choice: `ProblemReport` collects, `RaisingReport` raises.
     """
@@ -114,8 +109,18 @@ class Node:
     def error(self, message: str, remedy: str = "") -> None:
         self.report.error(self.file, self.field, message, remedy)
 
+    def error_from(self, error: NeecoError) -> None:
+        """Report an exception of the form "what is wrong; what to do" that does not say where."""
+        message, _, remedy = str(error).partition("; ")
+        self.error(message, remedy)
+
     def warning(self, message: str, remedy: str = "") -> None:
         self.report.warning(self.file, self.field, message, remedy)
+
+    @property
+    def reported(self) -> bool:
+        """Whether a problem of this place is known already."""
+        return any((problem.file, problem.field) == (self.file, self.field) for problem in self.report.problems)
 
     def has(self, key: str) -> bool:
         """Whether the object has this key with a value other than null."""
@@ -127,13 +132,18 @@ class Node:
         value = self.value.get(key) if isinstance(self.value, dict) else None
         return Node(value, self.file, path, self.report)
 
+    def item(self, index: int) -> Node:
+        """The element `index` of a list (None when this is not one)."""
+        value = self.value[index] if isinstance(self.value, list) else None
+        return Node(value, self.file, f"{self.field}[{index}]", self.report)
+
     def items(self) -> Iterator[Node]:
         """The elements of a list; reports an error and yields nothing when this is not a list."""
         if not isinstance(self.value, list):
             self.error(f"expected a list, found {printable(self.value)}")
             return
-        for index, value in enumerate(self.value):
-            yield Node(value, self.file, f"{self.field}[{index}]", self.report)
+        for index in range(len(self.value)):
+            yield self.item(index)
 
     def is_object(self) -> bool:
         """Whether this is an object; reports an error otherwise."""
@@ -217,14 +227,6 @@ class Node:
         return matrix
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a frame is described: file and field, for messages."""
-
-    file: str
-    field: str
-
-
 @dataclass
 class Parsed:
     """A capture as far as it could be read.
@@ -235,15 +237,19 @@ class Parsed:
 
     root: Path
     frames: list[Frame] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)  # of each frame
+    places: list[Node] = field(default_factory=list)  # where each frame is described
     instruments: tuple[Instrument, ...] = ()
     points: PointCloud | None = None  # None: none named
-    points_place: Place = Place("", "")
+    points_place: Node | None = None
     registered: bool = True
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
+
+    def header(self, field: str) -> Node:
+        """The place `field` of the file that describes the first frame."""
+        return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
         """The same without the frames whose camera is a placeholder."""
@@ -251,15 +257,13 @@ class Parsed:
         frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
         return replace(self, frames=frames, places=places, without_camera=set())
 
-    def states_of(self, name: str) -> list[tuple[Place, InstrumentState]]:
+    def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
         """(place of the state, state) of one instrument, over the frames that have it."""
-        found = []
-        for frame, place in zip(self.frames, self.places, strict=True):
-            if name in frame.state.instruments:
-                index = list(frame.state.instruments).index(name)
-                state = frame.state.instruments[name]
-                found.append((Place(place.file, f"{place.field}.instruments[{index}]"), state))
-        return found
+        return [
+            (place.child("instruments").item(list(frame.state.instruments).index(name)), frame.state.instruments[name])
+            for frame, place in zip(self.frames, self.places, strict=True)
+            if name in frame.state.instruments
+        ]
 
 
 def inside(root: Path, folder: Path, text: str) -> Path:
