@@ -19,7 +19,7 @@ from neeco.evaluation.align import align_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import Reference, load_reference
-from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, iou, mean_of, to_truth_ids
+from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, finite, iou, mean_of, to_truth_ids
 from neeco.files import write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
@@ -124,7 +124,7 @@ def evaluate_run(
         notes += _split_notes(split, result["given"][split])
     names = [list(name) for name in scene.label_names]
     labels = {"threshold": threshold_of(scene), "names": names, "jaw_assignment": jaw_assignment}
-    evaluation: dict[str, Any] = _finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
+    evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -248,14 +248,3 @@ def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
     if math.isnan(numbers["psnr_uncovered"]):
         notes.append(f"{split}: psnr_uncovered: null, the training frames saw all its tissue")
     return notes
-
-
-def _finite(value: Any) -> Any:
-    """The same structure with NaN and infinity as None: JSON has no such numbers."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
