@@ -8,8 +8,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,9 +28,6 @@ _MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
 }  # fmt: skip
-
-
-_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -76,10 +74,11 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
         place = Node(None, file, printable(image.name), report)
-        frame = _frame(image, cameras, root, order, place)
-        if frame is not None:
-            parsed.frames.append(frame)
+        try:
+            parsed.frames.append(_frame(image, cameras, root, order))
             parsed.places.append(place)
+        except NeecoError as error:
+            place.error_from(error)
     return parsed
 
 
@@ -99,24 +98,16 @@ def _add_points(
     parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
 
 
-def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Node) -> Frame | None:
-    intrinsics, pose = cameras.get(image.camera_id), _world_from_camera(image)
-    if intrinsics is None:
-        place.error(f"uses camera {image.camera_id}, which the model lacks", "export it again")
-        return None
-    if pose is None:
-        place.error("its pose is not a finite unit quaternion and translation", "drop it")
-        return None
-    try:
-        focal = _pinhole(intrinsics)
-        path = inside(root, root / "images", image.name)
-    except NeecoError as error:
-        place.error_from(error)
-        return None
+def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int) -> Frame:
+    """Raises NeecoError, which does not name the frame."""
+    if image.camera_id not in cameras:
+        raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
+    intrinsics = cameras[image.camera_id]
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    camera = Camera(pose, *_pinhole(intrinsics), intrinsics.width, intrinsics.height)
+    path = inside(root, root / "images", image.name)
     if not path.is_file():
-        place.error("no such file in images/", "put the undistorted images there")
-        return None
-    camera = Camera(torch.from_numpy(pose).float(), *focal, intrinsics.width, intrinsics.height)
+        raise NeecoError("no such file in images/; put the undistorted images there")
     return Frame(path, camera, State(time=float(order)), "test" if order % TEST_EVERY == 0 else "train")
 
 
@@ -133,14 +124,12 @@ def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
     return fx, fy, cx, cy
 
 
-def _world_from_camera(image: _Image) -> np.ndarray | None:
-    """[4, 4] from COLMAP's camera_from_world, None when it is no rigid transform."""
+def _world_from_camera(image: _Image) -> np.ndarray:
+    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all() and np.abs(translation).max() < 1e9):
-        return None
     norm = np.linalg.norm(quaternion)
-    if not 0.99 < norm < 1.01:
-        return None
+    if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
+        raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
@@ -148,7 +137,7 @@ def _world_from_camera(image: _Image) -> np.ndarray | None:
     return pose
 
 
-def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
+def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
     """`parse` applied to a file's content; damage becomes NeecoError."""
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
@@ -211,8 +200,7 @@ def _points_binary(content: bytes) -> list[tuple[float, ...]]:
 
 
 def _lines(content: bytes) -> list[str]:
-    lines = content.decode("utf-8").splitlines()
-    return [line for line in lines if not line.startswith("#")]
+    return [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
 
 
 def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
@@ -230,10 +218,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
 def _images_text(content: bytes) -> list[_Image]:
     images = []
     # two lines an image; the second (observations) may be empty, so only every other line is read
-    lines = _lines(content)
-    while lines and not lines[0].strip():
-        lines.pop(0)
-    for line in lines[::2]:
+    for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
         if line.strip():
             _, *pose, camera_id, name = line.split(maxsplit=9)
             values = tuple(map(float, pose))

@@ -16,8 +16,6 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.raster.rotations import rigid_fault
 
-MATRIX_REMEDY = "give four rows of four numbers"
-
 
 @dataclass(frozen=True)
 class Problem:
@@ -208,23 +206,24 @@ class Node:
 
     def rigid(self) -> np.ndarray | None:
         """A rigid transform [4, 4] float64: a rotation in its corner and the row 0 0 0 1, which may be left out."""
-        rows = self.value
-        if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
-            found = "is missing" if rows is None else f"expected a 4x4 matrix, found {printable(rows)}"
-            self.error(found, MATRIX_REMEDY)
-            return None
-        if any(len(row) != 4 for row in rows):
-            self.error("expected a 4x4 matrix, found rows of another length", MATRIX_REMEDY)
+        rows, wrong = self.value, ""
+        if rows is None:
+            wrong = "is missing"
+        elif not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
+            wrong = f"expected a 4x4 matrix, found {printable(rows)}"
+        elif any(len(row) != 4 for row in rows):
+            wrong = "expected a 4x4 matrix, found rows of another length"
+        elif any(as_float(entry) is None for row in rows for entry in row):
+            wrong = "expected a 4x4 matrix, found an entry that is not a number"
+        if wrong:
+            self.error(wrong, "give four rows of four numbers")
             return None
         numbers = [[as_float(entry) for entry in row] for row in rows]
-        if any(entry is None for row in numbers for entry in row):
-            self.error("expected a 4x4 matrix, found an entry that is not a number", MATRIX_REMEDY)
-            return None
         matrix = np.array([*numbers, [0.0, 0.0, 0.0, 1.0]][:4], dtype=np.float64)
-        if (fault := rigid_fault(matrix)) is not None:
+        fault = rigid_fault(matrix)
+        if fault is not None:
             self.error(*fault)
-            return None
-        return matrix
+        return matrix if fault is None else None
 
 
 @dataclass

@@ -53,8 +53,10 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     """
     file = Node(None, POSES_FILE, "", report)
     parsed = Parsed(root, timed=False, points_place=file.child("points"), is_endonerf=True)
-    table = _load(root, file)
-    if table is None:
+    try:
+        table = _load(root)
+    except NeecoError as error:
+        file.error_from(error)
         return parsed
     images = folder_images(root, "images", report)
     if len(images) != len(table):
@@ -93,25 +95,20 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
     return paths
 
 
-def _load(root: Path, file: Node) -> np.ndarray | None:
-    """The table [N, 17] as float64."""
+def _load(root: Path) -> np.ndarray:
+    """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
     remedy = "write an array of N x 17 numbers with numpy.save"
+    path = inside(root, root, POSES_FILE)
     try:
         # mapped, so that a wrong header cannot make us allocate more than the file holds
         with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
-            table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
-    except NeecoError as error:
-        file.error_from(error)
-        return None
+            table = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception:  # damaged headers make numpy raise nearly anything
-        file.error("is damaged or not an array of plain numbers", remedy)
-        return None
+        raise NeecoError(f"is damaged or not an array of plain numbers; {remedy}") from None
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
-        file.error("is not an array of plain numbers", remedy)
-        return None
+        raise NeecoError(f"is not an array of plain numbers; {remedy}")
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
-        file.error(f"has shape {printable(table.shape)}, expected N x {COLUMNS}", remedy)
-        return None
+        raise NeecoError(f"has shape {printable(table.shape)}, expected N x {COLUMNS}; {remedy}")
     return np.array(table, dtype=np.float64)
 
 
