@@ -56,8 +56,8 @@ def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tenso
 class PartTally:
     """Gathers per-part IoU over the frames of a split.
 
-    Which jaw is "left" is a name a scene learned from images cannot know, so both assignments of the two jaws are kept
-    and the better one over the whole split is reported (never the better one per frame).
+    A scene learned from images cannot know which jaw is called left: both assignments of the two jaws are counted, and
+    the better one over the whole split is reported (never the better one per frame).
     """
 
     frames: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"as named": [], "swapped": []})

@@ -77,7 +77,7 @@ def score_masks(
     """Score a folder of masks against a capture's (read, or its folder) or another folder's, matched by file stem.
 
     splits: of a capture; None: those of which `predicted` has an image. classes, truth_classes: part by id, where ids
-    differ from ours. components: a box per connected group instead of one per id. progress: told (done, of).
+    differ from ours. components: a box per connected group instead of one per id. progress: called with (done, of).
     An image without a prediction counts as predicted empty. Per region the mean over the images where either side
     shows it: `iou`, `dice`, `boundary_f`; over the whole folder `box_ap`, `box_ap50`
     (`average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
