@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import neeco
 from neeco import cluster
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_json, require_inside, write_json
+from neeco.files import is_vacant, own_folder, read_bytes, read_json, require_inside, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
@@ -175,11 +175,8 @@ def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Ru
 
 
 def _digest(run: Run) -> str:
-    scene_file = Path(run.path) / SCENE_FILE
-    try:
-        return hashlib.sha256(scene_file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
+    content = read_bytes(Path(run.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
+    return hashlib.sha256(content).hexdigest()
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:

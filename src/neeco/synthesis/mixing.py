@@ -219,7 +219,7 @@ def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[t
 def _body(scene: Scene, index: int, deformation: Deformation) -> CanonicalGaussians:
     """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
-    seen = scene.seen()[rows]
+    seen = scene.visibility()[rows]
     extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
     return alone.with_extras(**extras, **{SEEN: seen})
