@@ -10,6 +10,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src"
 ROOMS = (  # from the top down; rooms of one line do not know each other
     ("cli",),
+    ("api",),
     ("viewer", "report"),
     ("experiments",),
     ("synthesis",),
