@@ -1,6 +1,6 @@
 """Train a scene on the sample capture, draw a state that nobody recorded, and save the image with its labels.
 
-    python examples/01_train_and_draw.py --output runs/example        # under a minute; the other examples use this run
+python examples/01_train_and_draw.py --output runs/example        # under a minute; the other examples use this run
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Draw states of your own: a jaw that opens and a shaft that turns, from numpy arrays.
 
-    python examples/03_own_states.py RUN
+python examples/03_own_states.py RUN
 """
 
 from __future__ import annotations
