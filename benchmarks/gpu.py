@@ -52,7 +52,7 @@ from neeco.scene.hinges import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import open_run
 
 WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")

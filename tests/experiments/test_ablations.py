@@ -22,10 +22,9 @@ from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, De
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.plans import AblationPlan
 from neeco.report.ablation_page import write_ablation_report
-from neeco.training import train as train_module
 from neeco.training.run import read_config
 
-SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
+SMALL = ("deformation.width=8", "deformation.depth=2", "max_tissue_gaussians=120")
 
 
 @pytest.fixture(autouse=True)
@@ -34,10 +33,10 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
+def plan(capture: Path, tmp_path: Path) -> AblationPlan:
+    settings = (*SMALL, "log_interval=2")
     return AblationPlan(
-        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL, device="cpu"
+        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=settings, device="cpu"
     )
 
 
@@ -92,10 +91,9 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
 
 
 def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
-    plan: AblationPlan, monkeypatch: pytest.MonkeyPatch
+    plan: AblationPlan,
 ) -> None:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 50)
-    ablation = run_ablations(replace(plan, tables=("uniform-motion",)))
+    ablation = run_ablations(replace(plan, tables=("uniform-motion",), settings=SMALL))
     assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
     assert ablation["failures"] == []
     assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation["notes"])
@@ -112,7 +110,7 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         asked.append(run.path.name)
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
-    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
+    labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=settings, device="cpu")
     monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [jobs.run_job(job) for job in made if _neeco(job)])
     monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
     monkeypatch.setattr(ablation_run, "score_label_ways", score)

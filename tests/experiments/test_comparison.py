@@ -249,7 +249,7 @@ def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: Compar
 
 
 def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None:
-    given = ("tissue_budget=70", "deformation.width=16")
+    given = ("max_tissue_gaussians=70", "deformation.width=16")
     result = compared(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
     configs = {
         name: yaml.safe_load((spec.output / "runs" / f"{name}-seed0" / "config.yaml").read_text())

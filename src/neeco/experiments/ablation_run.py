@@ -26,7 +26,7 @@ from neeco.experiments.running import check_workers, run_jobs
 from neeco.experiments.work import JobNews
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import open_run
 
 SCHEMA = "neeco-ablation/1"

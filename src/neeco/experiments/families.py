@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from neeco.scene.deformations.nps import WARM_UP
-from neeco.training.config import TrainConfig
-from neeco.training.schedule import CLOSEST_RESETS
-from neeco.training.train import ROW_INTERVAL
+from neeco.training.config import LOG_INTERVAL, TrainConfig
+from neeco.training.schedule import MIN_RESET_INTERVAL
 
 PUBLISHED_STEPS = 20_000
 PHASE_1_STEPS = 8_000
@@ -47,19 +46,19 @@ def _with_room(config: TrainConfig) -> TrainConfig:
     """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
     if config.initial_points is not None:
         return config
-    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.max_tissue_gaussians)))
 
 
 def _missing_phases(steps: int) -> list[str]:
     told = []
-    if PHASE_1_SHARE * steps < ROW_INTERVAL:
+    if PHASE_1_SHARE * steps < LOG_INTERVAL:
         told.append(
             f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
-            f"({ROW_INTERVAL} steps); give --iterations {math.ceil(ROW_INTERVAL / PHASE_1_SHARE)} or more"
+            f"({LOG_INTERVAL} steps); give --iterations {math.ceil(LOG_INTERVAL / PHASE_1_SHARE)} or more"
         )
-    if TrainConfig().density_stop * steps <= CLOSEST_RESETS:
+    if TrainConfig().density_stop * steps <= MIN_RESET_INTERVAL:
         told.append(
-            f"opacity reset: none comes in {steps} steps (intervals do not scale below {CLOSEST_RESETS}, and density "
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and density "
             "control ends half-way), so P_oi changes nothing here"
         )
     return told

@@ -36,5 +36,5 @@ class AblationPlan:
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = ()
-    """Any other field of the training config, as NAME=VALUE (e.g. tissue_budget=4000), in every run; repeatable."""
+    """Any other field of the training config, as NAME=VALUE (e.g. max_tissue_gaussians=4000), in every run; repeatable."""
     device: Device = "auto"

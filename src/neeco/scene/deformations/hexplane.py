@@ -18,7 +18,7 @@ Where it departs from its source:
 - 16 channels, the smaller of the source's settings, for speed on a processor.
 - With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
   xt yt zt at that time, one normal number per plane and channel.
-- The number of Gaussians has a ceiling (`tissue_budget`).
+- The number of Gaussians has a ceiling (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations

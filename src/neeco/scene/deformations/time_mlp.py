@@ -13,7 +13,7 @@ Where it departs from its source:
 - The source computes in the units of its scenes, whose half extent is about 1. Here the points' half extent is the
   unit, for what goes in and for the changes of mean and scale.
 - A scale that its change would make negative is taken as positive; in the source, too, the covariance squares it.
-- The number of Gaussians has a ceiling (`tissue_budget`).
+- The number of Gaussians has a ceiling (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
