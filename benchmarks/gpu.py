@@ -48,7 +48,7 @@ from neeco.raster.optimizer import adam_step
 from neeco.raster.threads import synchronise
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings

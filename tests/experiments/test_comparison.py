@@ -261,7 +261,7 @@ def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None
     assert result["settings"] == list(given)
 
 
-@pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.moments=4", "no_such_field=1"])
+@pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.time_resolution=4", "no_such_field=1"])
 def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given: str) -> None:
     with pytest.raises(NeecoError, match="--set"):
         compared(replace(spec, assignments=(given,)))

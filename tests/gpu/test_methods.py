@@ -19,10 +19,8 @@ from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.scene.deformations import kinematic
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.methods import METHODS
-from neeco.scene.nerfies.render import Rays
+from neeco.scene.nerfies.field import Rays
 from neeco.scene.scene import Scene
 from neeco.training import train as module
 from neeco.training.config import TrainConfig
@@ -36,13 +34,20 @@ STEPS = 40
 SMALL = {
     "neeco": ["deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
-    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.moments=5"],
+    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.time_resolution=5"],
     "nerfies": [
         f"deformation.{size}"
         for size in ("rays=64", "coarse_samples=6", "width=16", "depth=2", "warp_width=8", "warp_depth=2")
     ],
     # all that a long run does happens within 40 iterations
-    "kinematic": ["density_start=10", "refine.start=8", "schedule.plain_density.interval=15"],
+    "kinematic": [
+        "density_start=10",
+        "refine.start=8",
+        "schedule.plain_density.interval=15",
+        "deformation.hinge_start=12",
+        "deformation.shadow_at=[10]",
+        "deformation.label_sharpness_start=14",
+    ],
 }
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
 # what three seeds differ by on the CPU, twice: on another device the frames that are drawn and the noise are others
@@ -59,9 +64,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def early(monkeypatch: pytest.MonkeyPatch) -> None:
     """The instrument is looked for, moves and casts its shadow from the beginning."""
     monkeypatch.setattr(discovery, "TISSUE_STEPS", 60)
-    monkeypatch.setattr(Kinematic, "learns_from", 12)
-    monkeypatch.setattr(kinematic, "SHADOW_AT", (10,))
-    monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
 
 
 def close(there: Tensor, here: Tensor, tolerance: float = 1e-3) -> bool:
@@ -105,7 +107,7 @@ def test_a_field_is_the_same_there(device: torch.device) -> None:
         scene = make_nerf(fine_samples=0).requires_grad_(True).to(where)
         directions = torch.nn.functional.normalize(torch.ones(7, 3), dim=-1).to(where)
         times = torch.zeros(7, dtype=torch.float64, device=where)
-        drawn = scene.trace(Rays(torch.zeros(7, 3, device=where), directions, times))
+        drawn = scene.render_rays(Rays(torch.zeros(7, 3, device=where), directions, times))
         drawn.coarse.color.square().sum().backward()
         return [drawn.coarse.color, *(p.grad for p in scene.parameters() if p.grad is not None)]
 

@@ -60,14 +60,14 @@ def test_the_share_that_is_made_up_is_told(scene, state, camera):
     tissue = slice(0, plain.counts[0])
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[tissue] = plain.means[tissue, 0] > 0
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         halved, _ = labelled(scene, recorded, camera)
     finally:
         scene.canonical = plain
-    assert not (drawing.made_up > 0.5).any()
+    assert not (drawing.unobserved > 0.5).any()
     behind = 1 - float((drawing.parts > 0).float().mean())
-    assert float((halved.made_up > 0.5).float().mean()) == pytest.approx(behind / 2, abs=0.02)
+    assert float((halved.unobserved > 0.5).float().mean()) == pytest.approx(behind / 2, abs=0.02)
     shown = halved.parts > 0
     right = torch.arange(camera.width) > camera.width / 2 + 3
     assert bool(halved.ignored[~shown & right].all())
@@ -80,14 +80,14 @@ def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of
     recorded, plain = scene.recorded.states[0], scene.canonical
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         for labeller in (CompositedLabels(scene), ThresholdLabels(scene)):
             drawing, _ = labelled(scene, recorded, camera, labeller)
             instrument = drawing.parts > 0
-            share = float((drawing.made_up > 0.5)[instrument].float().mean())
+            share = float((drawing.unobserved > 0.5)[instrument].float().mean())
             assert 0.5 < share < 1.0
-            assert not (drawing.made_up > 0.5)[~instrument].float().mean() > 0.02
+            assert not (drawing.unobserved > 0.5)[~instrument].float().mean() > 0.02
             assert Acceptance(0.0, None, share).why_refused(scene, drawing) is None
             assert Acceptance(0.0, None, 0.99 * share).why_refused(scene, drawing) == UNSEEN_SIDE
     finally:

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.nerfies.scene import NerfScene
+from neeco.scene.nerfies.field import NerfScene
 from neeco.training.options import training_config, variant_config
 from neeco.training.train import ProgressRow, train
 

@@ -259,7 +259,7 @@ OURS = (
         "rim",
         "Rim of the tissue",
         "What does continuing the tissue beyond what frames saw of it bring?",
-        "deformation.rim=false",
+        "deformation.extrapolate_tissue=false",
     ),
     Ablation(
         "labels",

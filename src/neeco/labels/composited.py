@@ -86,10 +86,10 @@ class CompositedLabels:
         return self._owners
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
         """One pass: colour and label channels together."""
-        channels = self.channels if made_up is None else torch.cat([self.channels, made_up[:, None]], 1)
+        channels = self.channels if unobserved is None else torch.cat([self.channels, unobserved[:, None]], 1)
         rendering = rasterize(gaussians, camera, channels=channels)
         assert rendering.channels is not None
         labels = replace(rendering, channels=rendering.channels[..., : len(self.names)])

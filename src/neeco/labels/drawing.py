@@ -55,14 +55,14 @@ class LayeredDrawing(Drawing):
     tissue_depth: np.ndarray  # of the tissue drawn alone
     tissue_image: Tensor | None  # [H, W, 3] in [0, 1], the same, where it was asked for
     alone: dict[str, Alone]  # by instrument
-    made_up: Tensor  # [H, W] in [0, 1]: how much of a pixel no training frame saw, or not from about there
+    unobserved: Tensor  # [H, W] in [0, 1]: how much of a pixel no training frame saw, or not from about there
 
     @property
     def ignored(self) -> Tensor:
         """[H, W] bool: pixels that a trainer had better not count: the edge (see `edges.uncertain_edge`), and what is
         mostly made up."""
         edge = torch.from_numpy(uncertain_edge(self.share.numpy(), self.parts.numpy() > 0))
-        return edge | (self.made_up > MOSTLY)
+        return edge | (self.unobserved > MOSTLY)
 
 
 class Labeller(Protocol):
@@ -75,7 +75,7 @@ class Labeller(Protocol):
         ...
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
         """The whole scene drawn, its part ids [H, W] uint8, and how much of each pixel is instrument [H, W]. Where
         `made_up` [N] is given, the rendering's last channel is that."""
@@ -102,8 +102,8 @@ def draw_layers(
     gaussians = scene.at(state)
     learned_camera = scene.camera(camera)
     owners = labeller.owners(state, gaussians)
-    made_up = scene.made_up(gaussians, learned_camera)
-    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, made_up)
+    unobserved = scene.unobserved(gaussians, learned_camera)
+    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, unobserved)
     assert rendering.channels is not None
     parts, share = _without_speckle(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, speckle)
     bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)  # colour takes time, and depth knows none
@@ -125,7 +125,7 @@ def draw_layers(
         tissue_depth=surface_depth(tissue),
         tissue_image=tissue.color.clamp(0, 1).cpu() if tissue_image else None,
         alone=alone,
-        made_up=rendering.channels[..., -1].cpu(),
+        unobserved=rendering.channels[..., -1].cpu(),
     )
 
 

@@ -17,7 +17,7 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
-from neeco.scene.deformations._moving import otsu
+from neeco.scene.deformations.base import otsu
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
@@ -74,7 +74,7 @@ class ThresholdLabels:
         return torch.where(moved, torch.cdist(means, origins).argmin(dim=1), -1)
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, made_up: Tensor | None = None
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
         """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
         moved = owners >= 0
@@ -83,7 +83,7 @@ class ThresholdLabels:
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
         lit = alone.color.norm(dim=2) > self.black
-        rendering = rasterize(gaussians, camera, channels=None if made_up is None else made_up[:, None])
+        rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
         return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
 
 

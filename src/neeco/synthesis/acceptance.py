@@ -55,10 +55,10 @@ class Acceptance:
             return LEAVES_IMAGE
         if keypoints and not any_in_image(drawing.camera, keypoints):
             return LEAVES_IMAGE
-        made_up = drawing.made_up > MOSTLY
-        if float(made_up.float().mean()) > MOST_MADE_UP:
+        unobserved = drawing.unobserved > MOSTLY
+        if float(unobserved.float().mean()) > MOST_MADE_UP:
             return UNSEEN
-        if float(made_up[drawing.parts > 0].float().mean()) > self.max_unseen:
+        if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unseen:
             return UNSEEN_SIDE
         if any(_crossing(drawing, a, b) for a, b in combinations(self.casts, 2)):
             return ENTERS_ANOTHER

@@ -101,7 +101,7 @@ class GaussianSession(GaussianTraining):
         self.iteration += views
         progress, scene = self.progress, self.scene
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
-        scene.deformation.resting = progress < scene.deformation.warm_up
+        scene.deformation.warming_up = progress < scene.deformation.warm_up
         chosen = [self._next_frame() for _ in range(views)]
         asked: list[Tensor] = []
         for index, following in zip(chosen, [*chosen[1:], *self.queue[:1], None], strict=False):
@@ -149,13 +149,13 @@ class GaussianSession(GaussianTraining):
     def _perturbation(self, progress: float) -> Perturbation:
         noise = self.schedule.state_noise(progress)
         given = Perturbation(noise) if noise else UNPERTURBED
-        return self.scene.deformation.disturbed(given, self.iteration, progress, self.rng)
+        return self.scene.deformation.perturb(given, self.iteration, progress, self.rng)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
         """Small corrections, and what the method adds of its own."""
         deformation = self.scene.deformation
         own = None
-        if not deformation.resting:
+        if not deformation.warming_up:
             own = deformation.regularisation(self.scene.canonical, rendering, self.iteration)
         return sum(term for term in (penalty, own) if term is not None)
 
@@ -164,7 +164,7 @@ class GaussianSession(GaussianTraining):
         scene, gaussian_rates = self.scene, self.gaussian_rates
         rates = gaussian_rates | {"means": POSITION_RATE * self.extent * log_linear(1.0, FINAL_RATE, progress)}
         learned = [(name, tensor, rates[name]) for name, tensor in scene.canonical.tensors().items() if name in rates]
-        still = scene.deformation.resting or self.iteration < scene.deformation.learns_from
+        still = scene.deformation.warming_up or self.iteration < scene.deformation.start_iteration
         own_rates = scene.deformation.learning_rates(progress)
         for name, parameter in scene.deformation.named_parameters():
             if own_rates[name] > 0 and not still:
@@ -208,7 +208,7 @@ class GaussianSession(GaussianTraining):
                 self._limits(),
                 settings.threshold if grows else math.inf,
                 self.generator,
-                scene.deformation.lost(scene.canonical, [camera for _, camera in self.given]),
+                scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
@@ -260,7 +260,7 @@ class GaussianSession(GaussianTraining):
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         scene.deformation.finish(self)
-        scene.seen()
+        scene.visibility()
 
 
 def new_session(

@@ -75,7 +75,7 @@ def write_sample(
         **state_to_json(drawing.state),
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "made_up": round(float(drawing.made_up.mean()), 4),
+        "made_up": round(float(drawing.unobserved.mean()), 4),
         "labels": [label.to_json() for label in labels],
         **facts,
         "refused": dict(sorted(refused.items())),

@@ -10,7 +10,7 @@ from torch import Tensor
 from neeco.raster import rasterize
 from neeco.raster.pinhole import pixel_centers, unproject_world
 from neeco.raster.types import Camera
-from neeco.scene.hinges import Hinged, Hinges
+from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.training.instruments.solid import solid_extent, spread
 from neeco.training.session import GaussianSession
 
@@ -24,7 +24,7 @@ SEEN_OFTEN = 0.2  # of the frames looked at must show both sides of a step
 CLEAR = 8.0  # times the median of steps along the shaft
 
 
-def color_boundary(session: GaussianSession, hinged: Hinged, index: int) -> float | None:
+def color_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float | None:
     """Position mm along the shaft where the photographs' colour along it changes most; None without a clear step."""
     hinges = hinged.hinges_of(index)
     radius = float(hinges.radius)
@@ -64,7 +64,7 @@ def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _profile(
-    session: GaussianSession, hinged: Hinged, index: int, frame_index: int, edges: Tensor
+    session: GaussianSession, hinged: HingedInstruments, index: int, frame_index: int, edges: Tensor
 ) -> tuple[Tensor, Tensor]:
     """A photograph's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and two
     log ratios, which the light's colour and distance change alike everywhere."""

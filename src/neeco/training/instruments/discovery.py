@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from neeco.errors import NeecoError
 from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
-from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import Report
 from neeco.scene.training_views import TrainingViews
@@ -29,7 +29,7 @@ AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted
 BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
 
 
-def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
+def find_instruments(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
     hinges.
 

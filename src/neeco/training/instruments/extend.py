@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.hinges import Hinges
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import Hinges
 
 WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
 ENDS_IN_VIEW = 0.3  # share above which the instrument's rear end is taken for real

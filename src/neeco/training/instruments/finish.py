@@ -11,7 +11,7 @@ from torch import Tensor
 from neeco.capture.model import InstrumentState, State
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.hinges import Hinged
+from neeco.scene.instruments import HingedInstruments
 from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.extend import extend_shaft
 from neeco.training.instruments.hidden import drop_hidden
@@ -22,7 +22,7 @@ FOUND = 0.35  # share of the moving parts' error that the readings must explain:
 
 
 @torch.no_grad()
-def conclude(session: GaussianSession, hinged: Hinged) -> None:
+def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Drop what is hidden of instruments, set the extent of each, prolong its shaft and write the joints' verdicts into
     `scene.diagnostics`.
 
@@ -56,7 +56,7 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
 
 
-def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
+def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, joint: int) -> dict[str, Any]:
     """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving
     parts' image?
 
@@ -103,7 +103,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
     }
 
 
-def _moving_weight(canonical: CanonicalGaussians, hinged: Hinged, index: int, joint: int) -> Tensor:
+def _moving_weight(canonical: CanonicalGaussians, hinged: HingedInstruments, index: int, joint: int) -> Tensor:
     """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
     weight = canonical.means.new_zeros(len(canonical), 1)
     weights = hinged.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]

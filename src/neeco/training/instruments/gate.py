@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neeco.errors import NeecoError
-from neeco.scene.swept import SweptVolume
+from neeco.scene.instruments import SweptVolume
 from neeco.training.instruments.carving import carve
 from neeco.training.instruments.discovery import SEEDS, judge_evidence, tissue_evidence
 from neeco.training.session import GaussianSession

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from neeco.capture.model import evenly_spaced
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.scene import Scene
-from neeco.scene.seen import pixels_of, spread_frames
+from neeco.scene.visibility import visible_pixels
 
 HIDDEN = 0.2  # of the pixels that a Gaussian takes up of its instrument drawn alone: less is left of it by the others
 ASKED = 0.05  # px that it takes up there, in all frames together: below, its own instrument hides it
@@ -23,13 +24,13 @@ def drop_hidden(scene: Scene) -> CanonicalGaussians:
     canonical, recorded = scene.canonical, scene.recorded
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     left, whole = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
-    for index in spread_frames(len(recorded.cameras), FRAMES):
+    for index in evenly_spaced(len(recorded.cameras), FRAMES):
         camera = scene.camera(recorded.cameras[index])
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
-        left += pixels_of(posed, camera)
+        left += visible_pixels(posed, camera)
         for own in instruments:
-            whole[own] += pixels_of(posed.select(own), camera)
+            whole[own] += visible_pixels(posed.select(own), camera)
     kept = (canonical.bodies == 0) | (whole < ASKED) | (left >= HIDDEN * whole)
     return _only(canonical, kept)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.hinges import Hinges
+from neeco.scene.instruments import Hinges
 from neeco.training.session import GaussianSession
 
 SOLID = 0.3  # opacity of a Gaussian that counts as the instrument's substance
@@ -54,7 +54,7 @@ def measure_tips(canonical: CanonicalGaussians, index: int, hinges: Hinges, weig
     for joint in range(len(hinges.joint_names)):
         pivot, _ = hinges.hinge(joint)
         found = torch.full_like(hinges.tips[joint], torch.nan)
-        for side, part in enumerate(hinges.left_first(joint).tolist()):
+        for side, part in enumerate(hinges.left_right_order(joint).tolist()):
             of_part = points[kept & (shares[:, 2 + 2 * joint + side] > MOSTLY)]
             if len(of_part) < ENOUGH:
                 continue

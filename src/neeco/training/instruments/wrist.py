@@ -7,7 +7,7 @@ import torch
 
 from neeco.raster import rasterize
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
-from neeco.scene.hinges import Hinged
+from neeco.scene.instruments import HingedInstruments
 from neeco.training.instruments.border import color_boundary
 from neeco.training.instruments.solid import measure_radius, solid_extent, spread
 from neeco.training.session import GaussianSession
@@ -20,7 +20,7 @@ SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
 
 
 @torch.no_grad()
-def place_wrists(session: GaussianSession, hinged: Hinged) -> None:
+def place_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Put every wrist where it is found."""
     for index in range(len(session.scene.instruments)):
         hinges = hinged.hinges_of(index)
@@ -30,7 +30,7 @@ def place_wrists(session: GaussianSession, hinged: Hinged) -> None:
 
 
 @torch.no_grad()
-def replace_wrists(session: GaussianSession, hinged: Hinged) -> None:
+def replace_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Look for every wrist again, and move it where spinning what then lies behind costs no more than before."""
     for index in range(len(session.scene.instruments)):
         hinges = hinged.hinges_of(index)
@@ -42,12 +42,12 @@ def replace_wrists(session: GaussianSession, hinged: Hinged) -> None:
         hinges.wrist_start.fill_(found if costs[found] <= LENIENCE * costs[before] else before)
 
 
-def _boundary(session: GaussianSession, hinged: Hinged, index: int) -> float:
+def _boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
     boundary = color_boundary(session, hinged, index)
     return _symmetry_boundary(session, hinged, index) if boundary is None else boundary
 
 
-def _symmetry_boundary(session: GaussianSession, hinged: Hinged, index: int) -> float:
+def _symmetry_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
     """Position mm along the shaft up to which spinning what lies behind costs little."""
     scene = session.scene
     hinges = hinged.hinges_of(index)
@@ -62,10 +62,12 @@ def _symmetry_boundary(session: GaussianSession, hinged: Hinged, index: int) -> 
     return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
-def _spun_error(session: GaussianSession, hinged: Hinged, index: int, start: float, frames: list[int]) -> float:
+def _spun_error(
+    session: GaussianSession, hinged: HingedInstruments, index: int, start: float, frames: list[int]
+) -> float:
     """Summed error of the frames' images, what lies behind `start` spun a little. Leaves the wrist there."""
     hinged.hinges_of(index).wrist_start.fill_(start)
-    return sum(_image_error(session, frame, hinged.spun(ROLLS[k % 2])) for k, frame in enumerate(frames))
+    return sum(_image_error(session, frame, hinged.spin_perturbation(ROLLS[k % 2])) for k, frame in enumerate(frames))
 
 
 def _image_error(session: GaussianSession, index: int, perturbation: Perturbation) -> float:
