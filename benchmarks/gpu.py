@@ -38,14 +38,14 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.experiments.jobs import Budget, Job, run_job
 from neeco.experiments.machine import machine
+from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.files import write_json, write_text
 from neeco.raster import Camera, Gaussians, rasterize
-from neeco.raster.devices import device_of, failures_told
+from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
+from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
-from neeco.raster.threads import synchronise
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.instruments import PART_LOGITS
@@ -217,8 +217,10 @@ def train_both(capture: Path, device: torch.device, iterations: int) -> list[dic
     for where in dict.fromkeys((str(device), "cpu")):
         with tempfile.TemporaryDirectory() as folder:
             config = training_config("kinematic", {})
-            job = Job("kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where)
-            done = run_job(job)
+            job = TrainingJob(
+                "kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where
+            )
+            done = job.run()
         scores = {name: {k: values[k] for k in ("psnr", "mask_iou")} for name, values in done["splits"].items()}
         rows.append({"device": where, "iterations": iterations, "seconds": done["seconds"], "splits": scores})
     return rows
@@ -329,7 +331,7 @@ def main(words: list[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # else cuBLAS knows no fixed order
     try:
-        with failures_told():
+        with readable_failures():
             result = run(arguments)
         told = markdown(result)
         if arguments.output is not None:

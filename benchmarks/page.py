@@ -25,7 +25,7 @@ import torch
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.scene.scene import Scene, gaussian_scene
 from neeco.training.run import open_run

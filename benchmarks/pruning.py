@@ -20,7 +20,7 @@ from torch import Tensor
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.evaluation.image_metrics import psnr
-from neeco.raster.threads import set_threads
+from neeco.raster.native import set_threads
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.scene import gaussian_scene
 from neeco.training.run import open_run

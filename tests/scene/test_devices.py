@@ -107,7 +107,7 @@ class TestProducts:
             return nullcontext()
 
         for module in (nps, time_mlp, hexplane, field):
-            monkeypatch.setattr(module, "quick_products", note)
+            monkeypatch.setattr(module, "tf32_products", note)
         return asked
 
     def test_a_network_that_moves_gaussians(self, scene: Scene, asked: list[torch.device]) -> None:

@@ -17,7 +17,7 @@ from scene_worlds import GRASPER, grasper_state, make_scene, pose_of
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded

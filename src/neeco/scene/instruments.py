@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
-from neeco.raster.on_device import Answer
+from neeco.raster.devices import CachedPredicate
 from neeco.raster.posing import HingedBody, part_weights
 from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
@@ -238,7 +238,7 @@ class SweptVolume(nn.Module):
         self.register_buffer("low", torch.zeros(3))
         self.register_buffer("cell", torch.zeros(3))
         self.register_buffer("occupied", torch.zeros(CELLS, CELLS, CELLS, dtype=torch.bool))
-        self._covered = Answer(lambda cell: cell.any())
+        self._covered = CachedPredicate(lambda cell: cell.any())
 
     @property
     def bounded(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from neeco.capture.model import Capture, Instrument
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.training_session import RunLength, Session
 from neeco.scene.training_views import TrainingViews

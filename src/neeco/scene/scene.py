@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
-from neeco.raster.on_device import Answer
+from neeco.raster.devices import CachedPredicate
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
@@ -74,8 +74,8 @@ class Scene(nn.Module):
         self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
         self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
         self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
-        self._shines = Answer(lambda strengths: (strengths > 0).any())
-        self._corrects = Answer(lambda registration: registration.any())
+        self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
+        self._corrects = CachedPredicate(lambda registration: registration.any())
 
     @property
     def settings(self) -> Any:

@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 
 from neeco.capture.model import State, evenly_spaced
 from neeco.raster import rasterize
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
 from neeco.raster.pinhole import in_image, pixel_centers, project_world, unproject_world
 from neeco.raster.rotations import quat_to_matrix
 from neeco.raster.types import Camera, Gaussians

@@ -15,8 +15,8 @@ from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
+from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
-from neeco.raster.on_device import constant, quick_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
@@ -127,7 +127,7 @@ class GaussianSession(GaussianTraining):
             self.views.announce(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
-        with quick_products(self.views.device) if scene.deformation.large_operations else nullcontext():
+        with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             total.backward(torch.full_like(total, 1 / views))
         gradient = rendering.center_offsets.grad
         assert gradient is not None

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neeco.errors import NeecoError
-from neeco.labels.composited import threshold_of
+from neeco.labels.labellers import threshold_of
 from neeco.raster.sh import SH_C0
 from neeco.scene.drawable import HingeMotion
 from neeco.viewer.steering import across, shafts_of, slider_ranges

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.difference import Pixels, difference_map, overlay_parts
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.scene import gaussian_scene

@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
@@ -114,7 +114,7 @@ class HexPlane(LabelledByMotion):
         places = (canonical.means - self.center) / (MARGIN * self.half_extent)
         rows = self.rows_at(self.times.share(state), perturbation.state_noise)
         features = self.features(places, rows)
-        with quick_products(places.device):
+        with tf32_products(places.device):
             hidden = self.trunk(features)
             d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()

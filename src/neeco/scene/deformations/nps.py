@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
@@ -198,7 +198,7 @@ class NPS(LabelledByMotion):
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         state = encoded_state[None]
         half = torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu")
-        with quick_products(means.device), half:
+        with tf32_products(means.device), half:
             features = torch.relu(self.mean_in(encoded) + self.state_in(state))
             for index, layer in enumerate(self.hidden, start=1):
                 summed = layer(features)

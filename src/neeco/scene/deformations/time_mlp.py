@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
     UNPERTURBED,
@@ -149,7 +149,7 @@ class TimeMLP(LabelledByMotion):
         """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
         encoded = octaves(places, self.settings.L_mean)
         features = encoded
-        with quick_products(places.device):
+        with tf32_products(places.device):
             for index, layer in enumerate(self.layers):
                 assert isinstance(layer, nn.Linear)
                 if index == SKIP + 1:

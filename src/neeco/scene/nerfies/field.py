@@ -35,7 +35,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.deformations.base import octave_angles
 from neeco.scene.drawable import Recorded
@@ -195,7 +195,7 @@ class WarpField(nn.Module):
     def forward(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
         """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; places in the template [M, 3]."""
         encoded = encode_by_octave(points, self.frequencies, opened)
-        with quick_products(points.device):
+        with tf32_products(points.device):
             features = self.trunk(torch.cat([encoded, codes], -1))
             rotation, velocity = self.rotation(features), self.velocity(features)
         return move_by_screw(points, rotation, velocity)
@@ -228,7 +228,7 @@ class Template(nn.Module):
     def forward(self, places: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
         """places [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
         conditions = conditions[:, None].expand(-1, places.shape[1], -1)
-        with quick_products(places.device):
+        with tf32_products(places.device):
             features = self.trunk(encode_by_octave(places, self.frequencies))
             seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
             density, color = self.density(features)[..., 0], self.color(seen)

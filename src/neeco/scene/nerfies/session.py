@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import log_linear
 from neeco.scene.drawable import Recorded
@@ -144,7 +144,7 @@ class NerfiesSession(Session):
         error = coarse if drawn.fine is None else _error(drawn.fine.color, colors, counted)
         loss = coarse if drawn.fine is None else coarse + error
         total = loss + self._elastic(drawn) + self._background()
-        with quick_products(total.device):
+        with tf32_products(total.device):
             total.backward()
         rate = log_linear(settings.rate, settings.rate_decay * settings.rate, progress)
         self.adam.step((name, parameter, rate) for name, parameter in scene.named_parameters() if parameter.numel())
