@@ -18,11 +18,10 @@ import torch
 
 from neeco.capture.images import read_image, read_labels
 from neeco.evaluation.image_metrics import psnr
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw, draw_layers
+from neeco.labels.labellers import CompositedLabels
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.motion import exposure, motion_between
-from neeco.synthesis.optics import mean_light
+from neeco.synthesis.camera_effects import average_exposure, motion_between, subframes
 from neeco.training.run import open_run
 
 
@@ -49,8 +48,8 @@ def main() -> None:
             states, cameras = recorded.states, recorded.cameras
             motion = motion_between(states[before], cameras[before], states[after], cameras[after])
             sharp = draw_layers(scene, labeller, states[now], cameras[now], 0.0)
-            moments = exposure(scene, sharp, motion, arguments.shutter)
-            exposed = torch.from_numpy(mean_light([draw(scene, *moment).image.numpy() for moment in moments]))
+            moments = subframes(scene, sharp, motion, arguments.shutter)
+            exposed = torch.from_numpy(average_exposure([draw(scene, *moment).image.numpy() for moment in moments]))
             photograph = read_image(file)
             mask = read_labels(arguments.capture / "truth/masks" / f"{file.stem}.png") > 0
             row = [psnr(image, photograph, of) for image in (sharp.image, exposed) for of in (None, mask)]

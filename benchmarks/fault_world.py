@@ -35,18 +35,18 @@ def still_the_clocks() -> None:
     from datetime import UTC, datetime
 
     from neeco.evaluation import evaluate
-    from neeco.experiments import jobs, speed, watching
-    from neeco.report import render
+    from neeco.experiments import machine, training_job
+    from neeco.report import page
     from neeco.training import train
 
     ticks = iter(range(10**12))
     ticking = SimpleNamespace(perf_counter=lambda: next(ticks) / 1024)  # differences are exact
-    evaluate.time = speed.time = ticking  # type: ignore[assignment]
-    watching.CLOCKS.update(wall=lambda: 0.0, processor=lambda: 0.0)
-    watching.peak_memory_mb = lambda: 1.0
-    assert jobs.CLOCKS is watching.CLOCKS
+    evaluate.time = machine.time = ticking  # type: ignore[assignment]
+    training_job.CLOCKS.update(wall=lambda: 0.0, processor=lambda: 0.0)
+    training_job.peak_memory_mb = lambda: 1.0
+    assert training_job.CLOCKS is training_job.CLOCKS
     train.train.__kwdefaults__["clock"] = lambda: 0.0
-    render.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
+    page.now = lambda: datetime(2026, 1, 1, tzinfo=UTC)
 
 
 def prepare() -> None:

@@ -298,14 +298,14 @@ def clock_set_back(verb: Verb, whole: Undisturbed, work: Path, pick: random.Rand
     clear(verb.shelf)
 
     def begin() -> None:
-        from neeco.experiments import watching
+        from neeco.experiments import training_job
         from neeco.training import train
 
         def falling() -> float:
             return time.monotonic() - 3600 * (time.monotonic_ns() // 50_000_000 % 7)
 
         train.train.__kwdefaults__["clock"] = falling
-        watching.CLOCKS.update(wall=falling, processor=falling)
+        training_job.CLOCKS.update(wall=falling, processor=falling)
         now = time.time
         time.time = lambda: now() - 3600 * (time.monotonic_ns() // 50_000_000 % 7)
 

@@ -27,9 +27,9 @@ from matplotlib.figure import Figure
 from neeco.capture import read_capture
 from neeco.capture.model import Frame
 from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.files import write_text
-from neeco.raster.threads import set_threads
+from neeco.raster.native import set_threads
 from neeco.scene import Drawable
 from neeco.scene.training_session import Session
 from neeco.training.config import training_config
@@ -79,7 +79,7 @@ class HeldOut:
         for split, rows in self.frames.items():
             whole, inside = [], []
             for frame, photo, mask in rows:
-                image = scene.draw(frame.state, frame.camera).color.clamp(0, 1)
+                image = scene.render(frame.state, frame.camera).color.clamp(0, 1)
                 whole.append(psnr(image, photo, frame.load_mask()))
                 inside.append(psnr(image, photo, mask) if mask is not None else float("nan"))
             scores[split] = (sum(whole) / len(whole), sum(inside) / len(inside))

@@ -43,12 +43,12 @@ def prepare() -> None:
         "neeco.ingest.pipeline",
         "neeco.ingest.convert",
         "neeco.report.annotated_page",
-        "neeco.report.comparison_page",
+        "neeco.report.study_pages",
         "neeco.report.downstream_page",
         "neeco.report.ingest_page",
         "neeco.synthesis.annotated",
         "neeco.synthesis.dataset",
-        "neeco.synthesis.render",
+        "neeco.synthesis.rendered_views",
         "neeco.viewer.export",
         "neeco.viewer.splats",
         "neeco.evaluation.mask_scores",
@@ -58,11 +58,11 @@ def prepare() -> None:
         "av",
     ):
         importlib.import_module(module)
-    from neeco.experiments import speed
+    from neeco.experiments import machine
 
     torch.set_num_threads(1)
     hasten_ingest()
-    speed.ROUNDS, speed.DRAWS = 1, 1
+    machine.ROUNDS, machine.DRAWS = 1, 1
 
 
 def make_world(desk: Path, wanted: set[str]) -> None:

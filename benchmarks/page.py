@@ -25,7 +25,7 @@ import torch
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.scene.scene import Scene, gaussian_scene
 from neeco.training.run import open_run
@@ -83,7 +83,7 @@ def states(scene: Scene, frame: int) -> Iterator[tuple[float | None, State]]:
 def compare(page: Any, scene: Scene, frame: int) -> None:
     """A row of the table for every state of a frame."""
     for reading, state in states(scene, frame):
-        truth = scene.draw(state, scene.recorded.cameras[frame], labels=True)
+        truth = scene.render(state, scene.recorded.cameras[frame], labels=True)
         parts = composited_parts(truth, threshold_of(scene)).numpy()
         image, ids, depths = shown(page, frame, reading)
         drawn, counted = truth.color.clamp(0, 1), torch.from_numpy(parts > 0)

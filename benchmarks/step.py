@@ -22,8 +22,8 @@ import torch
 
 from neeco.capture.check import read_checked
 from neeco.raster import cpu, losses, posing, shadow
+from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam
-from neeco.raster.threads import keep_freed_memory, set_threads
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as steps
 from neeco.training.initial import begin_session

@@ -22,12 +22,11 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
-from neeco.evaluation.truth import load_reference
-from neeco.labels.composited import CompositedLabels
+from neeco.evaluation.mask_folders import load_reference
+from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.annotated import fitted, usual_of
-from neeco.synthesis.trust import judge
+from neeco.synthesis.annotated import estimate_trust, fitted, typical_errors
 from neeco.training.run import open_run
 
 BAD = 0.9  # IoU
@@ -70,7 +69,7 @@ def main() -> None:
     with open_run(arguments.run) as run:
         scene, capture = gaussian_scene(run.scene, "trust"), run.capture()
         labeller = CompositedLabels(scene)
-        usual = usual_of(scene, labeller, capture)
+        usual = typical_errors(scene, labeller, capture)
         for split in held_out_splits(capture):
             frames = capture.split(split)
             for place in np.linspace(0, len(frames) - 1, min(arguments.frames, len(frames))).round().astype(int):
@@ -81,7 +80,7 @@ def main() -> None:
                     drawing = fitted(scene, labeller, frame, photograph, None)[1]
                     label = drawing.parts.numpy() > 0
                     overlap = (label & true).sum() / max(1, (label | true).sum())
-                    rows.append((how, overlap, judge(drawing, photograph, frame.load_mask(), usual).value))
+                    rows.append((how, overlap, estimate_trust(drawing, photograph, frame.load_mask(), usual).value))
     print("| frames | labels | IoU | trust |\n|---|---|---|---|")
     for how in dict.fromkeys(row[0] for row in rows):
         here = np.array([row[1:] for row in rows if row[0] == how])

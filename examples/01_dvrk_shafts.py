@@ -21,7 +21,7 @@ import torch
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.model import Capture, Instrument, InstrumentState
-from neeco.evaluation.truth import REFERENCE_FOLDER
+from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 
 TOOL_LENGTH, WRIST_LENGTH, REMOTE_CENTER = 416.2, 9.1, 431.8  # mm
 JOINTS = ("outer_yaw_rad", "outer_pitch_rad", "insertion_mm", "outer_roll_rad", "wrist_pitch_rad", "wrist_yaw_rad")

@@ -13,7 +13,7 @@ from neeco.capture.writer import write_capture
 from neeco.cli import main
 from neeco.cli._progress import resumable
 from neeco.errors import NeecoError
-from neeco.experiments import jobs
+from neeco.experiments import training_job
 from neeco.raster import devices
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import StepResult
@@ -80,13 +80,13 @@ def test_a_run_is_drawn_on_the_device_that_is_named(verb: str, made, monkeypatch
 
 
 def test_the_jobs_of_a_comparison_are_given_the_word(made, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[jobs.Job] = []
+    taken: list[training_job.TrainingJob] = []
 
-    def run_job(job: jobs.Job, progress: object, capture: Capture) -> dict[str, object]:
+    def run(job: training_job.TrainingJob, progress: object, capture: Capture) -> dict[str, object]:
         taken.append(job)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jobs, "run_job", run_job)
+    monkeypatch.setattr(training_job.TrainingJob, "run", run)
     for verb in ("compare", "ablate"):
         assert main(command(verb, made, "cpu")) == 130
     assert [job.device for job in taken] == ["cpu", "cpu"]
@@ -96,8 +96,10 @@ def test_the_jobs_of_a_comparison_are_given_the_word(made, monkeypatch: pytest.M
 def test_a_job_opens_its_device_where_it_runs(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = noted_words(monkeypatch)
     config = training_config("3dgs", {})
-    job = jobs.Job("3dgs", 0, Path(made["train"]), tmp_path / "job", config, jobs.Budget(None, 3), device="cpu")
-    jobs.run_job(job)
+    job = training_job.TrainingJob(
+        "3dgs", 0, Path(made["train"]), tmp_path / "job", config, training_job.Budget(None, 3), device="cpu"
+    )
+    job.run()
     assert asked == ["cpu"]
 
 
@@ -111,7 +113,7 @@ def noted_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return real(word)
 
     monkeypatch.setattr(devices, "device_of", noting)
-    monkeypatch.setattr(jobs, "device_of", noting)
+    monkeypatch.setattr(training_job, "device_of", noting)
     return words
 
 

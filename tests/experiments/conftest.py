@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neeco.experiments.jobs import Budget, Job
+from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.training.config import training_config
 
 
@@ -31,10 +31,10 @@ def capture(world, tmp_path: Path) -> Path:
 def make_job(capture: Path, tmp_path: Path):
     """Makes a short job of static 3DGS; keywords change it."""
 
-    def make(name: str = "3dgs", seed: int = 0, **changes) -> Job:
+    def make(name: str = "3dgs", seed: int = 0, **changes) -> TrainingJob:
         folder = changes.pop("folder", tmp_path / "runs" / f"{name}-seed{seed}")
         config = changes.pop("config", training_config("3dgs", {}))
         budget = changes.pop("budget", Budget(None, 12))
-        return Job(name, seed, capture, folder, config, budget, device="cpu", **changes)
+        return TrainingJob(name, seed, capture, folder, config, budget, device="cpu", **changes)
 
     return make

@@ -17,13 +17,13 @@ import torch
 from neeco import cluster
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.experiments import jobs as module
-from neeco.experiments import running
-from neeco.experiments.jobs import UNLIMITED, Budget, run_job
-from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
-from neeco.experiments.running import check_workers, run_jobs, threads_per_worker
-from neeco.experiments.watching import HeldOut
-from neeco.raster.threads import set_threads
+from neeco.experiments import study
+from neeco.experiments import training_job as module
+from neeco.experiments.machine import peak_memory_mb, reset_peak_memory, threads_per_worker
+from neeco.experiments.study import check_workers, run_jobs
+from neeco.experiments.training_job import UNLIMITED, Budget, HeldOutFrames
+from neeco.raster.native import set_threads
+from neeco.training import train as train_module
 from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
 
@@ -44,7 +44,7 @@ def curve_of(job) -> list[dict]:
 def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     job = make_job()
     told: list[tuple[str, float]] = []
-    result = run_job(job, lambda stage, share, text: told.append((stage, share)))
+    result = job.run(lambda stage, share, text: told.append((stage, share)))
     assert result == json.loads((job.folder / "job.json").read_text())
     assert result["schema"] == "neeco-job/1"
     assert (result["name"], result["method"], result["seed"], result["iterations"]) == ("3dgs", "3dgs", 0, 12)
@@ -66,16 +66,16 @@ def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
 
 
 def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = run_job(make_job())
+    first = make_job().run()
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
-    assert run_job(make_job()) == first
+    assert make_job().run() == first
 
 
 def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = run_job(make_job())
+    first = make_job().run()
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
-    again = run_job(make_job(splits=("unseen",)))
+    again = make_job(splits=("unseen",)).run()
     assert list(again["splits"]) == ["unseen"]
     assert without_times(again["splits"]["unseen"]) == without_times(first["splits"]["unseen"])
     assert again["seconds"] == first["seconds"]
@@ -86,7 +86,7 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
     stop: int, make_job, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = make_job(folder=tmp_path / "whole")
-    expected = run_job(whole)
+    expected = whole.run()
     cut = make_job(folder=tmp_path / "cut")
     step = GaussianSession.step
 
@@ -123,29 +123,29 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
 )
 def test_a_damaged_job_is_told_by_file_and_field(name: str, change: dict, told: str, make_job) -> None:
     job = make_job()
-    run_job(job)
+    job.run()
     file = job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     if name == "begun.json":
         (job.folder / "job.json").unlink()
     with pytest.raises(NeecoError, match=f"{name}: {told}.*remove that run's folder"):
-        run_job(job)
+        job.run()
 
 
 def test_a_damaged_curve_is_told_by_its_line(make_job) -> None:
     job = make_job()
-    run_job(job)
+    job.run()
     (job.folder / "job.json").unlink()
     with (job.folder / "curve.jsonl").open("a") as stream:
         stream.write("[[[")
     with pytest.raises(NeecoError, match=r"curve.jsonl: line \d+: not valid JSON"):
-        run_job(job)
+        job.run()
 
 
 def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = training_config("3dgs", {}, ["checkpoint_interval=5"])
     whole, cut = (make_job(folder=tmp_path / name, config=config) for name in ("whole", "cut"))
-    expected = run_job(whole)
+    expected = whole.run()
     step = GaussianSession.step
 
     def killed(session: GaussianSession):
@@ -156,7 +156,7 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
     with monkeypatch.context() as patched:
         patched.setattr(GaussianSession, "step", killed)
         assert "MemoryError" in run_jobs([cut])[0]["error"]
-    assert without_times(run_job(cut)) == without_times(expected)
+    assert without_times(cut.run()) == without_times(expected)
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
 
 
@@ -164,14 +164,14 @@ def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
     from neeco.training.run import load_run
 
     job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
-    result = run_job(job)
+    result = job.run()
     assert float(load_run(job.folder).scene.deformation.hinges[0].wrist_start) == float("-inf")
     assert result["splits"]["test"]["psnr"] > 5
 
 
 def test_drawing_the_curve_changes_no_bit_of_the_scene(make_job, tmp_path) -> None:
     job = make_job()
-    run_job(job)
+    job.run()
     plain = train_module.train(job.capture, tmp_path / "plain", job.train_config)
     assert (plain / "scene.safetensors").read_bytes() == (job.folder / "scene.safetensors").read_bytes()
 
@@ -180,22 +180,22 @@ def test_minutes_end_a_run_whatever_its_iterations(make_job) -> None:
     config = training_config("3dgs", {"iterations": 2})
     job = make_job(config=config, budget=Budget(0.005, None, "processor"))
     assert job.train_config.iterations == UNLIMITED
-    result = run_job(job)
+    result = job.run()
     assert result["iterations"] > 2
     assert result["processor_seconds"] == pytest.approx(0.3, abs=0.25)
 
 
 def test_time_of_drawing_the_curve_is_not_counted(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.experiments.watching import HeldOut
+    from neeco.experiments.training_job import HeldOutFrames
 
-    score = HeldOut.score
+    score = HeldOutFrames.score
 
     def slow(self, scene):
         time.sleep(0.1)
         return score(self, scene)
 
-    monkeypatch.setattr(HeldOut, "score", slow)
-    result = run_job(make_job())
+    monkeypatch.setattr(HeldOutFrames, "score", slow)
+    result = make_job().run()
     assert result["seconds"] < 1.0  # eleven drawings took 1.1 s
 
 
@@ -236,16 +236,16 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
         ({"budget": Budget(None, 13)}, "budget: this run has 12 iterations, not 13 iterations"),
         (
             {"budget": Budget(None, 12, "processor")},
-            "budget: this run has 12 iterations, not 12 iterations, processor time",
+            "budget: this run has 12 iterations, not 12 iterations, CPU time",
         ),
         (
             {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
-            "tissue_budget: this run has 20000, not 99",
+            "max_tissue_gaussians: this run has 20000, not 99",
         ),
     ],
 )
 def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, told, monkeypatch) -> None:
-    run_job(make_job())
+    make_job().run()
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
     with pytest.raises(NeecoError, match=f"{told}; give another --output"):
         run_jobs([make_job(seed=1), make_job(**changes)])
@@ -253,7 +253,7 @@ def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, t
 
 def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
     job = make_job()
-    run_job(job)
+    job.run()
     with pytest.raises(NeecoError, match="capture: this run was trained on"):
         run_jobs([replace(job, capture=tmp_path / "other")])
 
@@ -298,7 +298,7 @@ def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -
     ],
 )
 def test_workers_have_a_gpu_each(workers: int, device: str, told: str, monkeypatch) -> None:
-    monkeypatch.setattr(running, "require_ray", lambda: None)
+    monkeypatch.setattr(study, "require_ray", lambda: None)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
@@ -326,10 +326,10 @@ class FakeRay:
 def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", FakeRay())
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
-    monkeypatch.setattr(running, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
+    monkeypatch.setattr(study, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
     threads = torch.get_num_threads()
     try:
-        assert running._run_there(make_job(), 1) == {"seen": "1"}
+        assert study._run_in_worker(make_job(), 1) == {"seen": "1"}
     finally:
         set_threads(0)
         torch.set_num_threads(threads)
@@ -338,13 +338,13 @@ def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> N
 def test_gpus_are_asked_for_where_jobs_compute_on_them(make_job, monkeypatch) -> None:
     here, there = ([replace(make_job(), device=word)] for word in ("cpu", "auto"))
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cpu"))
-    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 0]
-    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cuda"))
-    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
-    monkeypatch.setattr(running, "device_of", lambda word, drawing: torch.device("cpu"))
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 0]
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cuda"))
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    monkeypatch.setattr(study, "device_of", lambda word, drawing: torch.device("cpu"))
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")  # whose machines may have what this one has not
-    assert [running._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
+    assert [study._gpus(FakeRay(), jobs) for jobs in (here, there)] == [0, 2]
 
 
 def test_workers_share_the_cores() -> None:
@@ -376,7 +376,7 @@ def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
 
 
 def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:
-    gaussians, field = (HeldOut(read_capture(capture), ("train",), field=kind) for kind in (False, True))
+    gaussians, field = (HeldOutFrames(read_capture(capture), ("train",), field=kind) for kind in (False, True))
     assert len(field.frames["train"]) < len(gaussians.frames["train"])
-    assert len(field.moments) < len(gaussians.moments)
-    assert field.moments[-1] == gaussians.moments[-1] == 1  # both end with the finished scene
+    assert len(field.shares) < len(gaussians.shares)
+    assert field.shares[-1] == gaussians.shares[-1] == 1  # both end with the finished scene

@@ -5,14 +5,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco_mask
 
-from neeco.labels.contours import (
-    bounding_box,
-    joined_polygon,
-    minimum_rectangle,
-    outer_polygons,
-    signed_area,
-    without_speckle,
-)
+from neeco.labels.annotation import bounding_box, minimum_rectangle, outer_polygons, signed_area
+from neeco.labels.drawing import without_small_components
+from neeco.synthesis.writers.yolo import joined_polygon
 
 masks = hnp.arrays(bool, st.tuples(st.integers(1, 14), st.integers(1, 14))).filter(lambda mask: mask.any())
 
@@ -104,8 +99,8 @@ def test_speckle_goes_and_large_pieces_stay():
     mask[:, 35:42] = False
     with_speck = mask.copy()
     with_speck[1, 1] = True
-    assert (without_speckle(with_speck, 0.01) == mask).all()
-    assert without_speckle(with_speck, 0.0)[1, 1]
+    assert (without_small_components(with_speck, 0.01) == mask).all()
+    assert without_small_components(with_speck, 0.0)[1, 1]
 
 
 def test_polygons_run_along_pixel_edges_and_pixels_that_touch_at_a_corner_are_two_pieces():

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from neeco.labels.composited import CLEAR_SHARES, LABEL_THRESHOLD
-from neeco.labels.edges import REACH, uncertain_edge, without_pieces
+from neeco.labels.drawing import REACH, uncertain_edge, without_components
+from neeco.labels.labellers import CLEAR_SHARES, LABEL_THRESHOLD
 
 HEIGHT, WIDTH = 120, 160
 REACH_PX = REACH * np.hypot(HEIGHT, WIDTH)  # 1.6
@@ -72,7 +72,7 @@ def test_a_dropped_piece_goes_with_what_fades_around_it_and_the_kept_one_stays()
     large, small = disc(30), disc(4, x=120)
     share = np.maximum(soft(large, width=8), soft(small, width=8))
     kept, dropped = large > 0, small > 0
-    cleaned = without_pieces(share, kept, dropped)
+    cleaned = without_components(share, kept, dropped)
     assert share[:, 105:].any()
     assert not cleaned[:, 105:].any()
     assert (cleaned[:, :100] == share[:, :100]).all()
@@ -82,10 +82,10 @@ def test_a_dropped_piece_goes_with_what_fades_around_it_and_the_kept_one_stays()
 def test_what_is_clearly_instrument_is_not_taken_with_a_dropped_piece():
     share = np.ones((HEIGHT, WIDTH), np.float32)
     kept, dropped = disc(10) > 0, disc(2, x=120) > 0
-    cleaned = without_pieces(share, kept, dropped)
+    cleaned = without_components(share, kept, dropped)
     assert ((cleaned == 0) == dropped).all()
 
 
 def test_without_dropped_pieces_the_share_is_untouched():
     share = soft(disc(30), width=8)
-    assert without_pieces(share, disc(30) > 0, np.zeros((HEIGHT, WIDTH), bool)) is share
+    assert without_components(share, disc(30) > 0, np.zeros((HEIGHT, WIDTH), bool)) is share

@@ -4,12 +4,18 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.labels.annotation import annotate, place_in_image, visibility
-from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels
 from neeco.labels.drawing import draw, draw_layers
-from neeco.labels.threshold import DeltaThresholds, ThresholdLabels, find_thresholds, otsu_of_magnitudes
+from neeco.labels.labellers import (
+    LABEL_THRESHOLD,
+    CompositedLabels,
+    DeltaThresholds,
+    ThresholdLabels,
+    find_thresholds,
+    otsu_of_magnitudes,
+)
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
-from neeco.synthesis.acceptance import UNSEEN, UNSEEN_SIDE, Acceptance
+from neeco.synthesis.generator import UNOBSERVED_SIDE, UNOBSERVED_TISSUE, Acceptance
 
 
 def labelled(scene, state, camera, labeller=None):
@@ -49,7 +55,7 @@ def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
     drawing, label = labelled(scene, tilted, camera)
     assert (drawing.parts == 1).any()
     assert 0.4 < label.visibility < 0.95
-    assert drawing.alone["rod"].mask.sum() > (drawing.parts > 0).sum()
+    assert drawing.layers["rod"].mask.sum() > (drawing.parts > 0).sum()
     assert label.keypoints["tip_left"].visibility == 1
     assert label.keypoints["shaft_near"].visibility == 2
 
@@ -60,36 +66,36 @@ def test_the_share_that_is_made_up_is_told(scene, state, camera):
     tissue = slice(0, plain.counts[0])
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[tissue] = plain.means[tissue, 0] > 0
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         halved, _ = labelled(scene, recorded, camera)
     finally:
         scene.canonical = plain
-    assert not (drawing.made_up > 0.5).any()
+    assert not (drawing.unobserved > 0.5).any()
     behind = 1 - float((drawing.parts > 0).float().mean())
-    assert float((halved.made_up > 0.5).float().mean()) == pytest.approx(behind / 2, abs=0.02)
+    assert float((halved.unobserved > 0.5).float().mean()) == pytest.approx(behind / 2, abs=0.02)
     shown = halved.parts > 0
     right = torch.arange(camera.width) > camera.width / 2 + 3
     assert bool(halved.ignored[~shown & right].all())
     assert torch.equal(halved.ignored[:, : camera.width // 2 - 3], drawing.ignored[:, : camera.width // 2 - 3])
-    assert Acceptance(0.0, None).why_refused(scene, drawing) is None
-    assert Acceptance(0.0, None).why_refused(scene, halved) == UNSEEN
+    assert Acceptance(0.0, None).refusal(scene, drawing) is None
+    assert Acceptance(0.0, None).refusal(scene, halved) == UNOBSERVED_TISSUE
 
 
 def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of_it_does(scene, camera):
     recorded, plain = scene.recorded.states[0], scene.canonical
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         for labeller in (CompositedLabels(scene), ThresholdLabels(scene)):
             drawing, _ = labelled(scene, recorded, camera, labeller)
             instrument = drawing.parts > 0
-            share = float((drawing.made_up > 0.5)[instrument].float().mean())
+            share = float((drawing.unobserved > 0.5)[instrument].float().mean())
             assert 0.5 < share < 1.0
-            assert not (drawing.made_up > 0.5)[~instrument].float().mean() > 0.02
-            assert Acceptance(0.0, None, share).why_refused(scene, drawing) is None
-            assert Acceptance(0.0, None, 0.99 * share).why_refused(scene, drawing) == UNSEEN_SIDE
+            assert not (drawing.unobserved > 0.5)[~instrument].float().mean() > 0.02
+            assert Acceptance(0.0, None, share).refusal(scene, drawing) is None
+            assert Acceptance(0.0, None, 0.99 * share).refusal(scene, drawing) == UNOBSERVED_SIDE
     finally:
         scene.canonical = plain
 
@@ -134,11 +140,11 @@ def test_the_pose_is_given_in_the_camera_frame(scene, state, camera):
 
 
 def test_visibility_counts_hidden_pixels():
-    alone, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
-    alone[:, :2] = True
+    layers, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    layers[:, :2] = True
     seen[:, 0] = True
-    assert visibility(seen, alone) == 0.5
-    assert visibility(seen & False, alone & False) == 0.0
+    assert visibility(seen, layers) == 0.5
+    assert visibility(seen & False, layers & False) == 0.0
 
 
 def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, camera):
@@ -236,8 +242,8 @@ def test_threshold_labels_share_is_the_alpha_of_what_moved(scene, state, camera)
     labeller = ThresholdLabels(scene)
     drawing, _ = labelled(scene, state(), camera, labeller)
     posed = scene.at(state())
-    alone = rasterize(posed.select(labeller.owners(state(), posed) >= 0), camera)
-    assert (drawing.share == alone.alpha).all()
+    layers = rasterize(posed.select(labeller.owners(state(), posed) >= 0), camera)
+    assert (drawing.share == layers.alpha).all()
     assert drawing.share[drawing.parts > 0].mean() > 0.7
     assert (drawing.ignored & (drawing.parts > 0)).any()
     assert (drawing.ignored & (drawing.parts == 0)).any()

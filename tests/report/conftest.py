@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from neeco.report import render
+from neeco.report import page
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -12,4 +12,4 @@ sys.path.insert(0, str(Path(__file__).parent))
 @pytest.fixture
 def noon(monkeypatch):
     """Pages are written at one fixed time."""
-    monkeypatch.setattr(render, "now", lambda: datetime(2026, 1, 1, 12, tzinfo=UTC))
+    monkeypatch.setattr(page, "now", lambda: datetime(2026, 1, 1, 12, tzinfo=UTC))

@@ -17,10 +17,9 @@ from PIL import Image
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.ingest.clocks import ClockOffset
-from neeco.ingest.moving import RoughShape
-from neeco.ingest.registration import Registration
-from neeco.ingest.result import IngestResult
+from neeco.ingest.motion import RoughShape
+from neeco.ingest.pipeline import IngestResult
+from neeco.ingest.registration import ClockOffset, Registration
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes
 from neeco.report.ingest_page import write_ingest_page
@@ -212,7 +211,7 @@ def test_frames_that_left_the_capture_after_registering_are_no_residuals_of_it(t
     count = len(read_capture(SAMPLE).frames)
     rows = np.where(np.arange(count) < 3, -1, np.arange(count))
     write_ingest_page(made(SAMPLE, registered_frames=rows), tmp_path / "page.html")
-    dots = re.search(r'class="dots" d="([^"]*)"', (tmp_path / "page.html").read_text())[1]
+    dots = re.search(r'class="dots">\s*<path d="([^"]*)"', (tmp_path / "page.html").read_text())[1]
     assert dots.count("M") == count - 3
 
 

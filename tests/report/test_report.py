@@ -12,10 +12,9 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.report import write_report
 from neeco.report.charts import Series, line_chart
-from neeco.report.figures import chosen_rows
-from neeco.report.run_page import curve, phase_starts, read_metrics
+from neeco.report.run_page import chosen_rows, curve, phase_starts, read_metrics
 
-VOID = {"meta", "img", "br", "path", "circle", "link"}
+VOID = {"meta", "img", "br", "link"}
 
 
 @pytest.fixture(scope="module")
@@ -113,14 +112,23 @@ def test_ticks_are_round_and_inside_the_range():
     assert ticks_of(23.1, 29.7) == [24, 26, 28, 30]  # the chart ends at 30.03
 
 
-def test_a_chart_has_no_ids_no_fixed_colours_and_needs_nothing_from_elsewhere(monkeypatch):
+def test_a_chart_has_no_fixed_colours_and_needs_nothing_from_elsewhere(monkeypatch):
     rows = [{"iteration": i, "loss": 1.0 - i / 20, "phase": 1 if i < 5 else 2} for i in range(10)]
     svg = curve(rows, "loss", "loss $\\frac$ \u65e5 \x01")
     assert svg.startswith('<svg viewBox="0 0 420 190" role="img" aria-label="loss $')
-    assert not re.search(r" id=|url\(|http|#[0-9a-f]{3}|font-family", svg)
+    assert not re.search(r"http|url\(|: #[0-9a-f]{3}|<style", svg)
     assert "$\\frac$ \u65e5 \ufffd" in svg
     monkeypatch.setitem(matplotlib.rcParams, "font.size", 40.0)  # the user's own settings change nothing
     assert curve(rows, "loss", "loss $\\frac$ \u65e5 \x01") == svg
+
+
+def test_charts_of_one_page_have_ids_of_their_own_and_find_what_they_refer_to():
+    charts = [line_chart(title, "x", [Series("a", 0, ((0.0, 1.0), (1.0, 2.0)), dots=((0.5, 1.0),))]) for title in "ab"]
+    defined = [re.findall(r' id="([^"]+)"', chart) for chart in charts]
+    for names, chart in zip(defined, charts, strict=True):
+        assert set(re.findall(r'href="#([^"]+)"', chart)) == set(names)
+        assert len(set(names)) == len(names) > 0
+    assert not set(defined[0]) & set(defined[1])
 
 
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(reported, world, tmp_path, noon):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers
-from neeco.synthesis.acceptance import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, buried_depth, find_tolerance
+from neeco.labels.labellers import CompositedLabels
+from neeco.synthesis.generator import ENTERS_TISSUE, LEAVES_IMAGE, Acceptance, buried_depth, find_tolerance
 
 ACCEPTANCE = Acceptance(min_share=0.005, tolerance_mm=2.0)
 
@@ -17,7 +17,7 @@ def drawn(scene, state, camera):
 def test_recorded_states_are_acceptable(scene, camera):
     for recorded in scene.recorded.states[:4]:
         drawing = drawn(scene, recorded, camera)
-        assert ACCEPTANCE.why_refused(scene, drawing) is None
+        assert ACCEPTANCE.refusal(scene, drawing) is None
 
 
 @pytest.mark.parametrize(
@@ -31,15 +31,15 @@ def test_recorded_states_are_acceptable(scene, camera):
 )
 def test_states_out_of_the_image_or_behind_the_tissue_are_refused(scene, state, camera, placed, reason):
     drawing = drawn(scene, state(**placed, jaw=0.0), camera)
-    assert ACCEPTANCE.why_refused(scene, drawing) == reason
+    assert ACCEPTANCE.refusal(scene, drawing) == reason
 
 
 def test_a_tip_in_the_tissue_is_refused_unless_the_check_is_off(scene, state, camera):
     dipping = state(z=97.0, jaw=0.8)  # the jaw turns its tips away from the camera, 7 mm deeper than the hinge
     drawing = drawn(scene, dipping, camera)
-    assert ACCEPTANCE.why_refused(scene, drawing) == ENTERS_TISSUE
-    assert Acceptance(0.005, None).why_refused(scene, drawing) is None
-    assert Acceptance(0.005, 20.0).why_refused(scene, drawing) is None
+    assert ACCEPTANCE.refusal(scene, drawing) == ENTERS_TISSUE
+    assert Acceptance(0.005, None).refusal(scene, drawing) is None
+    assert Acceptance(0.005, 20.0).refusal(scene, drawing) is None
 
 
 def test_buried_depth_is_how_far_the_tip_lies_behind_the_surface(scene, state, camera):
@@ -59,4 +59,4 @@ def test_the_tolerance_is_found_so_that_recorded_states_pass(scene, state, camer
     tolerance = find_tolerance(scene, labeller)
     assert 2.5 < tolerance < 4.5
     drawing = drawn(scene, dipping[0], camera)
-    assert Acceptance(0.005, tolerance).why_refused(scene, drawing) is None
+    assert Acceptance(0.005, tolerance).refusal(scene, drawing) is None

@@ -17,16 +17,15 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
 from neeco.report.annotated_page import write_annotated_page
 from neeco.scene import Scene
-from neeco.synthesis import trust
-from neeco.synthesis.annotated import annotate_capture
-from neeco.synthesis.trust import Usual, judge, usual_errors
+from neeco.synthesis import annotated
+from neeco.synthesis.annotated import TypicalErrors, annotate_capture, estimate_trust, typical_errors_of
 
-USUAL = Usual(0.05, 0.05)
+USUAL = TypicalErrors(0.05, 0.05)
 HIDDEN = 5  # the frame whose instrument something is held before
 
 
@@ -55,7 +54,7 @@ def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Rec
     for index in range(8):
         state = rod_state(x=2.0 * index - 7, y=3.0, jaw=0.1 * index)
         with torch.no_grad():
-            image = scene.draw(state, CAMERA).color.clamp(0, 1)
+            image = scene.render(state, CAMERA).color.clamp(0, 1)
         if index == HIDDEN:
             image[5:45, 20:60] = torch.tensor([0.1, 0.3, 0.9])
         path = root / "images" / f"{index:03d}.png"
@@ -84,8 +83,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_a_photograph_speaks_for_a_right_label_and_against_a_wrong_one(scene: Scene) -> None:
     right, wrong = layers(scene, rod_state()), layers(scene, rod_state(x=12.0))
-    assert judge(right, right.image, None, USUAL).value == 1.0
-    judged = judge(wrong, right.image, None, USUAL)
+    assert estimate_trust(right, right.image, None, USUAL).value == 1.0
+    judged = estimate_trust(wrong, right.image, None, USUAL)
     assert judged.value < 0.3
     assert judged.against > 0.7
 
@@ -95,19 +94,19 @@ def test_what_something_hides_is_no_label(scene: Scene) -> None:
     photograph, label = drawing.image.clone(), drawing.parts > 0
     photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
     hidden = float((label[:20]).sum() / label.sum())
-    judged = judge(drawing, photograph, None, USUAL)
+    judged = estimate_trust(drawing, photograph, None, USUAL)
     assert judged.against == pytest.approx(hidden, abs=0.1)
     assert judged.value < 1 - hidden + 0.1
 
 
 def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trust, "BESIDE", 0.2)  # of a very small image
+    monkeypatch.setattr(annotated, "BESIDE", 0.2)  # of a very small image
     drawing = layers(scene, rod_state())
     label = drawing.parts.clone()
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
     label[:, half:] = 0
     cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
-    judged = judge(cut, drawing.image, None, USUAL)
+    judged = estimate_trust(cut, drawing.image, None, USUAL)
     assert judged.missed > 0.2
     assert judged.value < 0.9
 
@@ -118,22 +117,22 @@ def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: Scene) -> None:
     photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
     mask = torch.ones(48, 64, dtype=torch.bool)
     mask[:23] = False  # and what the blur of the errors reaches
-    assert judge(drawing, photograph, mask, USUAL).value == 1.0
+    assert estimate_trust(drawing, photograph, mask, USUAL).value == 1.0
 
 
 def test_without_a_label_there_is_nothing_to_trust(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
     empty = replace(drawing, parts=torch.zeros_like(drawing.parts))
-    assert judge(empty, drawing.image, None, USUAL).value == 0.0
+    assert estimate_trust(empty, drawing.image, None, USUAL).value == 0.0
 
 
 def test_usual_errors_are_those_of_all_but_a_hundredth_of_the_pixels(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
     off = 0.04 * torch.rand(drawing.parts.shape, generator=torch.Generator().manual_seed(0))
     brighter = (drawing.image + off[..., None]).clamp(0, 1)
-    usual = usual_errors([(drawing, brighter, None)])
+    usual = typical_errors_of([(drawing, brighter, None)])
     assert 0.02 < usual.inside < 0.04
-    assert judge(drawing, brighter, None, usual).value > 0.95
+    assert estimate_trust(drawing, brighter, None, usual).value > 0.95
 
 
 def test_photographs_get_the_labels_that_the_scene_draws_at_fitted_poses(made: Path, recorded: RecordedRun) -> None:

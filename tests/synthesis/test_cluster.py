@@ -16,7 +16,7 @@ import pytest
 from ball_world import ball_scene, run_of
 
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 
@@ -55,7 +55,7 @@ def drawing_processes() -> list[int]:
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            if path.read_bytes().startswith(b"ray::_make_there"):
+            if path.read_bytes().startswith(b"ray::_draw_remotely"):
                 found.append(int(path.parent.name))
     return found
 

@@ -12,12 +12,11 @@ from pycocotools.coco import COCO
 from neeco.capture.statefile import state_to_json
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY
-from neeco.labels.composited import LABEL_THRESHOLD
-from neeco.synthesis import indexes
-from neeco.synthesis.acceptance import Acceptance
+from neeco.labels.labellers import LABEL_THRESHOLD
+from neeco.synthesis import dataset
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.making import Maker
-from neeco.synthesis.render import render, split_views, state_views
+from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folder
+from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
 
 COUNT = 6
@@ -50,7 +49,7 @@ def states_file(path, states) -> str:
 def test_the_folder_is_laid_out_as_promised(made):
     assert {path.name for path in made.iterdir()} == {
         ".records", "images", "masks", "soft", "ignore", "parts", "depth", "silhouettes", "coco", "yolo",
-        "states.jsonl", "dataset.json", "preview.png",
+        "states.jsonl", "dataset.json", "preview.png", "README.md",
     }  # fmt: skip
     image, mask, parts = (pixels(made / folder / "000002.png") for folder in ("images", "masks", "parts"))
     assert image.shape == (48, 64, 3)
@@ -88,7 +87,7 @@ def test_the_data_set_says_how_it_was_made(made, run):
     assert info["complete"] is True
     assert info["images"] == COUNT
     assert info["settings"]["seed"] == 3
-    assert info["settings"]["states"] == "inside"
+    assert info["settings"]["states"] == "interpolate"
     assert info["scene"] == str(run.path)
     assert [(entry["id"], entry["part"]) for entry in info["ids"]] == [(0, "tissue"), (1, "shaft"), (2, "jaw")]
 
@@ -169,13 +168,13 @@ def test_states_jsonl_draws_the_same_images_again(made, run, tmp_path):
 
 
 def test_an_image_depends_on_seed_and_index_only(made, run, tmp_path):
-    maker = Maker.of(run.scene, SETTINGS)
+    generator = SampleGenerator.of(run.scene, SETTINGS)
     for index in (4, 1):  # out of order, the others never drawn
-        maker.make(tmp_path, index)
+        draw_to_folder(generator, tmp_path, index)
         for folder in ("images", "parts", "depth"):
             name = f"{folder}/{index:06d}.png"
             assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
-    replace(maker, settings=replace(SETTINGS, seed=4)).make(tmp_path, 1)
+    draw_to_folder(replace(generator, settings=replace(SETTINGS, seed=4)), tmp_path, 1)
     assert (tmp_path / "images/000001.png").read_bytes() != (made / "images/000001.png").read_bytes()
 
 
@@ -243,7 +242,7 @@ def test_a_data_set_from_before_soft_and_ignore_gets_them_for_every_image(made, 
 def test_a_data_set_with_another_band_is_not_continued(made, run, tmp_path, monkeypatch):
     output = tmp_path / "dataset"
     shutil.copytree(made, output)
-    monkeypatch.setattr(indexes, "CLEAR_SHARES", (0.3, 0.8))
+    monkeypatch.setattr(dataset, "CLEAR_SHARES", (0.3, 0.8))
     with pytest.raises(NeecoError, match=r"ignore: begun with .*0\.5.* now .*0\.3.*; use a new folder"):
         synthesize(run, output, SETTINGS, resume=True)
     assert contents(output) == contents(made)
@@ -266,7 +265,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(run, tmp_path):
 
 @pytest.mark.parametrize(
     ("other", "field"),
-    [({"seed": 9}, "seed"), ({"states": "beyond"}, "states"), ({"labels": "threshold"}, "labels")],
+    [({"seed": 9}, "seed"), ({"states": "extrapolate"}, "states"), ({"labels": "threshold"}, "labels")],
 )
 def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, other, field):
     output = tmp_path / "dataset"
@@ -279,25 +278,27 @@ def test_a_data_set_is_not_continued_with_other_settings(made, run, tmp_path, ot
 
 def test_states_that_are_refused_are_drawn_anew_and_counted(run, tmp_path, monkeypatch):
     refusals = iter(["leaves the image", "enters the tissue", None, None])
-    monkeypatch.setattr(Acceptance, "why_refused", lambda self, scene, drawing: next(refusals))
+    monkeypatch.setattr(Acceptance, "refusal", lambda self, scene, drawing: next(refusals))
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2))
     assert summary.refused == {"leaves the image": 1, "enters the tissue": 1}
     assert json.loads((tmp_path / "dataset/dataset.json").read_text())["refused"] == summary.refused
 
 
 def test_impossible_demands_end_in_one_clear_line(run, tmp_path):
-    with pytest.raises(NeecoError, match=r"image 0: no acceptable state in 3 tries \(leaves the image: 3\)"):
-        synthesize(run, tmp_path / "dataset", replace(SETTINGS, min_share=0.9, tries=3))
+    with pytest.raises(NeecoError, match=r"image 0: no acceptable state in 3 attempts \(leaves the image: 3\)"):
+        synthesize(run, tmp_path / "dataset", replace(SETTINGS, min_share=0.9, max_attempts=3))
 
 
 def test_given_states_that_are_refused_are_skipped_and_named(run, tmp_path, state):
     given = states_file(tmp_path / "states.jsonl", [state(), state(x=200.0), state(x=3.0)])
-    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=3, states=given, tries=2))
+    summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=3, states=given, max_attempts=2))
     assert summary.skipped == [1]
     assert sorted(path.name for path in (tmp_path / "dataset/images").iterdir()) == ["000000.png", "000002.png"]
 
 
-@pytest.mark.parametrize("how", [{"states": "beyond"}, {"states": "grid"}, {"views": "orbit"}, {"views": "perturbed"}])
+@pytest.mark.parametrize(
+    "how", [{"states": "extrapolate"}, {"states": "grid"}, {"views": "orbit"}, {"views": "perturbed"}]
+)
 def test_every_sampler_makes_a_data_set(run, tmp_path, how):
     summary = synthesize(run, tmp_path / "dataset", replace(SETTINGS, count=2, **how), formats=("coco",))
     assert summary.images + len(summary.skipped) == 2
@@ -312,7 +313,7 @@ def test_threshold_labels_make_a_data_set_of_one_part(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "option"), [({"count": 0}, "--count"), ({"seed": -1}, "--seed"), ({"tries": 0}, "--tries")]
+    ("wrong", "option"), [({"count": 0}, "--count"), ({"seed": -1}, "--seed"), ({"max_attempts": 0}, "--max-attempts")]
 )
 def test_senseless_numbers_are_refused(run, tmp_path, wrong, option):
     with pytest.raises(NeecoError, match=option):

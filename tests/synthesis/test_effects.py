@@ -16,17 +16,30 @@ from rod_world import CAMERA, FakeRun, rod_state
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers
+from neeco.labels.labellers import CompositedLabels
 from neeco.scene import Scene
+from neeco.synthesis.camera_effects import (
+    EFFECTS,
+    MAX_SUBFRAMES,
+    CameraEffects,
+    MixedMotion,
+    Motion,
+    Range,
+    RecordedMotion,
+    apply_effects,
+    average_exposure,
+    image_circle,
+    linear_to_srgb,
+    read_effects,
+    srgb_to_linear,
+    subframes,
+)
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.effects import EFFECTS, CameraEffects, Range, read_effects
-from neeco.synthesis.making import Maker
-from neeco.synthesis.motion import MOST_DRAWINGS, MixedMotion, Motion, RecordedMotion, exposure
-from neeco.synthesis.optics import image_circle, mean_light, through_camera, to_light, to_stored
+from neeco.synthesis.generator import SampleGenerator
+from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.states import rigid
-from neeco.synthesis.views import moved_camera
 
 SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0)
 
@@ -42,7 +55,7 @@ def grey(value: float = 0.5) -> np.ndarray:
 
 
 def photographed(image: np.ndarray, depth: float = 100.0, seed: int = 0, **values: float) -> np.ndarray:
-    return through_camera(image, np.full(image.shape[:2], depth), values, np.random.default_rng(seed))
+    return apply_effects(image, np.full(image.shape[:2], depth), values, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -112,18 +125,18 @@ def test_an_effect_takes_its_share_of_the_images() -> None:
 
 def test_light_and_stored_image_are_inverse() -> None:
     image = np.linspace(0, 1, 300, dtype=np.float32).reshape(10, 10, 3)
-    assert np.abs(to_stored(to_light(image)) - image).max() < 1e-6
-    assert to_light(np.float32([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)  # IEC 61966-2-1
+    assert np.abs(linear_to_srgb(srgb_to_linear(image)) - image).max() < 1e-6
+    assert srgb_to_linear(np.float32([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)  # IEC 61966-2-1
 
 
 def test_without_effects_an_image_keeps_its_bits() -> None:
     image = np.random.default_rng(0).random((8, 8, 3), np.float32)
-    assert through_camera(image, np.zeros((8, 8)), {"shutter_s": 0.01}, np.random.default_rng(0)) is image
+    assert apply_effects(image, np.zeros((8, 8)), {"shutter_s": 0.01}, np.random.default_rng(0)) is image
 
 
 def test_exposure_and_white_balance_scale_light() -> None:
     brighter = photographed(grey(0.3), exposure_stops=1.0, red_gain=1.5)
-    assert to_light(brighter)[0, 0] == pytest.approx(to_light(grey(0.3))[0, 0] * [3.0, 2.0, 2.0], rel=1e-4)
+    assert srgb_to_linear(brighter)[0, 0] == pytest.approx(srgb_to_linear(grey(0.3))[0, 0] * [3.0, 2.0, 2.0], rel=1e-4)
 
 
 def test_gamma_is_an_exponent_on_the_stored_image() -> None:
@@ -131,10 +144,10 @@ def test_gamma_is_an_exponent_on_the_stored_image() -> None:
 
 
 def test_noise_has_the_deviation_asked_for() -> None:
-    noisy = to_light(photographed(grey(0.5), read_noise=0.02)) - to_light(grey(0.5))
+    noisy = srgb_to_linear(photographed(grey(0.5), read_noise=0.02)) - srgb_to_linear(grey(0.5))
     assert noisy.std() == pytest.approx(0.02, rel=0.05)
-    bright = to_light(photographed(grey(0.9), shot_noise=0.02)) - to_light(grey(0.9))
-    assert bright.std() == pytest.approx(0.02 * np.sqrt(to_light(grey(0.9))[0, 0, 0]), rel=0.05)
+    bright = srgb_to_linear(photographed(grey(0.9), shot_noise=0.02)) - srgb_to_linear(grey(0.9))
+    assert bright.std() == pytest.approx(0.02 * np.sqrt(srgb_to_linear(grey(0.9))[0, 0, 0]), rel=0.05)
     assert np.array_equal(photographed(grey(), read_noise=0.02), photographed(grey(), read_noise=0.02))
     assert not np.array_equal(photographed(grey(), read_noise=0.02), photographed(grey(), seed=1, read_noise=0.02))
 
@@ -143,22 +156,22 @@ def test_smoke_hides_what_is_far_more_than_what_is_near() -> None:
     near, far = (photographed(grey(0.1), depth, smoke=0.4, smoke_grey=0.8) for depth in (30.0, 150.0))
     assert 0.1 < near.mean() < far.mean() < 0.8
     passes = 0.6**1.5
-    expected = to_light(grey(0.1)) * passes + to_light(grey(0.8)) * (1 - passes)
-    assert to_light(far) == pytest.approx(expected, abs=1e-5)
+    expected = srgb_to_linear(grey(0.1)) * passes + srgb_to_linear(grey(0.8)) * (1 - passes)
+    assert srgb_to_linear(far) == pytest.approx(expected, abs=1e-5)
 
 
 def test_lens_blur_keeps_the_light_and_spreads_it() -> None:
     image = grey(0.0)
     image[24, 32] = 1.0
-    light = to_light(photographed(image, lens_blur_px=1.5))[..., 0]
+    light = srgb_to_linear(photographed(image, lens_blur_px=1.5))[..., 0]
     assert light.sum() == pytest.approx(1.0, rel=0.02)
     rows = np.arange(48) - 24
     assert (light.sum(1) * rows**2).sum() / light.sum() == pytest.approx(1.5**2, rel=0.05)
 
 
 def test_vignette_and_image_circle_darken_the_corners() -> None:
-    assert to_light(photographed(grey(), vignette=0.5))[0, 0, 0] == pytest.approx(
-        0.5 * to_light(grey())[0, 0, 0], rel=0.05
+    assert srgb_to_linear(photographed(grey(), vignette=0.5))[0, 0, 0] == pytest.approx(
+        0.5 * srgb_to_linear(grey())[0, 0, 0], rel=0.05
     )
     shown = photographed(grey(), field_of_view=0.6)
     assert shown[0, 0].max() == 0
@@ -209,7 +222,7 @@ def test_motion_goes_on_as_recorded(moving: Scene) -> None:
     assert motion.instruments["rod"][3:] == pytest.approx([30.0, 0, 0], abs=1e-6)
     assert motion.joints["rod"]["jaw_angle"] == pytest.approx(0.5)
     assert motion.camera == pytest.approx(np.zeros(6), abs=1e-9)
-    state, camera = motion.after(rod_state(x=2.0), CAMERA, 0.1)
+    state, camera = motion.advanced(rod_state(x=2.0), CAMERA, 0.1)
     assert state.instruments["rod"].pose[0, 3].item() == pytest.approx(5.0)
     assert torch.equal(camera.world_from_camera, CAMERA.world_from_camera)
 
@@ -217,7 +230,7 @@ def test_motion_goes_on_as_recorded(moving: Scene) -> None:
 def test_a_recording_without_times_tells_of_no_motion(run: FakeRun, tmp_path: Path) -> None:
     path = effects_file(tmp_path, "shutter_s: 0.02\n")
     with pytest.raises(NeecoError, match=r"effects.yaml: shutter_s: no two recorded frames are close enough in time"):
-        Maker.of(run.scene, replace(SETTINGS, camera_effects=path))
+        SampleGenerator.of(run.scene, replace(SETTINGS, camera_effects=path))
 
 
 def test_mixed_instruments_and_camera_move_each_as_recorded(moving: Scene) -> None:
@@ -239,18 +252,18 @@ def test_an_exposure_is_drawn_as_often_as_its_motion_needs(moving: Scene) -> Non
     still = Motion({"rod": np.zeros(6)}, {"rod": {"jaw_angle": 0.0}}, np.zeros(6))
     fast = Motion({"rod": np.array([0, 0, 0, 5e5, 0, 0.0])}, {"rod": {"jaw_angle": 0.0}}, np.zeros(6))
     slow = Motion({"rod": np.array([0, 0, 0, 400.0, 0, 0])}, {"rod": {"jaw_angle": 0.0}}, np.zeros(6))
-    counts = [len(exposure(moving, drawing, motion, 0.02)) for motion in (still, slow, fast)]
+    counts = [len(subframes(moving, drawing, motion, 0.02)) for motion in (still, slow, fast)]
     assert counts[0] == 1
     assert counts[1] in (7, 9)  # 8 mm at 70 mm and 60 px: 6.9 px
-    assert counts[2] <= MOST_DRAWINGS
+    assert counts[2] <= MAX_SUBFRAMES
 
 
 def blurred(scene: Scene, state: State, motion: Motion, shutter_s: float, count: int) -> torch.Tensor:
     """The exposure drawn `count` times."""
     labeller = CompositedLabels(scene)
     times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
-    drawings = [draw_layers(scene, labeller, *motion.after(state, CAMERA, float(t)), 0.0) for t in times]
-    return torch.from_numpy(mean_light([drawing.image.numpy() for drawing in drawings]))
+    drawings = [draw_layers(scene, labeller, *motion.advanced(state, CAMERA, float(t)), 0.0) for t in times]
+    return torch.from_numpy(average_exposure([drawing.image.numpy() for drawing in drawings]))
 
 
 @pytest.mark.parametrize(("speed", "seen"), [(60.0, 0.06), (250.0, 0.2)])
@@ -258,16 +271,16 @@ def test_motion_blur_is_the_integral_over_the_exposure(
     speed: float, seen: float, moving: Scene, tmp_path: Path
 ) -> None:
     path = effects_file(tmp_path, "shutter_s: 0.05\nsoft_masks: mean\n")
-    maker = Maker.of(moving, replace(SETTINGS, camera_effects=path))
+    generator = SampleGenerator.of(moving, replace(SETTINGS, camera_effects=path))
     motion = Motion({"rod": np.array([0, 0, 0.5, speed, 0, 0])}, {"rod": {"jaw_angle": 2.0}}, np.zeros(6))
-    maker = replace(maker, motion=lambda state, rng: motion)  # type: ignore[arg-type]
-    sharp = draw_layers(moving, maker.labeller, rod_state(), CAMERA, 0.0)
-    made = maker._photographed(sharp, {"shutter_s": 0.05}, np.random.default_rng(0))
+    generator = replace(generator, motion=lambda state, rng: motion)  # type: ignore[arg-type]
+    sharp = draw_layers(moving, generator.labeller, rod_state(), CAMERA, 0.0)
+    made = generator._through_camera(sharp, {"shutter_s": 0.05}, np.random.default_rng(0))
     exact = blurred(moving, rod_state(), motion, 0.05, 64)
     assert float((made.image - exact).abs().max()) < 0.03
     assert float((sharp.image - exact).abs().max()) > seen
     assert torch.equal(made.parts, sharp.parts)  # of the middle of the exposure
     assert float((made.share - sharp.share).abs().max()) > seen
     assert float(made.share.sum()) == pytest.approx(float(sharp.share.sum()), rel=0.05)
-    cut = maker._photographed(sharp, {"shutter_s": 0.05, "field_of_view": 0.3}, np.random.default_rng(0))
+    cut = generator._through_camera(sharp, {"shutter_s": 0.05, "field_of_view": 0.3}, np.random.default_rng(0))
     assert not bool(cut.share[torch.from_numpy(image_circle(48, 64, 0.3) <= 0.5)].any())

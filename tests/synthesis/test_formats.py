@@ -31,7 +31,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[FakeRun]:
 def made(runs: list[FakeRun], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six images of two balls."""
     output = tmp_path_factory.mktemp("made") / "dataset"
-    synthesize(runs[0], output, Settings(count=COUNT, tissue_tolerance_mm=2.0), FORMATS, casts=runs[1:])  # type: ignore[arg-type]
+    synthesize(runs[0], output, Settings(count=COUNT, tissue_tolerance_mm=2.0), FORMATS, instrument_runs=runs[1:])  # type: ignore[arg-type]
     return output
 
 
@@ -120,8 +120,8 @@ def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
 def test_a_format_can_be_added_later(made: Path, runs: list[FakeRun], tmp_path: Path) -> None:
     output = tmp_path / "set"
     settings = Settings(count=COUNT, tissue_tolerance_mm=2.0)
-    synthesize(runs[0], output, settings, ("coco",), casts=runs[1:])  # type: ignore[arg-type]
-    again = synthesize(runs[0], output, settings, FORMATS, resume=True, casts=runs[1:])  # type: ignore[arg-type]
+    synthesize(runs[0], output, settings, ("coco",), instrument_runs=runs[1:])  # type: ignore[arg-type]
+    again = synthesize(runs[0], output, settings, FORMATS, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
     assert again.made_now == 0
     for name in FORMATS:
         files = [path.relative_to(made) for path in (made / name).rglob("*") if path.is_file()]

@@ -16,14 +16,14 @@ from rod_world import CAMERA
 from neeco.capture.model import InstrumentState, State
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers
-from neeco.raster.threads import torch_threads
+from neeco.labels.labellers import CompositedLabels
+from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
 from neeco.scene import Scene
-from neeco.synthesis.acceptance import ENTERS_ANOTHER, Acceptance
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.mixing import Mixture, ground_of, tissue_depth
+from neeco.synthesis.generator import ENTERS_ANOTHER, Acceptance
+from neeco.synthesis.mixing import Mixture, tissue_depth, tissue_gaussians
 from neeco.synthesis.settings import Settings
 
 FINE = Camera(torch.eye(4, dtype=torch.float64), 240.0, 240.0, 128.0, 96.0, 256, 192)
@@ -64,14 +64,14 @@ def test_labels_and_occlusion_of_two_balls_are_those_of_geometry(near: Scene, fa
     assert bool((front & behind).any())
     assert overlap(parts == 1, front) > 0.93
     assert overlap(parts == 2, behind & ~front) > 0.9
-    assert overlap(drawing.alone["far"].mask, behind) > 0.93
+    assert overlap(drawing.layers["far"].mask, behind) > 0.93
 
 
 def test_an_instrument_stands_as_far_before_the_tissue_as_before_its_own(near: Scene) -> None:
     camera = Camera(at(500, 40, -30), 60.0, 60.0, 32.0, 24.0, 64, 48)
     tissue = ball_scene("own", [(0, 0, 50)], wall=130.0)
     mixture = Mixture.of(tissue, [near])
-    assert tissue_depth(ground_of(tissue), CAMERA, np.array([0.0, 0, 60])) == pytest.approx(130.0, rel=0.02)
+    assert tissue_depth(tissue_gaussians(tissue), CAMERA, np.array([0.0, 0, 60])) == pytest.approx(130.0, rel=0.02)
     placed = mixture.place(near, ball_state("near", -8, 0, 60), CAMERA, CAMERA)["near"].pose
     assert placed[2, 3].item() == pytest.approx(90.0, abs=2.0)  # 40 mm before the wall
     assert placed[0, 3].item() / placed[2, 3].item() == pytest.approx(-8 / 60)  # on the same line of sight
@@ -103,12 +103,12 @@ def test_the_light_is_that_of_the_tissue_and_shafts_are_matched(near: Scene) -> 
 def test_instruments_in_each_other_are_refused_but_not_those_recorded_so(near: Scene, far: Scene) -> None:
     mixed = Mixture.of(near, [near, far]).scene
     labeller = CompositedLabels(mixed)
-    casts = (frozenset({"near"}), frozenset({"far"}))
+    groups = (frozenset({"near"}), frozenset({"far"}))
     for depth, refused in ((75.0, False), (58.0, True)):
         state = State({"near": InstrumentState(at(-2, 0, 55), {}), "far": InstrumentState(at(2, 0, depth), {})}, 0.0)
         drawing = draw_layers(mixed, labeller, state, CAMERA, 0.01)
-        assert (Acceptance(0.0, None, casts=casts).why_refused(mixed, drawing) == ENTERS_ANOTHER) is refused
-        assert Acceptance(0.0, None, casts=(casts[0] | casts[1],)).why_refused(mixed, drawing) is None
+        assert (Acceptance(0.0, None, recorded_together=groups).refusal(mixed, drawing) == ENTERS_ANOTHER) is refused
+        assert Acceptance(0.0, None, recorded_together=(groups[0] | groups[1],)).refusal(mixed, drawing) is None
 
 
 def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
@@ -120,8 +120,8 @@ def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
     )
     alone, shared = tmp_path / "alone", tmp_path / "shared"
     with torch_threads(1):  # as `open_run` does
-        synthesize(tissue, alone, SETTINGS, casts=(first, second))  # type: ignore[arg-type]
-        synthesize(tissue, shared, SETTINGS, casts=(first, second), workers=2)  # type: ignore[arg-type]
+        synthesize(tissue, alone, SETTINGS, instrument_runs=(first, second))  # type: ignore[arg-type]
+        synthesize(tissue, shared, SETTINGS, instrument_runs=(first, second), workers=2)  # type: ignore[arg-type]
     files = {path.relative_to(alone) for path in alone.rglob("*") if path.is_file()}
     assert files == {path.relative_to(shared) for path in shared.rglob("*") if path.is_file()}
     assert all((alone / file).read_bytes() == (shared / file).read_bytes() for file in files)
@@ -131,7 +131,7 @@ def test_a_mixed_data_set_is_made_by_any_number_of_workers_with_the_same_bytes(
     with Image.open(alone / "parts/000000.png") as parts:
         assert set(np.unique(np.array(parts))) <= {0, 1, 2}
     with pytest.raises(NeecoError, match=r"settings.instruments_sha256: begun with"):
-        synthesize(tissue, alone, SETTINGS, casts=(second,), resume=True)  # type: ignore[arg-type]
+        synthesize(tissue, alone, SETTINGS, instrument_runs=(second,), resume=True)  # type: ignore[arg-type]
 
 
 def test_what_cannot_be_mixed_is_told(near: Scene, scene: Scene) -> None:

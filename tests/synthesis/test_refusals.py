@@ -12,12 +12,11 @@ import neeco.files
 from neeco.capture.statefile import state_to_json
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.synthesis.acceptance import Acceptance
 from neeco.synthesis.dataset import synthesize
-from neeco.synthesis.making import Maker
+from neeco.synthesis.generator import Acceptance, SampleGenerator
 from neeco.synthesis.settings import Settings
 
-SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, tries=3)
+SETTINGS = Settings(count=4, seed=3, tissue_tolerance_mm=2.0, max_attempts=3)
 
 
 def contents(folder) -> dict[str, bytes]:
@@ -27,7 +26,7 @@ def contents(folder) -> dict[str, bytes]:
 def refusing(reasons, monkeypatch) -> None:
     """Judge drawn states by `reasons` in turn; None accepts."""
     given = iter(reasons)
-    monkeypatch.setattr(Acceptance, "why_refused", lambda self, scene, drawing: next(given))
+    monkeypatch.setattr(Acceptance, "refusal", lambda self, scene, drawing: next(given))
 
 
 def behind_the_camera(state, path) -> str:
@@ -43,18 +42,18 @@ def behind_the_camera(state, path) -> str:
         ("nowhere.jsonl", "nowhere.jsonl: no such file; --states takes"),
         ("bad.jsonl", "bad.jsonl: line 1: not valid JSON"),
         ("behind.jsonl", "behind.jsonl: every state was refused .*leaves the image.*; correct its poses"),
-        ("inside", "image 0: no acceptable state in 3 tries"),
+        ("interpolate", "image 0: no acceptable state in 3 attempts"),
     ],
 )
 def test_a_refused_data_set_leaves_the_disk_as_it_was(there, resume, states, told, run, tmp_path, state, monkeypatch):
     (tmp_path / "bad.jsonl").write_text("{\n")
     behind_the_camera(state, tmp_path / "behind.jsonl")
-    if states == "inside":
+    if states == "interpolate":
         refusing(["leaves the image"] * 3, monkeypatch)
     output = tmp_path / "new" / "dataset"
     if there:
         output.mkdir(parents=True)
-    given = states if states == "inside" else str(tmp_path / states)
+    given = states if states == "interpolate" else str(tmp_path / states)
     with pytest.raises(NeecoError, match=told):
         synthesize(run, output, replace(SETTINGS, states=given), resume=resume)
     if there:
@@ -73,22 +72,22 @@ def test_images_drawn_before_a_refusal_are_kept_indexed_and_gone_on_from(run, tm
     info = json.loads((cut / "dataset.json").read_text())
     assert (info["complete"], info["images"]) == (False, 2)
     assert len((cut / "states.jsonl").read_text().splitlines()) == 2
-    assert synthesize(run, cut, replace(SETTINGS, tries=50), resume=True).made_now == 2
+    assert synthesize(run, cut, replace(SETTINGS, max_attempts=50), resume=True).made_now == 2
     assert contents(cut / "images") == contents(whole / "images")
 
 
 def test_ctrl_c_is_told_with_the_way_to_go_on(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
-    real, left = Maker.make, iter(range(2))
+    real, left = SampleGenerator.draw, iter(range(2))
 
     def stopped(*arguments):
         if next(left, None) is None:
             raise KeyboardInterrupt
         return real(*arguments)
 
-    words = ["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "4", "--tries", "50"]
+    words = ["synthesize", str(run.path), "--output", str(tmp_path / "dataset"), "--count", "4", "--max-attempts", "50"]
     with monkeypatch.context() as patched:
-        patched.setattr(Maker, "make", stopped)
+        patched.setattr(SampleGenerator, "draw", stopped)
         assert main(words) == 130
     assert capsys.readouterr().err.splitlines()[-1].endswith("run the same command again with --resume")
     assert main([*words, "--resume"]) == 0

@@ -11,19 +11,18 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.capture.statefile import read_states, state_to_json
 from neeco.errors import NeecoError
-from neeco.synthesis.samplers import instrument_axes, make_sampler
+from neeco.synthesis.samplers import SIMILAR, OrbitViews, PerturbedViews, RecordedViews, instrument_axes, make_sampler
 from neeco.synthesis.states import (
-    AlongPath,
-    Beyond,
-    Grid,
-    Inside,
+    ExtrapolatedStates,
+    GridStates,
+    InterpolatedStates,
     JointRange,
+    PathStates,
     interpolate_pose,
     rigid,
     turn_about,
     with_poses,
 )
-from neeco.synthesis.views import SIMILAR, OrbitViews, PerturbedViews, RecordedViews
 
 
 def rng_of(index: int) -> np.random.Generator:
@@ -53,7 +52,7 @@ def test_a_pose_between_two_is_rigid_and_reaches_both(seed, weight):
 
 
 def test_inside_stays_inside_the_recorded_range_and_is_not_a_recorded_state(scene):
-    sampler = Inside(scene.recorded.states)
+    sampler = InterpolatedStates(scene.recorded.states)
     recorded = np.stack([s.instruments["rod"].pose[:3, 3].numpy() for s in scene.recorded.states])
     drawn = [sampler(k, rng_of(k)).instruments["rod"] for k in range(60)]
     positions = np.stack([d.pose[:3, 3].numpy() for d in drawn])
@@ -65,18 +64,19 @@ def test_inside_stays_inside_the_recorded_range_and_is_not_a_recorded_state(scen
 
 
 def test_beyond_leaves_the_recorded_range_by_at_most_the_margin_and_obeys_limits(scene):
-    sampler = Beyond(scene.recorded.states, (Instrument("rod", {"jaw_angle": (0.0, 0.9)}),), margin=0.5)
+    sampler = ExtrapolatedStates(scene.recorded.states, (Instrument("rod", {"jaw_angle": (0.0, 0.9)}),), margin=0.5)
     jaws = [sampler(k, rng_of(k)).instruments["rod"].joints["jaw_angle"] for k in range(200)]
     assert min(jaws) >= 0.0  # the limit; the margin alone would allow -0.4
     assert 0.82 < max(jaws) <= 0.9
-    free = Beyond(scene.recorded.states, (Instrument("rod", {"jaw_angle": None}),), margin=0.5)
+    free = ExtrapolatedStates(scene.recorded.states, (Instrument("rod", {"jaw_angle": None}),), margin=0.5)
     jaws = [free(k, rng_of(k)).instruments["rod"].joints["jaw_angle"] for k in range(200)]
     assert 0.0 <= min(jaws) < 0.1  # recorded from 0 on
     assert 1.0 < max(jaws) <= 1.2
 
 
 def test_beyond_moves_poses_farther_from_the_mean(scene):
-    inside, beyond = Inside(scene.recorded.states), Beyond(scene.recorded.states, scene.instruments, 0.5)
+    inside = InterpolatedStates(scene.recorded.states)
+    beyond = ExtrapolatedStates(scene.recorded.states, scene.instruments, 0.5)
     mean = inside.means["rod"][:3, 3]
 
     def reach(sampler):
@@ -88,7 +88,7 @@ def test_beyond_moves_poses_farther_from_the_mean(scene):
 
 def test_a_margin_of_nothing_is_refused(scene):
     with pytest.raises(NeecoError, match="--margin"):
-        Beyond(scene.recorded.states, scene.instruments, 0.0)
+        ExtrapolatedStates(scene.recorded.states, scene.instruments, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_limits_narrower_than_the_recording_do_not_cut_into_it():
 def test_the_grid_holds_every_joint_value_with_every_roll_about_the_shaft(scene):
     axes = instrument_axes(scene)
     assert np.allclose(axes["rod"][1], [0, 1, 0])
-    sampler = Grid(scene.recorded.states, axes, joint_values=3, rolls=4)
+    sampler = GridStates(scene.recorded.states, axes, joint_values=3, rolls=4)
     states = [sampler(k, rng_of(k)).instruments["rod"] for k in range(12)]
     assert {round(s.joints["jaw_angle"], 6) for s in states} == {0.0, 0.4, 0.8}
     shafts = np.stack([s.pose[:3, 1].numpy() for s in states])
@@ -124,12 +124,12 @@ def test_the_grid_holds_every_joint_value_with_every_roll_about_the_shaft(scene)
 
 def test_a_path_passes_through_its_key_states(state):
     keys = [state(x=0.0, jaw=0.0), state(x=10.0, jaw=0.4), state(x=10.0, y=5.0, jaw=0.8)]
-    path = AlongPath(keys, count=5)
+    path = PathStates(keys, count=5)
     drawn = [path(k, rng_of(k)).instruments["rod"] for k in range(5)]
     assert [d.joints["jaw_angle"] for d in drawn] == pytest.approx([0, 0.2, 0.4, 0.6, 0.8])
     assert drawn[1].pose[0, 3] == pytest.approx(5.0)
     with pytest.raises(NeecoError, match="two"):
-        AlongPath(keys[:1], 5)
+        PathStates(keys[:1], 5)
 
 
 def test_states_written_are_states_read(tmp_path, scene, state):
@@ -175,8 +175,8 @@ def test_a_bad_state_is_refused_with_its_line_and_field(tmp_path, scene, state, 
 
 
 def test_a_misspelt_sampler_is_refused_by_name(scene):
-    with pytest.raises(NeecoError, match="'insid' is neither inside, beyond"):
-        make_sampler(scene, "insid", 0.2, "recorded", 1)
+    with pytest.raises(NeecoError, match="'interpol' is neither interpolate, extrapolate"):
+        make_sampler(scene, "interpol", 0.2, "recorded", 1)
 
 
 def test_an_orbit_keeps_its_centre_at_its_place_and_distance(camera):
@@ -226,7 +226,7 @@ def test_without_like_states_any_recorded_camera_may_see_a_state(camera):
 
 @pytest.mark.parametrize("states", ["", "path:", "."])
 def test_a_folder_is_no_file_of_states(scene, states):
-    with pytest.raises(NeecoError, match=f"--states: '{states}' is neither inside, beyond"):
+    with pytest.raises(NeecoError, match=f"--states: '{states}' is neither interpolate, extrapolate"):
         make_sampler(scene, states, 0.2, "recorded", 1)
 
 

@@ -7,12 +7,11 @@ from rod_world import CAMERA
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.labels.annotation import annotate
-from neeco.labels.composited import LABEL_THRESHOLD, CompositedLabels
 from neeco.labels.drawing import draw_layers
-from neeco.labels.threshold import ThresholdLabels
+from neeco.labels.labellers import LABEL_THRESHOLD, CompositedLabels, ThresholdLabels
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
-from neeco.synthesis.states import Inside
+from neeco.synthesis.states import InterpolatedStates
 
 WALL, BAR = 300, 40
 
@@ -74,7 +73,7 @@ def test_the_instrument_in_front_hides_the_other(bars, camera, front, state):
     assert labels[front].visibility > 0.97
     assert 0.6 < labels[back].visibility < 0.95
     assert len(labels[back].shape.polygons) == 2  # cut in two by the one in front
-    assert labels[back].shape.area < drawing.alone[back].mask.sum()
+    assert labels[back].shape.area < drawing.layers[back].mask.sum()
 
 
 def test_where_one_instrument_meets_another_all_is_instrument_and_no_edge(bars, camera):
@@ -124,7 +123,7 @@ def test_threshold_labels_tell_instruments_apart_by_nearness(bars, camera):
 
 
 def test_bodies_sampled_together_are_moved_together(bars):
-    sampler = Inside([at(60, 70), at(60, 70), at(61, 71)])
+    sampler = InterpolatedStates([at(60, 70), at(60, 70), at(61, 71)])
     for index in range(10):
         state = sampler(index, np.random.default_rng(index))
         gap = state.instruments["level"].pose[2, 3] - state.instruments["upright"].pose[2, 3]

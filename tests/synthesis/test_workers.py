@@ -11,7 +11,7 @@ import pytest
 from ball_world import ball_scene, run_of
 
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.synthesis import workers
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
@@ -37,41 +37,41 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
-    hired = []
-    real = workers._Crew.hire
+    started = []
+    real = workers._Pool.start_worker
 
-    def hire(crew) -> None:
-        real(crew)
-        hired.append(crew.members[-1])
+    def start(pool) -> None:
+        real(pool)
+        started.append(pool.workers[-1])
 
     def kill_the_first(done: int) -> None:
         if done == 2:
-            os.kill(hired[0].process.pid, signal.SIGKILL)
+            os.kill(started[0].process.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(workers._Crew, "hire", hire)
+    monkeypatch.setattr(workers._Pool, "start_worker", start)
     with torch_threads(1):
         made = synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=kill_the_first, workers=2)
-    assert len(hired) == 3
+    assert len(started) == 3
     assert made.images == 10
     assert contents(tmp_path / "set") == contents(alone)
 
 
 def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp_path: Path, monkeypatch) -> None:
-    hired = []
-    real = workers._Crew.hire
+    started = []
+    real = workers._Pool.start_worker
 
-    def hire(crew) -> None:
-        real(crew)
-        hired.append(crew.members[-1].process)
+    def start(pool) -> None:
+        real(pool)
+        started.append(pool.workers[-1].process)
 
     def interrupt(done: int) -> None:
         if done == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(workers._Crew, "hire", hire)
+    monkeypatch.setattr(workers._Pool, "start_worker", start)
     with torch_threads(1), pytest.raises(KeyboardInterrupt):
         synthesize(ball_run, tmp_path / "set", SETTINGS, on_progress=interrupt, workers=2)
-    assert not any(process.is_alive() for process in hired)
+    assert not any(process.is_alive() for process in started)
     with torch_threads(1):
         resumed = synthesize(ball_run, tmp_path / "set", SETTINGS, resume=True, workers=2)
     assert resumed.made_now <= 7
@@ -79,21 +79,21 @@ def test_interrupted_it_stops_its_workers_and_goes_on(ball_run, alone: Path, tmp
 
 
 def test_what_a_worker_meets_is_told_in_a_line(ball_run, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, min_share=0.9, tries=2)
-    with torch_threads(1), pytest.raises(NeecoError, match=r"image \d: no acceptable state in 2 tries") as error:
+    settings = replace(SETTINGS, min_share=0.9, max_attempts=2)
+    with torch_threads(1), pytest.raises(NeecoError, match=r"image \d: no acceptable state in 2 attempts") as error:
         synthesize(ball_run, tmp_path / "set", settings, workers=2)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "set").exists()
 
 
 def test_workers_that_keep_dying_end_it(ball_run, tmp_path: Path, monkeypatch) -> None:
-    real = workers._Crew.hire
+    real = workers._Pool.start_worker
 
-    def hire(crew) -> None:
-        real(crew)
-        os.kill(crew.members[-1].process.pid, signal.SIGKILL)
+    def start(pool) -> None:
+        real(pool)
+        os.kill(pool.workers[-1].process.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(workers._Crew, "hire", hire)
+    monkeypatch.setattr(workers._Pool, "start_worker", start)
     with pytest.raises(NeecoError, match=r"--workers: 3 processes died over image 0 \(exit status -9\)"):
         synthesize(ball_run, tmp_path / "set", replace(SETTINGS, count=2), workers=2)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.scene.hinges import Hinges
+from neeco.scene.instruments import Hinges
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import SearchConfig, training_config
 from neeco.training.initial import gaussian_session, initial_scene

@@ -108,7 +108,7 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
         with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not as neeco writes it"):
             load_run(run)
 
-    for line in ("minutes: -0.0", "iterations: 0", "views_per_step: 0", "seed: -1"):
+    for line in ("minutes: -0.0", "iterations: 0", "batch_size: 0", "seed: -1"):
         (run / "config.yaml").write_text(config + line + "\n")
         with pytest.raises(
             NeecoError, match=rf"config.yaml: --{line.partition(':')[0].replace('_', '-')}: .*; train again"

@@ -13,9 +13,9 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.hinges import PART_LOGITS, Hinges
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
-from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import SearchConfig, TrainConfig

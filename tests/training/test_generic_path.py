@@ -22,7 +22,12 @@ STEPS = 200
 SMALL = {
     "neeco": ["deformation.depth=3", "deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
-    "4dgs": ["deformation.resolution=8", "deformation.channels=4", "deformation.moments=5", "deformation.width=16"],
+    "4dgs": [
+        "deformation.resolution=8",
+        "deformation.channels=4",
+        "deformation.time_resolution=5",
+        "deformation.width=16",
+    ],
     "nerfies": ["deformation.rays=32", "deformation.coarse_samples=8", "deformation.width=16"],
 }
 

@@ -14,8 +14,6 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.scene.deformations import kinematic
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
@@ -36,15 +34,11 @@ EARLY = [
     "deformation.shaft_roll_start=5",
     "search.tissue_steps=100",
     "log_interval=1",
+    "deformation.hinge_start=12",
+    "deformation.shadow_at=[10]",
+    "deformation.label_sharpness_start=14",
 ]
 CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Kinematic, "learns_from", 12)
-    monkeypatch.setattr(kinematic, "SHADOW_AT", (10,))
-    monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.nerfies.scene import NerfScene
+from neeco.scene.nerfies.field import NerfScene
 from neeco.training.config import training_config, variant_config
 from neeco.training.train import ProgressRow, train
 
@@ -91,7 +91,7 @@ def test_a_scene_comes_back_from_disk_to_the_bit_and_damage_is_told(run: Path, t
     assert copy.read_bytes() == (run / "scene.safetensors").read_bytes()
     again = load_scene(copy)
     state, camera = scene.recorded.states[0], scene.recorded.cameras[0]
-    assert torch.equal(again.draw(state, camera).color, scene.draw(state, camera).color)
+    assert torch.equal(again.render(state, camera).color, scene.render(state, camera).color)
     header = {"neeco": json.dumps(header_of(copy))}
     for name, broken in (("module.codes", torch.zeros(2, 8)), ("module.scale", torch.tensor(float("nan")))):
         save_file(load_file(copy) | {name: broken}, tmp_path / "bad.safetensors", header)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.scene import training_views as module
-from neeco.scene.nerfies.rays import RayTable
+from neeco.scene.nerfies.session import RayTable
 from neeco.scene.training_views import PixelPrefetcher, TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import gaussian_session

@@ -16,8 +16,7 @@ from viewer_world import HEIGHT, WIDTH
 
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw
-from neeco.synthesis.samplers import make_sampler
-from neeco.synthesis.views import moved_camera
+from neeco.synthesis.samplers import make_sampler, moved_camera
 from neeco.synthesis.writers.folder import PIXELS, load_record
 from neeco.viewer.keeping import Keeper
 from neeco.viewer.source import Loaded, Source

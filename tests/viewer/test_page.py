@@ -17,10 +17,10 @@ from scene_worlds import GRASPER, grasper_state, make_scene, pose_of
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
 from neeco.viewer.export import page_of
 from neeco.viewer.packed import pack
@@ -135,7 +135,7 @@ def decibels(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = No
 @torch.no_grad()
 def agree(page: Page, scene: Scene, state: State, camera: Camera, frame: float | None) -> None:
     """What the page shows is what the scene draws: 50 dB, label ids in 99.9 % of pixels, depth within quantisation."""
-    truth = scene.draw(state, camera, labels=True)
+    truth = scene.render(state, camera, labels=True)
     parts = composited_parts(truth, threshold_of(scene)).numpy()
     shown = truth.color.clamp(0, 1).numpy()
     assert (parts > 0).sum() > 50
@@ -159,7 +159,7 @@ def test_without_its_shadows_it_would_not(page: Page, scene: Scene) -> None:
     scene.shadow_strengths.zero_()
     try:
         with torch.no_grad():
-            bare = scene.draw(scene.recorded.states[3], scene.recorded.cameras[3]).color.clamp(0, 1).numpy()
+            bare = scene.render(scene.recorded.states[3], scene.recorded.cameras[3]).color.clamp(0, 1).numpy()
     finally:
         scene.shadow_strengths.copy_(strengths)
     assert decibels(page.drawn(3)[0], bare) < 40
@@ -230,7 +230,7 @@ def test_saved_image_and_mask_are_of_the_recorded_size(page: Page, scene: Scene,
         with page.page.expect_download() as waiting:
             page.page.get_by_role("button", name=f"save {name}").click()
         waiting.value.save_as(tmp_path / f"{name}.png")
-    truth = scene.draw(scene.recorded.states[0], scene.recorded.cameras[0], labels=True)
+    truth = scene.render(scene.recorded.states[0], scene.recorded.cameras[0], labels=True)
     parts = composited_parts(truth, threshold_of(scene)).numpy()
     image = np.asarray(Image.open(tmp_path / "image.png").convert("RGB")) / 255
     assert decibels(image, truth.color.clamp(0, 1).numpy()) > 50

@@ -90,7 +90,7 @@ def decibels(image: Tensor, truth: Tensor) -> float:
 @torch.no_grad()
 def test_drawn_again_from_the_file_it_looks_as_the_scene_does_from_that_camera() -> None:
     scene = lit_scene()
-    truth = scene.draw(STATE, CAMERA).color
+    truth = scene.render(STATE, CAMERA).color
     splats = splats_of(scene, STATE, CAMERA)
     assert float(truth.std()) > 0.05
     assert decibels(rasterize(gaussians_of_ply(ply_bytes(splats)), CAMERA).color, truth) > 60
@@ -102,19 +102,19 @@ def test_what_is_baked_matters() -> None:
     scene = lit_scene()
     drawn = rasterize(gaussians_of_ply(ply_bytes(splats_of(scene, STATE, CAMERA))), CAMERA).color
     scene.sh_degree = 0
-    assert decibels(scene.draw(STATE, CAMERA).color, drawn) < 40  # the harmonics
+    assert decibels(scene.render(STATE, CAMERA).color, drawn) < 40  # the harmonics
     scene.sh_degree = 2
     scene.falloff.zero_()
-    assert decibels(scene.draw(STATE, CAMERA).color, drawn) < 40
+    assert decibels(scene.render(STATE, CAMERA).color, drawn) < 40
     other = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), -0.3)
-    assert decibels(lit_scene().draw(other, CAMERA).color, drawn) < 40
+    assert decibels(lit_scene().render(other, CAMERA).color, drawn) < 40
 
 
 def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None:
     scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
     state, camera = standing(scene, 0, None)
     splats = splats_of(scene, state, camera)
-    truth = scene.draw(state, camera).color
+    truth = scene.render(state, camera).color
     small, large = spz_bytes(splats), ply_bytes(splats)
     assert (small, large) == (spz_bytes(splats), ply_bytes(splats))
     assert len(small) < len(large) / 5

@@ -135,7 +135,7 @@ def test_every_method_is_steered_to_a_state_it_can_draw(method: str) -> None:
     wishes = Wishes(2.5, {item.name: Steered({"jaw_angle": 0.5}, 2.0, 0.1, 0.2, 0.3) for item in scene.instruments})
     state = steered_state(scene.recorded.states, shafts, wishes)
     with torch.no_grad():
-        assert torch.isfinite(scene.draw(state, scene.recorded.cameras[0]).color).all()
+        assert torch.isfinite(scene.render(state, scene.recorded.cameras[0]).color).all()
     assert set(shafts) == {item.name for item in scene.instruments}
 
 

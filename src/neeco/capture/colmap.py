@@ -1,6 +1,6 @@
 """Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
 
-Ours beside pycolmap on purpose: captures are read without it, damage becomes one line, and poses stay the same bits.
+Not by pycolmap, which an installation may lack and which ends in a traceback for damaged files.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from neeco.capture.documents import Parsed, Place, ProblemReport, inside, printable, relative_name
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.parsed import Parsed, Place, inside, relative_name
-from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.raster.rotations import quat_to_matrix
 from neeco.raster.types import Camera
 
 _MODELS = {
@@ -63,19 +63,19 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     """
     parsed = Parsed(root, timed=False)
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
-    binary = suffix == ".bin"
+    parse_cameras, parse_images, parse_points = _PARSERS[suffix]
     try:
-        cameras = _parse(model / f"cameras{suffix}", _cameras_binary if binary else _cameras_text)
-        images = _parse(model / f"images{suffix}", _images_binary if binary else _images_text)
+        cameras = _parse(model / f"cameras{suffix}", parse_cameras)
+        images = _parse(model / f"images{suffix}", parse_images)
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _add_points(model / f"points3D{suffix}", binary, parsed, report)
+    _add_points(model / f"points3D{suffix}", parse_points, parsed, report)
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
-        place = Place(file, shown(image.name))
+        place = Place(file, printable(image.name))
         frame = _frame(image, cameras, root, order, place, report)
         if frame is not None:
             parsed.frames.append(frame)
@@ -83,10 +83,12 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     return parsed
 
 
-def _add_points(path: Path, binary: bool, parsed: Parsed, report: ProblemReport) -> None:
+def _add_points(
+    path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
+) -> None:
     parsed.points_place = Place(relative_name(path, parsed.root), "")
     try:
-        rows = _parse(path, _points_binary if binary else _points_text)
+        rows = _parse(path, parse)
     except NeecoError as error:
         report.error(parsed.points_place.file, "", str(error).removeprefix(f"{path}: "))
         return
@@ -101,13 +103,11 @@ def _add_points(path: Path, binary: bool, parsed: Parsed, report: ProblemReport)
 def _frame(
     image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: ProblemReport
 ) -> Frame | None:
-    intrinsics = cameras.get(image.camera_id)
+    intrinsics, pose = cameras.get(image.camera_id), _world_from_camera(image)
     if intrinsics is None:
-        report.error(
-            place.file, place.field, f"uses camera {image.camera_id}, which the model lacks", "export it again"
-        )
+        message = f"uses camera {image.camera_id}, which the model lacks"
+        report.error(place.file, place.field, message, "export it again")
         return None
-    pose = _world_from_camera(image)
     if pose is None:
         report.error(place.file, place.field, "its pose is not a finite unit quaternion and translation", "drop it")
         return None
@@ -115,7 +115,7 @@ def _frame(
         focal = _pinhole(intrinsics)
         path = inside(root, root / "images", image.name)
     except NeecoError as error:
-        report.refused(place.file, place.field, error)
+        report.error_from(place.file, place.field, error)
         return None
     if not path.is_file():
         report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
@@ -150,14 +150,7 @@ def _world_from_camera(image: _Image) -> np.ndarray | None:
     norm = np.linalg.norm(quaternion)
     if not 0.99 < norm < 1.01:
         return None
-    w, x, y, z = quaternion / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ translation
@@ -174,7 +167,7 @@ def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
 
 
 class _Stream:
-    """Little-endian values out of bytes, one after the other."""
+    """Little-endian values of a binary file, one after the other."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.offset = content, 0
@@ -236,7 +229,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
     for line in _lines(content):
         if line.strip():
             camera_id, model, width, height, *params = line.split()
-            expected = {name: count for name, count in _MODELS.values()}.get(model, len(params))
+            expected = dict(_MODELS.values()).get(model, len(params))
             if len(params) != expected:
                 raise ValueError("parameters missing")
             cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
@@ -262,3 +255,9 @@ def _points_text(content: bytes) -> list[tuple[float, ...]]:
     if any(len(row) != 6 for row in rows):
         raise ValueError("columns missing")
     return rows
+
+
+_PARSERS = {
+    ".bin": (_cameras_binary, _images_binary, _points_binary),
+    ".txt": (_cameras_text, _images_text, _points_text),
+}

@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.capture.documents import Node, Parsed, Place, ProblemReport, inside, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.nodes import Node
-from neeco.capture.parsed import Parsed, Place, inside
 from neeco.capture.points import random_points
-from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
@@ -73,7 +71,7 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
         parsed.places.append(Place(POSES_FILE, f"[{order}]"))
     usable = [row for row in rows if row is not None]
     parsed.points = _points(usable)
-    _say_what_is_missing(root, usable, report)
+    _warn_of_limits(root, usable, report)
     return parsed
 
 
@@ -88,7 +86,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
         try:
             paths.append(inside(root, root / folder, path.name))
         except NeecoError as error:
-            report.refused(f"{folder}/{path.name}", "", error)
+            report.error_from(f"{folder}/{path.name}", "", error)
     return paths
 
 
@@ -96,11 +94,11 @@ def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
     """The table [N, 17] as float64."""
     remedy = "write an array of N x 17 numbers with numpy.save"
     try:
-        # mapped, so that a lying header cannot make us allocate more than the file holds
-        with warnings.catch_warnings(action="ignore"):  # that Python 2 wrote it, which is no matter
+        # mapped, so that a wrong header cannot make us allocate more than the file holds
+        with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
             table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
     except NeecoError as error:
-        report.refused(POSES_FILE, "", error)
+        report.error_from(POSES_FILE, "", error)
         return None
     except Exception:  # damaged headers make numpy raise nearly anything
         report.error(POSES_FILE, "", "is damaged or not an array of plain numbers", remedy)
@@ -109,7 +107,7 @@ def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
         report.error(POSES_FILE, "", "is not an array of plain numbers", remedy)
         return None
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
-        report.error(POSES_FILE, "", f"has shape {shown(table.shape)}, expected N x {COLUMNS}", remedy)
+        report.error(POSES_FILE, "", f"has shape {printable(table.shape)}, expected N x {COLUMNS}", remedy)
         return None
     return np.array(table, dtype=np.float64)
 
@@ -144,10 +142,9 @@ def _points(rows: list[_Row]) -> PointCloud | None:
     return random_points(centers.mean(axis=0), max(half_width, half_depth))
 
 
-def _say_what_is_missing(root: Path, rows: list[_Row], report: ProblemReport) -> None:
-    report.warning(
-        POSES_FILE, "instruments", "no instrument states", "only methods that need none can be trained, such as 3dgs"
-    )
+def _warn_of_limits(root: Path, rows: list[_Row], report: ProblemReport) -> None:
+    remedy = "only methods that need none can be trained, such as 3dgs"
+    report.warning(POSES_FILE, "instruments", "no instrument states", remedy)
     report.warning(POSES_FILE, "units", "names no unit of length", "lengths are taken as mm: distances may be off")
     poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
     if len(poses) > 1 and np.ptp(poses, axis=0).max() < STILL:
@@ -159,7 +156,9 @@ def _say_what_is_missing(root: Path, rows: list[_Row], report: ProblemReport) ->
         report.warning(POSES_FILE, "poses", message, remedy)
     if (root / MASKS).is_dir():
         message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
-        remedy = f"`neeco ingest {shown(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
+        remedy = (
+            f"`neeco ingest {printable(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
+        )
         report.warning(f"{MASKS}/", "", message, remedy)
     if (root / "depth").is_dir():
         report.warning("depth/", "", "depth maps are not read", "training starts from random points")

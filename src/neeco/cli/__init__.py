@@ -42,6 +42,9 @@ RENAMED = {
     ("train", "--views-per-step"): "--batch-size",
     ("train", "--tissue-budget"): "--max-tissue-gaussians",
     ("train", "--instrument-budget"): "--max-instrument-gaussians",
+    ("synthesize", "--speckle"): "--min-component",
+    ("synthesize", "--max-unseen"): "--max-unobserved",
+    ("synthesize", "--tries"): "--max-attempts",
     ("compare", "--processor-minutes"): "--cpu-minutes",
     ("downstream", "--pick"): "--frame-selection",
     ("downstream", "--real"): "--num-real",
@@ -113,11 +116,11 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
-    from neeco.raster.devices import failures_told
-    from neeco.raster.threads import keep_freed_memory
+    from neeco.raster.devices import readable_failures
+    from neeco.raster.native import keep_freed_memory
 
     keep_freed_memory()
-    with failures_told():
+    with readable_failures():
         return run(parsed)
 
 

@@ -17,7 +17,7 @@ from neeco.raster.devices import device_failure
 if TYPE_CHECKING:
     import torch
 
-    from neeco.experiments.work import JobNews
+    from neeco.experiments.study import JobEvent
     from neeco.training.config import TrainConfig
     from neeco.training.train import ProgressRow
 
@@ -66,7 +66,7 @@ class Bars:
         if title in self.tasks:
             self.bar.update(self.tasks[title], completed=1.0)
 
-    def job(self, news: JobNews) -> None:
+    def job(self, news: JobEvent) -> None:
         """Progress of `run_jobs`."""
         title = f"{news.index + 1}/{news.total} {news.job.title}"
         task = self._task(title)

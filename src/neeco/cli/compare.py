@@ -14,7 +14,7 @@ from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
     from neeco.experiments.comparison import ComparisonSpec
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,8 @@ class Compare:
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.comparison import compare, failures, plan_comparison
-    from neeco.experiments.comparison_tables import absent_notes, budget_words, tables_of
-    from neeco.report.comparison_page import write_comparison_report
+    from neeco.experiments.comparison import absent_notes, budget_words, compare, failures, plan_comparison, tables_of
+    from neeco.report.study_pages import write_comparison_report
 
     with Bars() as bars:
         plan = plan_comparison(_spec(args))
@@ -95,7 +94,7 @@ def _spec(args: Compare) -> ComparisonSpec:
 
 def _budget(args: Compare) -> Budget:
     from neeco.errors import NeecoError
-    from neeco.experiments.jobs import Budget
+    from neeco.experiments.training_job import Budget
 
     options = {
         "--minutes": args.minutes,

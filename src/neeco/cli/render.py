@@ -31,7 +31,7 @@ def run(arguments: Arguments) -> int:
     """Draw, and say where it lies."""
     from neeco.cli._progress import counting
     from neeco.raster.devices import device_of
-    from neeco.synthesis.render import STATES_FOLDER, render, split_views, state_views
+    from neeco.synthesis.rendered_views import STATES_FOLDER, render, split_views, state_views
     from neeco.training.run import open_run
 
     with open_run(arguments.run, device_of(arguments.device)) as trained:

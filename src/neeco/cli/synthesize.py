@@ -45,10 +45,10 @@ def run(arguments: Arguments) -> int:
 
     settings = arguments.settings
     settings.check()
-    drawn, casts = _runs(arguments)
+    drawn, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
     with open_run(drawn, device) as trained, counting("synthesize", settings.count) as advance:
-        others = [load_run(cast, device) for cast in casts]
+        others = [load_run(cast, device) for cast in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,
@@ -58,7 +58,7 @@ def run(arguments: Arguments) -> int:
                 arguments.resume,
                 on_progress=advance,
                 workers=arguments.workers,
-                casts=others,
+                instrument_runs=others,
             )
     print(f"{summary.images} images in {summary.output} ({summary.made_now} drawn now); look at preview.png")
     for reason, times in summary.refused.items():

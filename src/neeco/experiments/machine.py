@@ -1,28 +1,40 @@
-"""The machine that numbers were taken on, in words, and how much of its memory a piece of work takes at most."""
+"""The machine that numbers are taken on: what it is, how much memory a piece of work takes, how fast runs draw."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
 import platform
-from collections.abc import Mapping
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from neeco.capture.model import Capture, Frame
 from neeco.raster.devices import cuda_backend
-from neeco.raster.threads import simd, threads
+from neeco.raster.native import simd, synchronise, threads
+from neeco.training.run import Run
 
 STATUS = Path("/proc/self/status")
 CLEAR = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"  # proc(5): resets the high-water mark of the resident memory
 
+WARM_UP = 3  # images drawn before any is timed
+ROUNDS = 3  # every run is drawn in turn, so often: a slow moment of the machine meets them all
+DRAWS = 7  # timed per run and round
+PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer images
 
-def machine(device: torch.device) -> dict[str, Any]:
-    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one."""
+
+def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
+    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one; of a study also its
+    `workers`, and the threads that each of several has."""
     on_gpu = device.type == "cuda"
+    share = threads_per_worker(workers) if workers is not None and workers > 1 else None
     return {
         "cpu": processor_name(),
         "cores": usable_cores(),
@@ -33,13 +45,25 @@ def machine(device: torch.device) -> dict[str, Any]:
         "torch": torch.__version__,
         "backend": f"{cuda_backend()} (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
         "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
-    }
+    } | ({} if workers is None else {"workers": workers, "threads_per_worker": share})
 
 
 def hardware_words(machine: Mapping[str, Any]) -> str:
-    """What computed, of what `machine` told: the GPU, if it was one, and the processor."""
+    """What computed, of what `machine` returned: the GPU, if it was one, and the processor."""
     gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
     return f"{gpu}{machine['cpu']}, {machine['cores']} cores"
+
+
+def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
+    """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
+    count = machine["threads_per_worker"] or machine[threads]
+    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
+    return f"{hardware_words(machine)}, {count} thread{'s' if count > 1 else ''}{workers}, torch {machine['torch']}"
+
+
+def threads_per_worker(workers: int, cores: int | None = None) -> int:
+    """Each of `workers` gets its share of the cores, at least one thread."""
+    return max(1, (cores or usable_cores()) // workers)
 
 
 def processor_name() -> str:
@@ -63,12 +87,8 @@ def reset_peak_memory() -> bool:
     What earlier work freed goes back to the system first, as far as the C library can (glibc): it would count here too.
     """
     gc.collect()
-    try:
-        trim = ctypes.CDLL(None).malloc_trim
-    except (AttributeError, OSError, TypeError):
-        pass
-    else:
-        trim(ctypes.c_size_t(0))
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(ctypes.c_size_t(0))
     try:
         CLEAR.write_text(RESET_PEAK)
     except OSError:
@@ -82,7 +102,61 @@ def peak_memory_mb() -> float | None:
         lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:
         return None
-    for line in lines:
-        if line.startswith("VmHWM:"):
-            return round(int(line.split()[1]) / 1024, 1)
-    return None
+    peaks = [round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith("VmHWM:")]
+    return peaks[0] if peaks else None
+
+
+@torch.no_grad()
+def measure_speed(
+    runs: Sequence[tuple[str, int, Run]],
+    capture: Capture,
+    device: torch.device,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Frames per second of every (name, seed, run) on the CPU and, if it is another, on `device`, posing included.
+
+    All are measured side by side, in turn. Moves the scenes. Returns {"rows": [{name, seed, method, backend, fps,
+    milliseconds, draws, num_gaussians}], "image": [width, height], "frames": how many states were drawn in turn,
+    "machine", "how"}. fps is 1 / the median.
+    """
+    frames = [frame for frame in capture.frames if frame.split != "train"] or list(capture.frames)
+    report = progress or (lambda done, total: None)
+    devices = dict.fromkeys((torch.device("cpu"), device))
+    cases = [(index, device) for device in devices for index in range(len(runs))]
+    times: dict[tuple[int, torch.device], list[float]] = {case: [] for case in cases}
+    for step in range(ROUNDS):
+        for number, (index, where) in enumerate(cases):
+            report(step * len(cases) + number, ROUNDS * len(cases))
+            times[index, where] += _timed(runs[index][2], frames, where)
+    report(ROUNDS * len(cases), ROUNDS * len(cases))
+    rows = []
+    for (index, where), seconds in times.items():
+        (name, seed, run), median = runs[index], statistics.median(seconds)
+        row = {"name": name, "seed": seed, "method": run.config["method"], "backend": where.type}
+        row |= {"fps": round(1 / median, 3), "milliseconds": round(1000 * median, 4), "draws": len(seconds)}
+        rows.append(row | {"num_gaussians": run.scene.num_gaussians})
+    camera = frames[0].camera
+    return {
+        "rows": rows,
+        "image": [camera.width, camera.height],
+        "frames": len(frames),
+        "machine": machine(device),
+        "how": f"Posing and drawing held-out frames in turn, 1 / median, {ROUNDS} rounds of up to {DRAWS} draws per "
+        f"run after up to {WARM_UP} to warm up",
+    }
+
+
+def _timed(run: Run, frames: Sequence[Frame], device: torch.device) -> list[float]:
+    """Seconds of each timed image."""
+    seconds: list[float] = []
+    scene = run.scene.to(device)
+    with scene.torch_threads():  # each as it would be drawn by itself, though they are drawn in turn
+        for count, patience in ((WARM_UP, PATIENCE / 2), (DRAWS, PATIENCE)):
+            seconds.clear()
+            began = time.perf_counter()
+            while len(seconds) < count and time.perf_counter() - began < patience:
+                start = time.perf_counter()
+                frame = frames[len(seconds) % len(frames)]
+                synchronise(scene.render(frame.state, frame.camera).color.device)
+                seconds.append(time.perf_counter() - start)
+    return seconds

@@ -12,14 +12,12 @@ from neeco.capture import Capture
 from neeco.capture.images import write_labels
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
+from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, load_reference, open_masks, truth_file
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.truth import load_reference, truth_file
 from neeco.files import write_json
-from neeco.labels.composited import CompositedLabels
-from neeco.labels.drawing import Labeller, draw, draw_layers
-from neeco.labels.threshold import ThresholdLabels
+from neeco.labels.drawing import draw, draw_layers
+from neeco.labels.labellers import CompositedLabels, Labeller, ThresholdLabels
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.settings import Settings
 from neeco.training.run import Run, open_run
@@ -114,7 +112,7 @@ def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> Label
     Threads of torch: the caller's to set. Raises NeecoError for an unreadable mask.
     """
     scene = gaussian_scene(run.scene, "label ways")
-    speckle = Settings(count=1).speckle
+    min_component = Settings(count=1).min_component
     scores: LabelScores = {}
     for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):
         try:
@@ -128,7 +126,7 @@ def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> Label
             for frame in capture.split(split):
                 reference = load_reference(capture, frame)
                 if reference is not None:
-                    drawing = draw_layers(scene, labeller, frame.state, frame.camera, speckle)
+                    drawing = draw_layers(scene, labeller, frame.state, frame.camera, min_component)
                     values.append(iou(drawing.parts > 0, reference.mask, frame.load_mask()))
             mean = mean_of(values)
             scores[way][split] = None if mean != mean else round(mean, 6)  # NaN is unequal to itself

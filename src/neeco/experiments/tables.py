@@ -1,12 +1,17 @@
-"""One kind of result table, for the terminal, pages, Markdown and LaTeX; and the CSV of numbers behind it."""
+"""Result tables of every study: CSV by pandas, and one kind of table for the terminal, pages, Markdown and LaTeX.
+
+`csv_text` writes rows of numbers in full. `summary_table` makes a `Table` of means and standard deviations, rounded,
+the best of each column marked; `markdown_document` and `latex_document` write several, `write_files` all of a study.
+"""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
+
+from neeco.files import write_text
 
 UNKNOWN = "-"
 LATEX_SPECIAL = {
@@ -15,6 +20,8 @@ LATEX_SPECIAL = {
     "^": r"\textasciicircum{}",
     **{character: "\\" + character for character in "&%$#_{}"},
     "±": r"$\pm$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
@@ -33,6 +40,7 @@ class Column:
     scale: float = 1.0
 
     def written(self, value: float) -> str:
+        """`value` as the table shows it."""
         return f"{value * self.scale:,.{self.digits}f}"
 
     @property
@@ -73,51 +81,110 @@ class Table:
     rows: tuple[Row, ...]
 
 
-def csv_text(header: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
-    """CSV with a header line, unrounded; None and what a row lacks are empty, what the header lacks is left out."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
+@dataclass(frozen=True)
+class SummaryRow:
+    """What a row is of, its numbers by column key as `study.spread` gives them, and why there are none."""
+
+    keys: tuple[str, ...]
+    numbers: Mapping[str, Any]
+    failed: str | None = None
 
 
-def markdown_lines(table: Table) -> list[str]:
-    """The table in Markdown under its title; the best of a column is bold."""
+def summary_table(title: str, keys: tuple[str, ...], columns: Sequence[Column], rows: Sequence[SummaryRow]) -> Table:
+    """Mean ± standard deviation by row and column. Columns that no row has a number for are left out.
 
-    def line(cells: Sequence[str]) -> str:
-        return f"| {' | '.join(cells)} |"
+    The best mean of a column is judged as it is written, so that equal entries are all best; of one entry there is no
+    best.
+    """
+    known = {column.key: [row.numbers[column.key] for row in rows if _has(row, column)] for column in columns}
+    shown = tuple(column for column in columns if known[column.key])
+    best = {}
+    for column in shown:
+        means = [numbers["mean"] for numbers in known[column.key]]
+        if column.better is not None and len(means) > 1:
+            best[column.key] = column.written(max(means) if column.better == "high" else min(means))
 
-    headings = [*table.keys, *(column.heading for column in table.columns)]
-    lines = [f"## {markdown_escape(table.title)}", "", line([markdown_escape(heading) for heading in headings])]
-    lines.append("|" + "---|" * len(table.keys) + "---:|" * len(table.columns))
-    for row in table.rows:
-        shown = [f"**{cell.text}**" + str(cell)[len(cell.text) :] if cell.best else str(cell) for cell in row.cells]
-        if row.failed is not None:
-            shown = [f"failed: {markdown_escape(row.failed)}"] + [""] * (len(row.cells) - 1)
-        lines.append(line([*map(markdown_escape, row.keys), *shown]))
-    return lines
+    def cell(row: SummaryRow, column: Column) -> Cell:
+        if not _has(row, column):
+            return Cell(UNKNOWN)
+        numbers = row.numbers[column.key]
+        mean = column.written(numbers["mean"])
+        return Cell(
+            mean, "" if numbers["std"] is None else column.written(numbers["std"]), mean == best.get(column.key)
+        )
+
+    made = (Row(row.keys, tuple(cell(row, column) for column in shown), row.failed) for row in rows)
+    return Table(title, keys, shown, tuple(made))
+
+
+def _has(row: SummaryRow, column: Column) -> bool:
+    return bool(row.numbers.get(column.key) and row.numbers[column.key]["n"])
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """CSV with a header line, unrounded; None and what a row lacks are empty, what the columns lack is left out."""
+    import pandas
+
+    return str(
+        pandas.DataFrame(list(rows), columns=list(columns), dtype=object).to_csv(index=False, lineterminator="\n")
+    )
+
+
+def summary_csv(keys: Sequence[str], metrics: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """CSV of rows with `keys` and a `study.spread` by metric, as METRIC_mean, METRIC_std and METRIC_n."""
+    parts = ("mean", "std", "n")
+    flat = [
+        {**row, **{f"{metric}_{part}": row[metric][part] for metric in metrics if metric in row for part in parts}}
+        for row in rows
+    ]
+    return csv_text([*keys, *(f"{metric}_{part}" for metric in metrics for part in parts)], flat)
+
+
+def markdown_table(table: Table) -> list[str]:
+    """The table's lines in Markdown under its title; the best of a column is bold."""
+    headings, rows = _texts(table, markdown_escape, "**{}**", "failed: {}")
+    rule = "|" + "---|" * len(table.keys) + "---:|" * (len(headings) - len(table.keys))
+    lines = [f"| {' | '.join(texts)} |" for texts in (headings, *rows)]
+    return [f"## {markdown_escape(table.title)}", "", lines[0], rule, *lines[1:]]
+
+
+def markdown_document(
+    title: str, lead: str, tables: Sequence[Table], over: str, notes: Sequence[str], findings: Sequence[str] = ()
+) -> str:
+    """Markdown: a heading, a sentence, findings, the tables and notes. over: what their means are taken over."""
+    parts = [f"# {markdown_escape(title)}", "", markdown_escape(lead), ""]
+    parts += [*(f"- {markdown_escape(finding)}" for finding in findings), *([""] if findings else [])]
+    for table in tables:
+        parts += [*markdown_table(table), ""]
+    parts += [f"Mean ± standard deviation over {over}; the best of a column is bold.", ""]
+    parts += [f"- {markdown_escape(note)}" for note in notes]
+    return "\n".join(parts).rstrip() + "\n"
 
 
 def markdown_escape(text: str) -> str:
     """`text` so that Markdown shows it as it stands, in a table too."""
-    return text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
+    for character in "\\|*_":
+        text = text.replace(character, "\\" + character)
+    return text
 
 
-def latex_lines(table: Table, caption: str) -> list[str]:
+def latex_table(table: Table, caption: str) -> str:
     """The table in LaTeX for the package booktabs; the best of a column is bold."""
-    arrows = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
-    headings = [latex_escape(key.capitalize()) for key in table.keys]
-    headings += [latex_escape(column.title) + arrows[column.better] for column in table.columns]
-    lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_escape(caption)}}}"]
-    lines += [rf"\begin{{tabular}}{{{'l' * len(table.keys)}{'r' * len(table.columns)}}}", r"\toprule"]
-    lines += [" & ".join(headings) + r" \\", r"\midrule"]
-    for row in table.rows:
-        shown = [_latex_cell(cell) for cell in row.cells]
-        if row.failed is not None:
-            shown = [rf"\multicolumn{{{max(len(row.cells), 1)}}}{{l}}{{{latex_escape(f'failed: {row.failed}')}}}"]
-        lines.append(" & ".join([*map(latex_escape, row.keys), *shown]) + r" \\")
-    return [*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+    import pandas
+
+    headings, rows = _texts(table, latex_escape, r"\textbf{{{}}}", "failed")
+    columns = "l" * len(table.keys) + "r" * (len(headings) - len(table.keys))
+    style = pandas.DataFrame(rows, columns=headings).style.hide(axis="index")
+    caption = latex_escape(caption)
+    return str(style.to_latex(hrules=True, position_float="centering", caption=caption, column_format=columns))
+
+
+def latex_document(caption: str, tables: Sequence[Table], lead: Sequence[str], notes: Sequence[str]) -> str:
+    """LaTeX tables for the package booktabs. caption: with {} for a table's title; lead, notes: comments."""
+    comments = [["% " + " ".join(text.split()) for text in texts] for texts in (lead, notes)]
+    parts = ["% \\usepackage{booktabs}", *comments[0], ""]
+    parts += [latex_table(table, caption.replace("{}", table.title)) for table in tables]
+    return "\n".join([*parts, *comments[1]]).rstrip() + "\n"
 
 
 def latex_escape(text: str) -> str:
@@ -125,8 +192,24 @@ def latex_escape(text: str) -> str:
     return "".join(LATEX_SPECIAL.get(character, character) for character in text)
 
 
-def _latex_cell(cell: Cell) -> str:
-    if cell.text == UNKNOWN:
-        return "--"
-    text = rf"\textbf{{{cell.text}}}" if cell.best else latex_escape(cell.text)
-    return rf"{text} $\pm$ {cell.std}" if cell.std else text
+def _texts(table: Table, escape: Callable[[str], str], bold: str, failed: str) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows as texts; bold, failed: the markup of a best entry and of a row without numbers, with {}."""
+    rows = []
+    for row in table.rows:
+        cells = [bold.format(escape(cell.text)) if cell.best else escape(cell.text) for cell in row.cells]
+        cells = [
+            text + (escape(f" ± {cell.std}") if cell.std else "") for text, cell in zip(cells, row.cells, strict=True)
+        ]
+        if row.failed is not None:
+            cells = [failed.format(escape(row.failed)), *[""] * (len(row.cells) - 1)]
+        rows.append([*map(escape, row.keys), *cells])
+    headings = [escape(text) for text in (*table.keys, *(column.heading for column in table.columns))]
+    width = max(map(len, [headings, *rows]))  # no run has a number: the reasons have a column without heading
+    return headings + [""] * (width - len(headings)), rows
+
+
+def write_files(output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str]) -> None:
+    """Write `texts` by suffix as STEM.csv, STEM.md and STEM.tex into `output`, and `data` by name into its data/."""
+    files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
+    for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():
+        write_text(path, text)

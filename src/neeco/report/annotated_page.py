@@ -11,8 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from neeco.capture.model import Capture, Frame
-from neeco.report.figures import jpeg, to_bytes
-from neeco.report.render import write_page
+from neeco.report.page import jpeg, to_bytes, write_page
 
 PAGE = "annotate.html"
 SHOWN = 60  # photographs: the page has to stay a file one can mail

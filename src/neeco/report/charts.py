@@ -1,31 +1,72 @@
-"""Charts of several series, told apart by colour, dashes and marks; of one number per frame; and their keys."""
+"""Charts as inline SVG in the colours of the page's style sheet: lines of series, dots over time, and their keys.
+
+Matplotlib draws them. A chart is drawn in placeholder colours (PALETTE), which become the style sheet's variables, so
+that it is readable in a light, a dark and a printed page; its background is transparent and its text stays text. An
+artist's gid becomes the class of its group.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import matplotlib
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import IdentityTransform
 
-from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
-
 SIZE, SMALL = (460, 270), (420, 190)  # view box units; the page scales them
-LABEL_STEP = 13  # units between two names
+LABEL_STEP = 13  # units between two names at the ends of lines
 LABEL_CHARACTERS = 20  # of a name at the end of its line
 CHARACTER = 6.9  # units that one takes at most, on average
 COLORS = 7
-DASHES = ("", "7 3", "2 3", "10 3 2 3", "14 4", "5 2 1 2 1 2", "1 2 6 2")  # in black and white, lines differ by these
+DASHES = (
+    (),
+    (7, 3),
+    (2, 3),
+    (10, 3, 2, 3),
+    (14, 4),
+    (5, 2, 1, 2, 1, 2),
+    (1, 2, 6, 2),
+)  # tell lines apart in grey print
 MARKS = ("o", "s", "^", "x", "D", "+", "v")
-LEVEL_DASHES = (4, 4)
-EDGE, CROWDED = 0.03, 0.06  # of a logarithmic axis: room beyond its ends; how near two ticks may be
+CROWDED = 0.06  # of a logarithmic axis: the least distance of two ticks
 FEW_DECADES = (10.0, 300.0)  # highest over lowest where the ticks of a logarithmic axis are 1, 2 and 5
+
+VARIABLES = ("ink", "soft", "edge", "accent", "phase", "good", "bad", *(f"m{order}" for order in range(COLORS)))
+PALETTE = {name: f"#0101{index:02x}" for index, name in enumerate(VARIABLES)}  # of the style sheet's variables
+STYLE: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.labelcolor": PALETTE["soft"],
+    "axes.titlecolor": PALETTE["ink"],
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8,
+    "axes.titlesize": 12,
+    **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
+    "font.sans-serif": ["DejaVu Sans"],  # measures text; the page shows it in its own font
+    "font.size": 11,
+    "grid.color": PALETTE["edge"],
+    "lines.scale_dashes": False,
+    "path.simplify": False,
+    "svg.fonttype": "none",
+    "text.color": PALETTE["soft"],
+    "text.parse_math": False,  # a name with two dollars in it is a name
+    **{f"{axis}tick.color": PALETTE["soft"] for axis in "xy"},
+    **{f"{axis}tick.labelsize": 11 for axis in "xy"},
+    **{f"{axis}tick.{kind}.size": 0 for axis in "xy" for kind in ("major", "minor")},
+}
 
 Point = tuple[float, float]
 
@@ -50,6 +91,47 @@ class Level:
     value: float
 
 
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Matplotlib's settings for our charts, whatever the user's own are; put back afterwards."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        yield
+
+
+def new_axes(size: tuple[int, int], left: float, right: float, top: float, bottom: float) -> Axes:
+    """Axes in a figure of their own; width, height and margins in units of the SVG's view box."""
+    width, height = size
+    figure = Figure((width / 72, height / 72), dpi=72, frameon=False)
+    axes = figure.add_axes((left / width, bottom / height, 1 - (left + right) / width, 1 - (top + bottom) / height))
+    axes.patch.set_visible(False)
+    return axes
+
+
+def inline_svg(axes: Axes, label: str) -> Markup:
+    """The figure of `axes` as an SVG element for a page, texts escaped. label: its text for screen readers.
+
+    The same figure gives the same text. Ids of definitions depend on `label` and on what is defined, so charts of one
+    page do not get in each other's way.
+    """
+    figure, stream = axes.get_figure(), io.StringIO()
+    assert isinstance(figure, Figure)
+    for artist in figure.findobj():
+        artist.set_clip_on(False)
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with warnings.catch_warnings(), matplotlib.rc_context({"svg.hashsalt": label}):
+        warnings.filterwarnings("ignore", message="Glyph")  # the page's font may have what matplotlib's lacks
+        figure.savefig(stream, format="svg", metadata=nothing)
+    body = stream.getvalue().partition("</defs>")[2]  # after the XML header and a style that would be the whole page's
+    body = re.sub('<g id="([a-z-]+)"', r'<g class="\1"', body)
+    body = re.sub('<g id="[^"]*"', "<g", body)
+    body = re.sub("#0101([0-9a-f]{2})", lambda found: f"var(--{VARIABLES[int(found[1], 16)]})", body)
+    body = re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", body)  # what markup cannot hold
+    width, height = figure.get_size_inches() * 72
+    return Markup(f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(label)}">{body}')
+
+
 @page_style()
 def line_chart(
     title: str,
@@ -63,18 +145,17 @@ def line_chart(
     over_logarithmic: bool = False,
     size: tuple[int, int] = SIZE,
 ) -> str:
-    """Lines and marks over a shared frame as inline SVG; "" when nothing has two points.
+    """Lines and marks over a shared x axis as inline SVG; "" when nothing has two points.
 
     starts: (x, what begins there), drawn as dashed vertical lines. levels: thin dashed lines from side to side; beside
     them a single point is a chart. note: stands at the right, above the chart. over_logarithmic: the axis of x, whose
     ticks are then the points' own.
     """
-    points = [point for item in series for line in (item.main, *item.faint, item.dots) for point in line]
-    if len({x for x, _ in points}) < (1 if levels else 2):
+    xs = sorted({x for item in series for line in (item.main, *item.faint, item.dots) for x, _ in line})
+    if len(xs) < (1 if levels else 2):
         return ""
-    longest = max(len(name) for name in (*(item.name for item in series), *(level.name for level in levels)))
-    right = 14 + round(CHARACTER * min(LABEL_CHARACTERS, longest))
-    axes = new_axes(size, 46, right, 28, 42)
+    longest = max(len(name) for name in [*(item.name for item in series), *(level.name for level in levels)])
+    axes = new_axes(size, 46, 14 + round(CHARACTER * min(LABEL_CHARACTERS, longest)), 28, 42)
     axes.set_title(title)
     axes.set_title(note, loc="right", fontsize=11)
     axes.set_xlabel(over)
@@ -83,16 +164,16 @@ def line_chart(
     for item in series:
         axes.plot(*_columns(item.dots), alpha=0.45, **_mark(item.order))
         for line in item.faint:
-            _draw_line(axes, item.order, line, {"linewidth": 0.7, "alpha": 0.55})
+            _draw_line(axes, item.order, line, linewidth=0.7, alpha=0.55)
     for item in series:  # above all that is faint
-        _draw_line(axes, item.order, item.main, {"linewidth": 2, **_dashes(item.order)})
+        dashes = DASHES[item.order % len(DASHES)]
+        _draw_line(axes, item.order, item.main, linewidth=2, **({"dashes": dashes} if dashes else {}))
     for level in levels:
-        axes.axhline(level.value, color=_color(level.order), linewidth=1.1, dashes=LEVEL_DASHES, gid="level")
-    xs = [x for x, _ in points]
+        axes.axhline(level.value, color=_color(level.order), linewidth=1.1, dashes=(4, 4), gid="level")
     if over_logarithmic:
-        _draw_logarithmic(axes, sorted(set(xs)))
+        _set_logarithmic_x(axes, xs)
     else:
-        axes.set_xlim(min(0.0, *xs), max(xs))
+        axes.set_xlim(min(0.0, xs[0]), xs[-1])
         round_ticks(axes.xaxis, 5, short)
     round_ticks(axes.yaxis, 4, short)
     if logarithmic:
@@ -116,9 +197,9 @@ def residual_chart(times: np.ndarray, values: np.ndarray, title: str, level: flo
         return ""
     axes = new_axes(SMALL, 46, 12, 28, 26)
     axes.set_title(title)
-    axes.set_title(f"rms {level:.3g}, largest {values.max():.3g}", loc="right", fontsize=11, color=STAND_INS["soft"])
-    draw_dots(axes, np.stack([times, values], axis=1), gid="dots", color=STAND_INS["accent"], linewidth=3.2, alpha=0.65)
-    axes.axhline(level, color=STAND_INS["phase"], linewidth=1, dashes=(5, 3))
+    axes.set_title(f"rms {level:.3g}, largest {values.max():.3g}", loc="right", fontsize=11, color=PALETTE["soft"])
+    draw_dots(axes, np.stack([times, values], axis=1), gid="dots", color=PALETTE["accent"], linewidth=3.2, alpha=0.65)
+    axes.axhline(level, color=PALETTE["phase"], linewidth=1, dashes=(5, 3))
     axes.set_xlim(float(times.min()), max(float(times.max()), float(times.min()) + 1e-9))
     axes.set_ylim(0, max(float(values.max()), level, 1e-9) * 1.05)
     round_ticks(axes.xaxis, 5, short)
@@ -134,7 +215,8 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
         if name in shown:
             axes = new_axes((46, 14), 0, 0, 0, 0)
             axes.set_axis_off()
-            axes.plot([1, 45], [7, 7], linewidth=2, **_dashes(order))
+            dashes = DASHES[order % len(DASHES)]
+            _draw_line(axes, order, ((1, 7), (45, 7)), linewidth=2, **({"dashes": dashes} if dashes else {}))
             axes.plot(23, 7, **_mark(order))
             axes.set(xlim=(0, 46), ylim=(0, 14))
             entries.append((name, inline_svg(axes, f"line of {name}")))
@@ -144,18 +226,17 @@ def legend(names: Sequence[str], shown: Sequence[str]) -> list[tuple[str, Markup
 def binned(points: Sequence[Point], edges: Sequence[float]) -> tuple[Point, ...]:
     """Mean of the points between every two `edges` (the last bin takes its upper edge too); empty bins are left out."""
     means = []
-    for index, (low, high) in enumerate(pairwise(edges)):
-        last = index == len(edges) - 2
-        inside = [(x, y) for x, y in points if low <= x < high or (last and x == high)]
+    for low, high in pairwise(edges):
+        inside = [(x, y) for x, y in points if low <= x < high or x == high == edges[-1]]
         if inside:
             means.append((sum(x for x, _ in inside) / len(inside), sum(y for _, y in inside) / len(inside)))
     return tuple(means)
 
 
 def draw_dots(axes: Axes, places: np.ndarray, **style: Any) -> None:
-    """Round dots at places [N, 2], `linewidth` across, as one path."""
+    """Round dots at places [N, 2], `linewidth` across, as one path: a tenth of what so many marks take in a file."""
     line = np.concatenate([places, places, np.full_like(places, np.nan)], axis=1).reshape(-1, 2)
-    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", clip_on=False, **style)
+    axes.plot(line[:, 0], line[:, 1], solid_capstyle="round", **style)
 
 
 def round_ticks(axis: Axis, count: int, label: Callable[[float], str]) -> None:
@@ -177,49 +258,44 @@ def _columns(points: Sequence[Point]) -> tuple[list[float], list[float]]:
 
 def _color(order: int) -> str:
     """A method's colour, as the style sheet has it."""
-    return STAND_INS[f"m{order % COLORS}"]
+    return PALETTE[f"m{order % COLORS}"]
 
 
 def _mark(order: int, size: float = 6.4) -> dict[str, Any]:
     """A method's mark, hollow."""
     shape = {"marker": MARKS[order % len(MARKS)], "markersize": size, "markeredgewidth": 1, "fillstyle": "none"}
-    return {**shape, "linestyle": "", "color": _color(order), "clip_on": False}
+    return {**shape, "linestyle": "", "color": _color(order)}
 
 
-def _dashes(order: int) -> dict[str, Any]:
-    dashes = [float(length) for length in DASHES[order % len(DASHES)].split()]
-    return {"color": _color(order), "clip_on": False, **({"dashes": dashes} if dashes else {})}
-
-
-def _draw_line(axes: Axes, order: int, points: Sequence[Point], style: dict[str, Any]) -> None:
-    if len(points) < 2:
-        style = _mark(order, 8.0)
-    axes.plot(*_columns(points), **{"color": _color(order), "clip_on": False, **style})
+def _draw_line(axes: Axes, order: int, points: Sequence[Point], **style: Any) -> None:
+    """A line through points, or a mark where there is but one."""
+    style = {"color": _color(order), **style} if len(points) > 1 else _mark(order, 8.0)
+    axes.plot(*_columns(points), **style)
 
 
 def _draw_start(axes: Axes, x: float, words: str, falling: bool) -> None:
     """A dashed line where something begins; its name stands where lines leave room for it."""
     low, high = axes.get_xlim()
     x = min(max(x, low), high)
-    beyond = x - low > 0.75 * (high - low)
-    axes.axvline(x, color=STAND_INS["phase"], linewidth=1, dashes=(4, 3), gid="phase", clip_on=False)
+    right = x - low > 0.75 * (high - low)
+    axes.axvline(x, color=PALETTE["phase"], linewidth=1, dashes=(4, 3), gid="phase")
     axes.annotate(
         words,
         (x, 1 if falling else 0),
-        (-4 if beyond else 4, -12 if falling else 5),
+        (-4 if right else 4, -12 if falling else 5),
         xycoords=axes.get_xaxis_transform(),
         textcoords="offset points",
-        ha="right" if beyond else "left",
-        color=STAND_INS["phase"],
+        ha="right" if right else "left",
+        color=PALETTE["phase"],
     )
 
 
-def _draw_logarithmic(axes: Axes, xs: Sequence[float]) -> None:
-    """Make x logarithmic from the first to the last of `xs`, which are its ticks but where they crowd."""
+def _set_logarithmic_x(axes: Axes, xs: Sequence[float]) -> None:
+    """Make x logarithmic from the first to the last of `xs` (rising), which are its ticks but where they crowd."""
     span = xs[-1] / xs[0]
-    beyond = span**EDGE if span > 1 else 2.0
+    margin = span**0.03 if span > 1 else 2.0
     axes.set_xscale("log")
-    axes.set_xlim(xs[0] / beyond, xs[-1] * beyond)
+    axes.set_xlim(xs[0] / margin, xs[-1] * margin)
     ticks: list[float] = []
     for x in reversed(xs):
         if not ticks or ticks[-1] / x > span**CROWDED:
@@ -236,9 +312,8 @@ def _draw_names(axes: Axes, ends: Sequence[tuple[float, int, str]]) -> None:
     places: list[float] = []  # downwards
     for y, _, _ in wanted:
         places.append(max(y, places[-1] + LABEL_STEP) if places else y)
-    box = axes.bbox
-    beyond = max(0.0, places[-1] + box.y0) if places else 0.0
+    too_low = max(0.0, places[-1] + axes.bbox.y0) if places else 0.0
     for (_, order, name), y in zip(wanted, places, strict=True):
         shown = name if len(name) <= LABEL_CHARACTERS else name[: LABEL_CHARACTERS - 1] + "…"
         place: dict[str, Any] = {"transform": IdentityTransform(), "va": "center_baseline"}
-        axes.text(box.x1 + 8, beyond - y, shown, color=_color(order), gid="name", **place)
+        axes.text(axes.bbox.x1 + 8, too_low - y, shown, color=_color(order), gid="name", **place)

@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
-from neeco.report.charts import round_ticks
-from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
+from neeco.report.charts import PALETTE, inline_svg, new_axes, page_style, round_ticks
 
 BINS = 24
 SLACK = 0.02  # of the trained range: a state outside by less is not called outside
@@ -143,14 +142,14 @@ def histogram(degree: Degree) -> str:
         axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
         axes.set_xticks([])
         return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
-    axes.set_title(said, loc="right", fontsize=11, color=STAND_INS["soft"])
+    axes.set_title(said, loc="right", fontsize=11, color=PALETTE["soft"])
     axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
     left, right = axes.get_xlim()
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
         if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
-            axes.axvspan(start, end, color=STAND_INS["phase"], alpha=0.13, linewidth=0, gid="beyond")
+            axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
     _draw_bars(axes, degree, np.linspace(low, high, BINS + 1))
-    axes.axhline(0, color=STAND_INS["edge"], linewidth=1, clip_on=False)
+    axes.axhline(0, color=PALETTE["edge"], linewidth=1)
     round_ticks(axes.xaxis, 4, _number)
     return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
 
@@ -160,9 +159,9 @@ def _draw_bars(axes: Axes, degree: Degree, edges: np.ndarray) -> None:
     floor = np.zeros(BINS)
     for name in names:
         count = np.histogram(degree.of(name), edges)[0]
-        kept, color = count > 0, STAND_INS[SPLIT_COLORS.get(name, "soft")]
+        kept, color = count > 0, PALETTE[SPLIT_COLORS.get(name, "soft")]
         middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
-        axes.bar(middles[kept], count[kept], 0.92 * width, floor[kept], color=color, clip_on=False)
+        axes.bar(middles[kept], count[kept], 0.92 * width, floor[kept], color=color)
         floor += count
     axes.set_ylim(0, max(1.0, floor.max()))
 

@@ -10,11 +10,20 @@ from typing import Any
 from markupsafe import Markup
 
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.conditions import AUGMENT, REAL
-from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, verdict
-from neeco.experiments.downstream.tables import described
-from neeco.report.charts import Level, Point, Series, legend, line_chart, short
-from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
+from neeco.experiments.downstream.job import AUGMENT, REAL
+from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, title_of, verdict
+from neeco.report.charts import (
+    PALETTE,
+    Level,
+    Point,
+    Series,
+    inline_svg,
+    legend,
+    line_chart,
+    new_axes,
+    page_style,
+    short,
+)
 
 COURSE = (340, 210)  # view box units
 BAR, SCALE = (150, 16), (150, 14)  # view box units of an interval and of the scale above all
@@ -184,8 +193,8 @@ def _span(rows: Sequence[Mapping[str, Any]]) -> float:
 def _difference(row: Mapping[str, Any], span: float) -> Difference:
     known = row["low"] is not None
     return Difference(
-        described(row["condition"], row["real"]),
-        described(row["against"], row["against_real"]),
+        title_of(row["condition"], row["real"]),
+        title_of(row["against"], row["against_real"]),
         signed(row["difference"]),
         f"{signed(row['low'])} to {signed(row['high'])}" if known else "–",
         row["folds"],
@@ -204,8 +213,8 @@ def _bar(row: Mapping[str, Any], span: float) -> Markup:
     axes = new_axes(BAR, BAR_EDGE, BAR_EDGE, 0, 0)
     axes.set(xlim=(-span, span), ylim=(-1, 1))
     axes.set_axis_off()
-    axes.axvline(0, color=STAND_INS["soft"], linewidth=1)
-    color = STAND_INS[{HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")]
+    axes.axvline(0, color=PALETTE["soft"], linewidth=1)
+    color = PALETTE[{HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")]
     style: dict[str, Any] = {"color": color, "clip_on": False, "linestyle": ""}
     if row["low"] is not None:
         low, high = max(row["low"], -span), min(row["high"], span)
@@ -226,5 +235,5 @@ def _scale(span: float) -> Markup:
     for place, align in ((-span, "left"), (0.0, "center"), (span, "right")):
         words = "0" if not place else f"{'−' if place < 0 else '+'}{short(abs(place))}"
         moved = BAR_EDGE * span / (BAR[0] / 2 - BAR_EDGE) * ((place > 0) - (place < 0))
-        axes.text(place + moved, 0.2, words, ha=align, color=STAND_INS["soft"])
+        axes.text(place + moved, 0.2, words, ha=align, color=PALETTE["soft"])
     return inline_svg(axes, "scale of the differences")

@@ -11,7 +11,7 @@ import numpy as np
 
 from neeco.capture import read_capture
 from neeco.capture.model import Capture
-from neeco.ingest.result import IngestResult
+from neeco.ingest.pipeline import IngestResult
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import (
     SPLIT_COLORS,
@@ -31,7 +31,7 @@ from neeco.report.ingest_figures import (
     main_axes,
     sample_figures,
 )
-from neeco.report.render import split_counts, write_page
+from neeco.report.page import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
 from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 

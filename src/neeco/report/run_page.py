@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neeco.capture.model import Capture
-from neeco.evaluation.difference import FULL_SCALE, PART_COLORS
+import torch
+
+from neeco.capture.model import Capture, Frame, State
+from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
+from neeco.evaluation.mask_folders import load_reference
+from neeco.labels.drawing import draw
+from neeco.raster.types import Camera
 from neeco.report.charts import SMALL, Series, line_chart, short
-from neeco.report.figures import file_uri, frame_figures
-from neeco.report.render import REPORT_FILE, split_counts, write_page
+from neeco.report.page import REPORT_FILE, difference, file_uri, jpeg, split_counts, to_bytes, write_page
 from neeco.scene import Drawable
 
 MAX_POINTS = 300  # of a training curve
@@ -95,6 +100,83 @@ def write_report(
         facts=_facts(capture, scene, rows),
         config=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
     )
+
+
+@dataclass(frozen=True)
+class FrameFigure:
+    """One frame's row of pictures and what the caption says of it."""
+
+    split: str
+    name: str
+    why: str  # best, median, worst
+    scores: tuple[str, ...]
+    pictures: tuple[tuple[str, str], ...]  # (what it is, data URI)
+
+
+def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[FrameFigure]:
+    """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`."""
+    figures = []
+    for split, rows in evaluation.get("per_frame", {}).get(kind, {}).items():
+        frames = {frame.name: frame for frame in capture.split(split)}
+        for why, row in chosen_rows(rows):
+            if row["frame"] in frames:
+                figures.append(_figure(capture, scene, split, frames[row["frame"]], why, row))
+    return figures
+
+
+def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
+    """Best, median and worst of the rows that have a PSNR; fewer when there are fewer rows."""
+    ranked = sorted((row for row in rows if row.get("psnr") is not None), key=lambda row: -row["psnr"])
+    places = {"best": 0, "median": len(ranked) // 2, "worst": len(ranked) - 1}
+    chosen: dict[int, str] = {}
+    for why, place in places.items():
+        if 0 <= place < len(ranked):
+            chosen.setdefault(place, why)
+    return [(why, ranked[place]) for place, why in sorted(chosen.items())]
+
+
+def _figure(capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]) -> FrameFigure:
+    state, camera = _poses(frame, row)
+    drawing = draw(scene, state, camera)
+    photograph, image = frame.load_image().numpy(), drawing.image.numpy()
+    reference = load_reference(capture, frame)
+    pictures = [
+        ("photograph", jpeg(to_bytes(photograph))),
+        ("drawn", jpeg(to_bytes(image))),
+        ("difference", difference(image, photograph, frame.load_mask())),
+    ]
+    if drawing.parts is not None:
+        overlay = overlay_parts(photograph, drawing.parts.numpy())
+        if reference is not None:
+            overlay = overlay_outline(overlay, reference.mask.numpy())
+        pictures.append(("label mask over photograph", jpeg(overlay)))
+    return FrameFigure(split, frame.name, why, tuple(_scores(row)), tuple(pictures))
+
+
+def _scores(row: dict[str, Any]) -> list[str]:
+    """What evaluation found of a frame, in words."""
+    scores = [f"{row['psnr']:.2f} dB"]
+    if row.get("mask_iou") is not None:
+        scores.append(f"IoU {row['mask_iou']:.3f}")
+    moves = row.get("moved", {}).items()
+    return [*scores, *(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°" for body, moved in moves)]
+
+
+def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
+    """The fitted poses that evaluation recorded in the row, or the frame's own."""
+    state, camera = frame.state, frame.camera
+    if "world_from_camera" in row:
+        pose = camera.world_from_camera
+        camera = replace(camera, world_from_camera=torch.tensor(row["world_from_camera"], dtype=pose.dtype))
+        fitted = row["world_from_instrument"]
+        state = replace(
+            state,
+            instruments={
+                name: replace(given, pose=torch.tensor(fitted[name], dtype=torch.float64)) if name in fitted else given
+                for name, given in state.instruments.items()
+            },
+        )
+    return state, camera
 
 
 def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:

@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
-from neeco.report.charts import draw_dots
-from neeco.report.figures import to_bytes
-from neeco.report.svg import STAND_INS, inline_svg, new_axes, page_style
+from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
+from neeco.report.page import to_bytes
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # view box units
 SVG_POINTS, CANVAS_POINTS = 1500, 4000
@@ -87,11 +86,11 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
     axes = new_axes((WIDTH, HEIGHT), 0, 0, 0, 0)
     axes.set_axis_off()
     axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
-    axes.text(12, 18, title, color=STAND_INS["ink"], fontsize=12)
+    axes.text(12, 18, title, color=PALETTE["ink"], fontsize=12)
     step = -(-len(tracks.points) // SVG_POINTS) or 1
     dots = place(tracks.points[::step])
     inside = ((dots > 0) & (dots < [WIDTH, HEIGHT])).all(axis=1)
-    draw_dots(axes, dots[inside], gid="points", color=STAND_INS["soft"], linewidth=1.7, alpha=0.55)
+    draw_dots(axes, dots[inside], gid="points", color=PALETTE["soft"], linewidth=1.7, alpha=0.55)
     _draw_line(axes, place(tracks.camera), tracks.breaks, "accent", 1.8)
     chosen = np.unique(np.linspace(0, len(tracks.camera) - 1, RAYS).round().astype(int))
     ends = tracks.camera[chosen] + 0.12 * float(np.linalg.norm(high - low)) * tracks.looking[chosen]
@@ -101,7 +100,7 @@ def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> st
         _draw_line(axes, place(track), tracks.breaks, LINE_COLORS[index % len(LINE_COLORS)], 1.8)
     length = round_length(0.25 * (WIDTH - 2 * MARGIN) / scale)
     end = WIDTH - 12
-    axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=STAND_INS["ink"], linewidth=2, clip_on=False)
+    axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=PALETTE["ink"], linewidth=2, clip_on=False)
     axes.text(end, HEIGHT - 16, f"{length:g} mm", ha="right")
     return inline_svg(axes, title)
 
@@ -118,7 +117,7 @@ def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, width: float) -> None:
     """A line through [F, 2], interrupted at breaks [F - 1] and where a place is unknown."""
     line = np.insert(places, np.flatnonzero(breaks) + 1, np.nan, axis=0)
-    axes.plot(line[:, 0], line[:, 1], color=STAND_INS[color], linewidth=width, clip_on=False)
+    axes.plot(line[:, 0], line[:, 1], color=PALETTE[color], linewidth=width, clip_on=False)
 
 
 def round_length(wanted: float) -> float:

@@ -1,17 +1,51 @@
-"""What evaluation, reports and benchmarks ask of a scene, whether it is made of Gaussians or a field."""
+"""A learned scene as the rest of the program sees it, whether it is made of Gaussians or a field."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Camera, Instrument, State
+from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.types import Rendering
-from neeco.scene.recorded import Recorded
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Every training frame's name, split, state and camera."""
+
+    names: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
+    states: tuple[State, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], instruments: tuple[Instrument, ...]) -> Recorded:
+        """What `frames` record of `instruments`: only these, and of each only the joints named."""
+        states = []
+        for frame in frames:
+            chosen = {}
+            for instrument in instruments:
+                given = frame.state.instruments[instrument.name]
+                joints = {joint: given.joints[joint] for joint in instrument.joints}
+                chosen[instrument.name] = InstrumentState(given.pose, joints)
+            states.append(State(chosen, frame.state.time))
+        names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
+        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames))
+
+
+@dataclass(frozen=True)
+class HingeMotion:
+    """All that posing takes where bodies move rigidly with their instruments and turn about hinges, for renderers
+    other than this program's."""
+
+    log_scales: Tensor  # [N, 3], as drawn
+    turns: Tensor  # [N, J, 2] rad by which joint j turns a Gaussian: at a reading of 0, and per unit of the reading
+    hinges: tuple[tuple[tuple[Tensor, Tensor], ...], ...]  # pivot [3] mm, unit axis [3] per moving instrument and joint
 
 
 class Drawable(Protocol):
@@ -38,11 +72,14 @@ class Drawable(Protocol):
     def camera(self, camera: Camera) -> Camera:
         """The camera to draw with for a recorded one."""
 
-    def draw(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
-        """Draw `state` as the recorded `camera` sees it; `labels`: with label channels where the scene has them."""
+    def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
+        """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
+
+    def hinge_motion(self) -> HingeMotion | None:
+        """How the Gaussians move, where hinges say all of it; None otherwise."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where the scene is drawn."""
+        """Use as many of torch's threads as pay where the scene is drawn."""
 
 
 class Learned(Drawable, Protocol):

@@ -1,38 +1,48 @@
-"""`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust it."""
+"""`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust its label.
+
+Trust goes by the recorded image alone; every pixel votes. Inside the label the tissue alone may explain a pixel better
+than the instrument does, or neither does (something else is in front): it votes against the label. Beside the label a
+pixel may look as no tissue did in training frames: the label misses it. Trust is the overlap (IoU) that is left.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from scipy.ndimage import binary_opening, distance_transform_edt, uniform_filter
 from torch import Tensor
 
-from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Capture, Frame
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
-from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
+from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
 from neeco.files import own_folder, write_json
 from neeco.labels.annotation import annotate
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import LayeredDrawing, draw_layers
+from neeco.labels.labellers import CompositedLabels
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.indexes import INFO, check_output, description, drawn, keeping, write_indexes
+from neeco.synthesis.dataset import INFO, check_output, description, indexed_on_failure, with_image, write_indexes
 from neeco.synthesis.settings import MIN_TRUST, Format, Settings
-from neeco.synthesis.trust import Trust, Usual, judge, usual_errors
 from neeco.synthesis.writers.folder import Record, load_record, write_sample, write_skipped
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
     from neeco.training.run import Run
 
-LOOKED_AT = 16  # frames trained on that say how well pixels are usually explained
-FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # its fit is near: no coarse look for the place
+REFERENCE_FRAMES = 16  # training frames that tell how well pixels are usually explained
+FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
 NOT_TRUSTED = "not trusted"
+BESIDE = 0.03  # of the image's diagonal: how far from the label a pixel is looked at that it may miss
+USUAL = 0.99  # share of the pixels of training frames that are explained as well
+HALF = 0.5  # of the error that the tissue alone would have: an instrument that explains more is there, if blurred
+SMOOTH = 3  # px, side of the square over which a pixel's error is averaged
 
 
 @dataclass(frozen=True)
@@ -46,7 +56,7 @@ class Annotated:
     @property
     def written(self) -> int:
         """How many frames were trusted."""
-        return len(drawn(self.records))
+        return len(with_image(self.records))
 
 
 def annotate_capture(
@@ -60,8 +70,8 @@ def annotate_capture(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
-    write those that can be trusted as a data set: the photographs with the labels that the scene draws at poses fitted
-    to them.
+    write those that can be trusted as a data set: the recorded images with the labels that the scene draws at poses
+    fitted to them.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
     what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
@@ -82,16 +92,16 @@ def annotate_capture(
     begun = check_output(output, info, resume)
     write = partial(write_indexes, output, info=info, scene=scene, labeller=labeller, formats=formats)
     with own_folder(output):
-        with keeping(output, len(capture.frames), begun, partial(write, complete=False)):
+        with indexed_on_failure(output, len(capture.frames), begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
-            usual = usual_of(scene, labeller, trained_on)
-            info["usual_errors"] = usual.to_json()
+            typical = typical_errors(scene, labeller, trained_on)
+            info["usual_errors"] = asdict(typical)
             made: dict[int, Record] = {}
-            for index, record in _Annotator(scene, labeller, usual, min_trust, output).frames(capture.frames, begun):
+            for index, record in _Annotator(scene, labeller, typical, min_trust, output).frames(capture.frames, begun):
                 made[index] = record
                 on_progress(len(made), len(capture.frames))
             records = [made[index] for index in sorted(made)]
-            if not drawn(records):
+            if not with_image(records):
                 best = max(record["trust"]["value"] for record in records)
                 raise NeecoError(
                     f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
@@ -106,12 +116,12 @@ class _Annotator:
 
     scene: Scene
     labeller: CompositedLabels
-    usual: Usual
+    typical: TypicalErrors
     min_trust: float
     output: Path
 
     def frames(self, frames: Sequence[Frame], begun: bool) -> Iterator[tuple[int, Record]]:
-        """(index, record) of every frame, in the order of time: each fit starts from its neighbour's."""
+        """(index, record) of every frame, in the order of time: each fit starts from its predecessor's."""
         start: Tensor | None = None
         for index in sorted(range(len(frames)), key=lambda k: frames[k].state.time):
             record = load_record(self.output, index) if begun else None
@@ -121,48 +131,47 @@ class _Annotator:
             yield index, record
 
     def _one(self, index: int, frame: Frame, start: Tensor | None) -> Record:
-        photograph = frame.load_image()
-        fit, drawing, trust = self._fitted(frame, photograph, start)
-        if start is not None and trust.value < self.min_trust:  # the neighbour's may have led astray
-            again = self._fitted(frame, photograph, None)
+        image = frame.load_image()
+        fit, drawing, trust = self._fitted(frame, image, start)
+        if start is not None and trust.value < self.min_trust:  # the neighbour's start may have misled the fit
+            again = self._fitted(frame, image, None)
             fit, drawing, trust = max((again, (fit, drawing, trust)), key=lambda found: found[2].value)
         facts: dict[str, Any] = {
             "frame": frame.name,
             "recorded_split": frame.split,
             "trust": trust.to_json(),
-            "moved": moves(frame, fit.state, fit.camera),
+            "moved": pose_changes(frame, fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
         labels = annotate(self.scene, drawing, self.labeller.names)
         if trust.value < self.min_trust:
             facts["labels"] = [label.to_json() for label in labels]
             return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
-        return write_sample(self.output, index, replace(drawing, image=photograph), labels, {}, facts)
+        return write_sample(self.output, index, replace(drawing, image=image), labels, {}, facts)
 
-    def _fitted(self, frame: Frame, photograph: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
-        fit, drawing = fitted(self.scene, self.labeller, frame, photograph, start)
-        return fit, drawing, judge(drawing, photograph, frame.load_mask(), self.usual)
+    def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
+        fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
+        return fit, drawing, estimate_trust(drawing, image, frame.load_mask(), self.typical)
 
 
 def fitted(
-    scene: Scene, labeller: CompositedLabels, frame: Frame, photograph: Tensor, start: Tensor | None
+    scene: Scene, labeller: CompositedLabels, frame: Frame, image: Tensor, start: Tensor | None
 ) -> tuple[Fit, LayeredDrawing]:
-    """The poses of `frame` fitted to its photograph [H, W, 3], and what the scene draws there; `start`: a neighbour's
-    increments, without which it is looked for from afar."""
-    fit = fit_frame(scene, frame, photograph, start, None if start is None else FROM_NEIGHBOUR)
-    return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.speckle, tissue_image=True)
+    """The poses of `frame` fitted to its image [H, W, 3], and what the scene draws there; `start`: a neighbour's
+    increments, without which the search starts coarse."""
+    fit = fit_frame(scene, frame, image, start, None if start is None else FROM_NEIGHBOUR)
+    return fit, draw_layers(scene, labeller, fit.state, fit.camera, Settings.min_component, tissue_image=True)
 
 
-def usual_of(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> Usual:
-    """What the frames that the scene was trained on say of its errors."""
+def typical_errors(scene: Scene, labeller: CompositedLabels, trained_on: Capture) -> TypicalErrors:
+    """The scene's errors on the frames that it was trained on."""
     frames = trained_on.split("train")
-    chosen = [frames[round(k * (len(frames) - 1) / max(1, LOOKED_AT - 1))] for k in range(min(LOOKED_AT, len(frames)))]
     drawings = []
-    for frame in chosen:
-        photograph = frame.load_image()
-        drawing = fitted(scene, labeller, frame, photograph, None)[1]
-        drawings.append((drawing, photograph, frame.load_mask()))
-    return usual_errors(drawings)
+    for k in range(min(REFERENCE_FRAMES, len(frames))):
+        frame = frames[round(k * (len(frames) - 1) / (REFERENCE_FRAMES - 1))]
+        image = frame.load_image()
+        drawings.append((fitted(scene, labeller, frame, image, None)[1], image, frame.load_mask()))
+    return typical_errors_of(drawings)
 
 
 def _check_instruments(scene: Scene, capture: Capture) -> None:
@@ -177,3 +186,72 @@ def _check_instruments(scene: Scene, capture: Capture) -> None:
             raise NeecoError(
                 f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"
             )
+
+
+@dataclass(frozen=True)
+class TypicalErrors:
+    """How well pixels of training frames are explained: USUAL of them have a smaller error (mean over colours) than
+    these, inside the label and beside it."""
+
+    inside: float
+    beside: float
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far the recorded image supports a label."""
+
+    value: float  # in [0, 1]: the overlap that the votes leave
+    against: float  # share of the label's pixels that vote against it
+    missed: float  # pixels beside the label that it misses, as a share of the label's
+
+    def to_json(self) -> dict[str, float]:
+        """As plain values, for files."""
+        return {name: round(number, 4) for name, number in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Of every pixel [H, W]: in the label, beside it, and how far the drawing and the tissue alone are off."""
+
+    label: np.ndarray
+    beside: np.ndarray
+    drawn: np.ndarray
+    tissue: np.ndarray
+
+
+def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | None]]) -> TypicalErrors:
+    """From drawings of frames trained on, each with its image [H, W, 3] and loss mask."""
+    errors = [_errors(*drawing) for drawing in drawings]
+    inside = np.concatenate([frame.drawn[frame.label] for frame in errors])
+    beside = np.concatenate([frame.drawn[frame.beside] for frame in errors])
+    return TypicalErrors(
+        *(round(float(np.quantile(values, USUAL)), 5) if len(values) else 1.0 for values in (inside, beside))
+    )
+
+
+def estimate_trust(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, typical: TypicalErrors) -> Trust:
+    """How far the label of `drawing` can be trusted as that of `image` [H, W, 3]; 0 where there is no label.
+
+    Pixels that the frame's loss mask leaves out do not vote.
+    """
+    errors = _errors(drawing, image, mask)
+    unexplained = (errors.drawn > typical.inside) & (errors.drawn > HALF * errors.tissue)
+    against = errors.label & ((errors.drawn > errors.tissue) | unexplained)
+    missed = errors.beside & (errors.drawn > typical.beside)
+    size = max(1, int(errors.label.sum()))
+    left_out, added = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
+    return Trust((int(errors.label.sum()) - left_out) / (size + added), left_out / size, added / size)
+
+
+def _errors(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None) -> _Errors:
+    votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
+    label = drawing.parts.numpy() > 0
+    away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
+    near = ~label & (away <= BESIDE * float(np.hypot(*label.shape)))
+    assert drawing.tissue_image is not None
+    drawn, tissue = (
+        uniform_filter((rendered - image).abs().mean(2).numpy(), SMOOTH)
+        for rendered in (drawing.image, drawing.tissue_image)
+    )
+    return _Errors(label & votes, near & votes, drawn, tissue)

@@ -1,48 +1,73 @@
-"""`neeco synthesize`: draw many states, keep the acceptable ones, write them with labels."""
+"""`neeco synthesize`: draw many states, write the acceptable ones with labels; and what any data set has as a whole.
+
+dataset.json says how it was made, and decides whether one begun may be continued. Index files, README.md and preview
+are written from the records of its images.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import neeco
 from neeco import cluster
 from neeco.errors import NeecoError
-from neeco.files import own_folder, write_json
-from neeco.raster.threads import threads
+from neeco.files import is_vacant, own_folder, read_json, require_inside, write_json
+from neeco.labels.annotation import keypoint_names
+from neeco.labels.drawing import REACH
+from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
+from neeco.raster.native import threads
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.acceptance import ENTERS_ANOTHER, ENTERS_TISSUE, LEAVES_IMAGE, UNSEEN
-from neeco.synthesis.cluster import make_on_cluster
-from neeco.synthesis.effects import read_effects
-from neeco.synthesis.indexes import (
-    INFO,
-    SCENE_FILE,
-    check_output,
-    counted,
-    description,
-    drawn,
-    keeping,
-    refusals,
-    skipped,
-    write_indexes,
+from neeco.synthesis.camera_effects import read_effects
+from neeco.synthesis.generator import (
+    ENTERS_ANOTHER,
+    ENTERS_TISSUE,
+    LEAVES_IMAGE,
+    UNOBSERVED_TISSUE,
+    VERB,
+    GeneratorSpec,
+    SampleGenerator,
+    draw_to_folder,
+    format_counts,
 )
-from neeco.synthesis.making import Maker
-from neeco.synthesis.samplers import states_fingerprint
+from neeco.synthesis.preview import write_preview
+from neeco.synthesis.samplers import SIMILAR, states_fingerprint
 from neeco.synthesis.settings import Format, Settings
-from neeco.synthesis.source import VERB, Source
-from neeco.synthesis.views import SIMILAR
-from neeco.synthesis.workers import make_in_processes
-from neeco.synthesis.writers.folder import Record, load_record, record_path
+from neeco.synthesis.workers import draw_in_processes, draw_on_cluster
+from neeco.synthesis.writers.bop import write_bop
+from neeco.synthesis.writers.coco import write_coco
+from neeco.synthesis.writers.folder import (
+    DEPTH_MM_PER_COUNT,
+    FOLDERS,
+    IGNORED,
+    SHARE_PER_COUNT,
+    Record,
+    load_record,
+    record_path,
+    write_states,
+)
+from neeco.synthesis.writers.hub import write_card, write_imagefolder, write_webdataset
+from neeco.synthesis.writers.yolo import write_yolo
 
 if TYPE_CHECKING:
+    from neeco.scene import Scene
     from neeco.training.run import Run
+
+SCHEMA = "neeco-dataset/1"
+INFO = "dataset.json"
+SCENE_FILE = "scene.safetensors"
 
 REMEDIES = {  # where every given state was refused
     LEAVES_IMAGE: "correct its poses (world frame, mm) or cameras, or lower --min-share",
     ENTERS_ANOTHER: "mix fewer instruments",
-    UNSEEN: "record more of the tissue, or keep --views recorded",
+    UNOBSERVED_TISSUE: "record more of the tissue, or keep --views recorded",
     ENTERS_TISSUE: "give a larger --tissue-tolerance-mm, or --no-tissue-check",
 }
 
@@ -66,17 +91,17 @@ def synthesize(
     resume: bool = False,
     on_progress: Callable[[int], None] = lambda done: None,
     workers: int = 1,
-    casts: Sequence[Run] = (),
+    instrument_runs: Sequence[Run] = (),
 ) -> Synthesized:
-    """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `casts` of its tissue
-    under the instruments of those runs.
+    """Write a labelled data set of `settings.count` images of the run's scene to `output`; with `instrument_runs` of
+    its tissue under the instruments of those runs.
 
     Image `index` depends on (scene, settings, index) alone, however many `workers` share the work: processes started
     anew, so that a script needs `if __name__ == "__main__"` about its own start.
     Interrupted (Ctrl-C) or failing, it keeps and indexes what is done, for `resume`; where no image was drawn at all,
-    `output` is left as it was found. `on_progress` is told how many images are done. How many threads torch takes is
-    the caller's to set (`open_run`). Raises NeecoError for bad settings, an output that is not empty (without `resume`)
-    or was made with other settings, and when no acceptable state is found.
+    `output` is left as it was found. `on_progress` gets how many images are done. How many threads torch takes is the
+    caller's to set (`open_run`). Raises NeecoError for bad settings, an output that is not empty (without `resume`) or
+    was made with other settings, and when no acceptable state is found.
     """
     settings.check()
     if workers < 1:
@@ -84,53 +109,186 @@ def synthesize(
     if workers > 1 and cluster.address():
         cluster.require_ray()
     output = Path(output)
-    scenes = [gaussian_scene(given.scene, VERB) for given in (run, *casts)]
+    runs = (run, *instrument_runs)
+    scene, *instrument_scenes = (gaussian_scene(given.scene, VERB) for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
     identity = settings.identity() | {
         "states_sha256": states_fingerprint(settings.states),
         "similar_views": SIMILAR,
         "camera_effects": effects,
     }
-    info = description(run, identity, casts)
+    info = description(run, identity, instrument_runs)
     begun = check_output(output, info, resume)
     if begun and record_path(output, settings.count).exists():
         raise NeecoError(
             f"--count: {output} holds more than {settings.count} images already; give more, or a new folder"
         )
-    maker = Maker.of(scenes[0], settings, scenes[1:])
-    info["tissue_tolerance_mm"] = maker.acceptance.tolerance_mm
-    if maker.gains:
-        info["color_gains"] = [[round(value, 4) for value in gain] for gain in maker.gains]
-    write = partial(write_indexes, output, info=info, scene=maker.scene, labeller=maker.labeller, formats=formats)
+    generator = SampleGenerator.of(scene, settings, instrument_scenes)
+    info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
+    if generator.gains:
+        info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
+    write = partial(
+        write_indexes, output, info=info, scene=generator.scene, labeller=generator.labeller, formats=formats
+    )
     with own_folder(output):
-        with keeping(output, settings.count, begun, partial(write, complete=False)):
+        with indexed_on_failure(output, settings.count, begun, partial(write, complete=False)):
             write_json(output / INFO, info | {"complete": False})
-            records = {k: record for k in range(settings.count) if begun and (record := load_record(output, k))}
-            made, missing = 0, [k for k in range(settings.count) if k not in records]
-            if records:
-                on_progress(len(records))
-            files = [Path(given.path) / SCENE_FILE for given in (run, *casts)]
-            source = Source(files[0], settings, str(scenes[0].center.device), tuple(files[1:]))
-            for record in _made(maker, source, output, missing, min(workers, len(missing))):
-                records[record["index"]] = record
+            done = {k: record for k in range(settings.count) if begun and (record := load_record(output, k))}
+            if done:
+                on_progress(len(done))
+            missing = [k for k in range(settings.count) if k not in done]
+            scene_file, *others = (Path(given.path) / SCENE_FILE for given in runs)
+            spec = GeneratorSpec(scene_file, settings, str(scene.center.device), tuple(others))
+            made = 0
+            for record in _draw_all(generator, spec, output, missing, min(workers, len(missing))):
+                done[record["index"]] = record
                 made += not record.get("skipped")
-                on_progress(len(records))
-            all_of_them = [records[k] for k in range(settings.count)]
-            if not drawn(all_of_them):
-                refused = refusals(all_of_them)
+                on_progress(len(done))
+            records = [done[k] for k in range(settings.count)]
+            if not with_image(records):
+                refused = refusals(records)
                 remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
-                raise NeecoError(f"{settings.states}: every state was refused ({counted(refused)}); {remedies}")
-        write(all_of_them, complete=True)
-        return Synthesized(output, len(drawn(all_of_them)), made, refusals(all_of_them), skipped(all_of_them))
+                raise NeecoError(f"{settings.states}: every state was refused ({format_counts(refused)}); {remedies}")
+        write(records, complete=True)
+        return Synthesized(output, len(with_image(records)), made, refusals(records), skipped(records))
 
 
-def _made(maker: Maker, source: Source, output: Path, missing: list[int], workers: int) -> Iterator[Record]:
-    """The records of the missing images, as they are made."""
+def _draw_all(
+    generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
+) -> Iterator[Record]:
+    """The records of the missing images, as they are drawn."""
     if workers > 1 and cluster.address():
-        yield from make_on_cluster(source, output, missing, workers)
-        return
+        return draw_on_cluster(spec, output, missing, workers)
     if workers > 1:
-        yield from make_in_processes(source, output, missing, workers, max(1, threads() // workers))
-        return
-    for index in missing:
-        yield maker.make(output, index)
+        return draw_in_processes(spec, output, missing, workers, max(1, threads() // workers))
+    return (draw_to_folder(generator, output, index) for index in missing)
+
+
+def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Run] = ()) -> dict[str, Any]:
+    """How a data set of the run's scene, or of its tissue under the instruments of `instrument_runs`, is made: what
+    dataset.json begins with. `settings` must stay the same for it to be continued."""
+    info = {
+        "schema": SCHEMA,
+        "version": neeco.__version__,
+        "scene_sha256": _digest(run),
+        "settings": settings,
+        "soft": {"share_per_count": SHARE_PER_COUNT},
+        "ignore": {"ignored": IGNORED, "clear_shares": list(CLEAR_SHARES), "reach": REACH},
+        "scene": str(run.path),
+    }
+    if instrument_runs:
+        info["settings"] = settings | {"instruments_sha256": [_digest(given) for given in instrument_runs]}
+        info["instruments"] = [str(given.path) for given in instrument_runs]
+    return info
+
+
+def _digest(run: Run) -> str:
+    scene_file = Path(run.path) / SCENE_FILE
+    try:
+        return hashlib.sha256(scene_file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
+
+
+def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
+    """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give a folder")
+    if is_vacant(output):
+        return False
+    if not resume:
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")
+    if not (output / INFO).exists():
+        raise NeecoError(f"{output}: not empty and no {INFO} in it; --resume continues only data sets made by neeco")
+    begun = read_json(require_inside(output / INFO, output))
+    if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
+        raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
+    settings = Settings.with_new_names(begun["settings"])
+    compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
+    # a version that wrote neither of these folders named neither: all its images are drawn anew
+    compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
+    compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
+    for key, before, now in compared:
+        if before != now:
+            raise NeecoError(f"{output / INFO}: {key}: begun with {before!r}, now {now!r}; use a new folder")
+    return True
+
+
+@contextlib.contextmanager
+def indexed_on_failure(output: Path, count: int, begun: bool, write: Callable[[list[Record]], None]) -> Iterator[None]:
+    """For a block that makes images 0 to `count` - 1 of a data set. Interrupted (Ctrl-C) or failing, what is done stays
+    and is indexed by `write`, to be continued; where nothing was `begun` and no image made, nothing stays."""
+    try:
+        yield
+    except (KeyboardInterrupt, NeecoError):
+        records = [record for index in range(count) if (record := load_record(output, index)) is not None]
+        if begun or with_image(records):
+            with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to continue from
+                write(records)
+        else:
+            (output / INFO).unlink(missing_ok=True)
+            for folder in FOLDERS:
+                shutil.rmtree(output / folder, ignore_errors=True)
+        raise
+
+
+def write_indexes(
+    output: Path,
+    records: list[Record],
+    info: dict[str, Any],
+    scene: Scene,
+    labeller: Labeller,
+    formats: tuple[Format, ...],
+    complete: bool,
+) -> None:
+    """(Re)write everything that is about the whole data set, from the records."""
+    images = with_image(records)
+    instruments = instruments_of(labeller.names)
+    keypoints = keypoint_names(scene)
+    write_states(output, images)
+    writers: dict[Format, Callable[[], None]] = {
+        "coco": lambda: write_coco(output, images, instruments, keypoints),
+        "yolo": lambda: write_yolo(output, images, instruments, keypoints),
+        "webdataset": lambda: write_webdataset(output, images),
+        "bop": lambda: write_bop(output, images, labeller.names),
+        "imagefolder": lambda: write_imagefolder(output, images, instruments),
+    }
+    for name, writer in writers.items():
+        if name in formats:
+            writer()
+    if images:
+        write_preview(output, images, labeller.names)
+    thresholds = labeller.thresholds if isinstance(labeller, ThresholdLabels) else None
+    info = info | {
+        "complete": complete,
+        "images": len(images),
+        "splits": dict(Counter(record["split"] for record in images)),
+        "formats": list(formats),
+        "ids": [{"id": 0, "part": "tissue"}]
+        + [{"id": k + 1, "instrument": name, "part": part} for k, (name, part) in enumerate(labeller.names)],
+        "keypoints": list(keypoints),
+        "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
+        "delta_thresholds": None if thresholds is None else asdict(thresholds),
+        "refused": refusals(records),
+        "skipped": skipped(records),
+    }
+    write_card(output, info)
+    write_json(output / INFO, info)
+
+
+def with_image(records: Sequence[Record]) -> list[Record]:
+    """The records of images that were written."""
+    return [record for record in records if not record.get("skipped")]
+
+
+def skipped(records: Sequence[Record]) -> list[int]:
+    """Indices without an image."""
+    return [record["index"] for record in records if record.get("skipped")]
+
+
+def refusals(records: Sequence[Record]) -> dict[str, int]:
+    """How many states were refused, by reason."""
+    refused: Counter[str] = Counter()
+    for record in records:
+        refused.update(record["refused"])
+    return dict(sorted(refused.items()))

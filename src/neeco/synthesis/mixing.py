@@ -1,48 +1,44 @@
 """The tissue of one run under the instruments of others: one scene of them all, and where the instruments stand in it.
 
-An instrument stands before the camera as in its own recording, its working end as far before the tissue as it was
+An instrument is placed before the camera as in its own recording, its working end as far before the tissue as it was
 there; lengths stay what they are (mm). The light is that of the tissue's capture.
 """
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.random import Generator
-from torch import Tensor, nn
+from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.evaluation.resize import resize_camera
+from neeco.evaluation.image_metrics import resize_camera
+from neeco.labels.annotation import working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project
 from neeco.raster.sh import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
-from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.hinges import PART_LOGITS
-from neeco.scene.recorded import Recorded
+from neeco.scene.deformations.base import Deformation
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
-from neeco.scene.seen import SEEN
-from neeco.synthesis.acceptance import ends_or_origins
-from neeco.synthesis.samplers import make_sampler
+from neeco.scene.visibility import VISIBILITY
+from neeco.synthesis.samplers import Sampler, make_sampler
 
 if TYPE_CHECKING:
     from neeco.synthesis.settings import Settings
 
-Draw = Callable[[int, Generator], tuple[State, Camera]]
-
-COARSE = 0.25  # of the image's size, at which the depth of tissue is looked up
-MOMENTS = 24  # that the mixed scene remembers as if they had been recorded
-GAINS = (0.6, 1.6)  # how far colours are changed at most: beyond that, shafts are of other make
-SOLID = 0.5  # opacity of Gaussians that tell a shaft's colour
+DEPTH_SCALE = 0.25  # of the image's size, at which the depth of tissue is looked up
+RECORDED_FRAMES = 24  # frames that the mixed scene has as if they had been recorded
+GAINS = (0.6, 1.6)  # range of the change of colours: beyond that, the shafts differ in make
+SOLID = 0.5  # least opacity of Gaussians that tell a shaft's colour
 
 
 @dataclass(frozen=True)
@@ -51,63 +47,73 @@ class Mixture:
 
     scene: Scene
     tissue: Scene
-    casts: tuple[Scene, ...]  # whose instruments they are
-    gains: tuple[tuple[float, float, float], ...]  # by which each cast's colours were multiplied
-    nearest: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
-    ground: Gaussians  # the tissue alone
-    grounds: tuple[Gaussians, ...]  # the same of every cast
+    instrument_scenes: tuple[Scene, ...]
+    gains: tuple[tuple[float, float, float], ...]  # by which each instrument scene's colours were multiplied
+    min_depth: Mapping[str, float]  # mm from the lens, by instrument: working ends were recorded no nearer
+    tissue_alone: Gaussians  # of `tissue`
+    own_tissue_alone: tuple[Gaussians, ...]  # of every instrument scene
 
     @classmethod
-    def of(cls, tissue: Scene, casts: Sequence[Scene]) -> Mixture:
+    def of(cls, tissue: Scene, instrument_scenes: Sequence[Scene]) -> Mixture:
         """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
-        for scene in (tissue, *casts):
-            if not isinstance(scene.deformation, Kinematic):
+        for scene in (tissue, *instrument_scenes):
+            if not scene.deformation.separates_instruments or scene.method != tissue.method:
                 raise NeecoError(
                     f"--instruments: method {scene.method} does not keep tissue and instruments apart; "
                     "mix runs of method kinematic"
                 )
-        names = [instrument.name for scene in casts for instrument in scene.instruments]
+        names = [instrument.name for scene in instrument_scenes for instrument in scene.instruments]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise NeecoError(f"--instruments: {twice[0]!r} is in two of the runs; mix runs whose instruments differ")
         if not names:
             raise NeecoError("--instruments: none of the runs has an instrument; train on captures that record them")
-        if any(not scene.recorded.states for scene in (tissue, *casts)):
+        if any(not scene.recorded.states for scene in (tissue, *instrument_scenes)):
             raise NeecoError("--tissue: a run remembers no recorded frame; train it again with this version")
-        gains = tuple(_gain(tissue, scene) for scene in casts)
-        mixed = _composed(tissue, casts, gains)
-        nearest = {name: _nearest(scene) for scene in casts for name in (item.name for item in scene.instruments)}
-        grounds = tuple(ground_of(scene) for scene in casts)
-        mixture = cls(mixed, tissue, tuple(casts), gains, nearest, ground_of(tissue), grounds)
-        mixed.recorded = mixture._remembered()
+        gains = tuple(_gain(tissue, scene) for scene in instrument_scenes)
+        mixture = cls(
+            _merged(tissue, instrument_scenes, gains),
+            tissue,
+            tuple(instrument_scenes),
+            gains,
+            {item.name: _min_depth(scene) for scene in instrument_scenes for item in scene.instruments},
+            tissue_gaussians(tissue),
+            tuple(tissue_gaussians(scene) for scene in instrument_scenes),
+        )
+        mixture.scene.recorded = mixture._recorded()
         return mixture
 
     def sampler(self, settings: Settings) -> MixedSampler:
-        """Draws where the instruments stand, each as its own run's sampler does."""
-        if settings.states not in ("inside", "beyond"):
+        """Draws where the instruments are, each as its own run's sampler does."""
+        if settings.states not in ("interpolate", "extrapolate"):
             raise NeecoError(
-                f"--states: {settings.states}: states of one recording; with --instruments use inside or beyond"
+                f"--states: {settings.states}: states of one recording; with --instruments use interpolate "
+                "or extrapolate"
             )
         if settings.views == "orbit":
             raise NeecoError("--views: orbit is about one recording's tissue; with --instruments use another")
-        draws = [make_sampler(s, settings.states, settings.margin, "recorded", settings.count) for s in self.casts]
-        return MixedSampler(self, tuple(draws))
+        samplers = [
+            make_sampler(scene, settings.states, settings.margin, "recorded", settings.count)
+            for scene in self.instrument_scenes
+        ]
+        return MixedSampler(self, tuple(samplers))
 
-    def place(self, cast: Scene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
-        """The instruments of `cast`, in `state` before `seen_by`, as they stand before `camera` of the tissue's run.
+    def place(self, scene: Scene, state: State, seen_by: Camera, camera: Camera) -> dict[str, InstrumentState]:
+        """The instruments of instrument scene `scene`, in `state` before `seen_by`, as placed before `camera` of the
+        tissue's run.
 
         They are shifted along the line of sight until they are as far before this tissue as before their own, but no
-        nearer to the lens than they were recorded: nobody knows what they look like there.
+        nearer to the lens than they were recorded: how they look there is unknown.
         """
-        registered = cast.registered(state)
+        registered = scene.registered(state)
         camera_from_world = np.linalg.inv(to_numpy(seen_by.world_from_camera))
-        end = _working_end(cast, state, seen_by)
+        end = _working_end(scene, state, seen_by)
         shift = np.eye(4)
-        own = self.grounds[self.casts.index(cast)]
-        here, there = tissue_depth(self.ground, camera, end), tissue_depth(own, seen_by, end)
+        own_tissue = self.own_tissue_alone[self.instrument_scenes.index(scene)]
+        here, there = tissue_depth(self.tissue_alone, camera, end), tissue_depth(own_tissue, seen_by, end)
         if here > 0 and there > 0 and end[2] > 0:
-            nearest = min(self.nearest[name] for name in registered.instruments)
-            depth = max(end[2] + here - there, min(nearest, end[2]))
+            min_depth = min(self.min_depth[name] for name in registered.instruments)
+            depth = max(end[2] + here - there, min(min_depth, end[2]))
             shift[:3, 3] = (depth / end[2] - 1) * end
         carry = to_numpy(camera.world_from_camera) @ shift @ camera_from_world
         return {
@@ -115,18 +121,18 @@ class Mixture:
             for name, given in registered.instruments.items()
         }
 
-    def _remembered(self) -> Recorded:
-        """Moments spread over the tissue's cameras, the casts' recorded states carried over."""
+    def _recorded(self) -> Recorded:
+        """Frames spread over the tissue's cameras, with the instrument scenes' recorded states placed before them."""
         cameras = self.tissue.recorded.cameras
-        count = min(MOMENTS, len(cameras))
+        count = min(RECORDED_FRAMES, len(cameras))
         chosen, states = [], []
         for k in range(count):
             camera = cameras[round(k * (len(cameras) - 1) / max(1, count - 1))]
             placed: dict[str, InstrumentState] = {}
-            for scene in self.casts:
+            for scene in self.instrument_scenes:
                 own = scene.recorded
-                moment = round(k * (len(own.states) - 1) / max(1, count - 1))
-                placed |= self.place(scene, own.states[moment], own.cameras[moment], camera)
+                frame = round(k * (len(own.states) - 1) / max(1, count - 1))
+                placed |= self.place(scene, own.states[frame], own.cameras[frame], camera)
             chosen.append(camera)
             states.append(State(placed, 0.0))
         names = tuple(f"{k:06d}" for k in range(count))
@@ -135,10 +141,11 @@ class Mixture:
 
 @dataclass(frozen=True)
 class MixedSampler:
-    """Draws (state, camera): a recorded camera of the tissue's run, and before it what every cast's sampler draws."""
+    """Draws (state, camera): a recorded camera of the tissue's run, and before it what the sampler of every instrument
+    scene draws."""
 
     mixture: Mixture
-    draws: tuple[Draw, ...]
+    samplers: tuple[Sampler, ...]
     prescribed: bool = False
 
     def fixed(self, index: int) -> bool:
@@ -150,19 +157,19 @@ class MixedSampler:
         cameras = self.mixture.tissue.recorded.cameras
         camera = cameras[int(rng.integers(len(cameras)))]
         placed: dict[str, InstrumentState] = {}
-        for scene, draw in zip(self.mixture.casts, self.draws, strict=True):
-            placed |= self.mixture.place(scene, *draw(index, rng), camera)
+        for scene, sampler in zip(self.mixture.instrument_scenes, self.samplers, strict=True):
+            placed |= self.mixture.place(scene, *sampler(index, rng), camera)
         return State(placed, 0.0), camera
 
 
 def _working_end(scene: Scene, state: State, camera: Camera) -> np.ndarray:
     """The mean [3] mm of the instruments' working ends in the camera's frame; of their origins where none is known."""
-    ends = [point for points in ends_or_origins(scene, state).values() for point in points]
+    ends = [point for points in working_ends_or_origins(scene, state).values() for point in points]
     camera_from_world = np.linalg.inv(to_numpy(camera.world_from_camera))
     return camera_from_world[:3, :3] @ np.mean(ends, axis=0) + camera_from_world[:3, 3]
 
 
-def _nearest(scene: Scene) -> float:
+def _min_depth(scene: Scene) -> float:
     """Depth mm of the working ends in the recorded frame where they were nearest to the lens."""
     recorded = scene.recorded
     pairs = zip(recorded.states, recorded.cameras, strict=True)
@@ -170,34 +177,32 @@ def _nearest(scene: Scene) -> float:
 
 
 @torch.no_grad()
-def ground_of(scene: Scene) -> Gaussians:
+def tissue_gaussians(scene: Scene) -> Gaussians:
     """The scene's tissue alone, which stands still; for its depth, so without its light."""
     gaussians = scene.at(scene.recorded.states[0])
     return dataclasses.replace(gaussians, sh=gaussians.sh[:, :1], headlight=None).select(scene.canonical.bodies == 0)
 
 
 @torch.no_grad()
-def tissue_depth(ground: Gaussians, camera: Camera, point: np.ndarray) -> float:
+def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
     """Depth mm of a tissue alone on the line of sight through `point` [3] mm of the camera's frame; 0 for none.
 
     Beyond the image's border, that of the nearest pixel.
     """
-    coarse = resize_camera(camera, COARSE)
-    drawn = rasterize(ground, coarse)
+    coarse = resize_camera(camera, DEPTH_SCALE)
+    drawn = rasterize(tissue, coarse)
     x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
     row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))
     return float(surface_depth(drawn)[row, column])
 
 
-def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:
-    """One scene of the tissue of `tissue` and the instruments of `casts`."""
-    instruments = tuple(instrument for scene in casts for instrument in scene.instruments)
-    deformation = Kinematic(instruments, copy.deepcopy(casts[0].settings))
-    deformation.hinges = nn.ModuleList(copy.deepcopy(hinges) for s in casts for hinges in _kinematic(s).hinges)
-    columns = deformation.logit_count
-    bodies = [_body(tissue, 0, columns)]
-    for scene, gain in zip(casts, gains, strict=True):
-        bodies += [_brightened(_body(scene, k + 1, columns), gain) for k in range(len(scene.instruments))]
+def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:
+    """One scene of the tissue of `tissue` and the instruments of `instrument_scenes`."""
+    instruments = tuple(instrument for scene in instrument_scenes for instrument in scene.instruments)
+    deformation = tissue.deformation.combined([scene.deformation for scene in instrument_scenes])
+    bodies = [_body(tissue, 0, deformation)]
+    for scene, gain in zip(instrument_scenes, gains, strict=True):
+        bodies += [_brightened(_body(scene, k + 1, deformation), gain) for k in range(len(scene.instruments))]
     mixed = Scene(
         tissue.method, join_bodies(bodies), deformation, instruments, tissue.recorded, tissue.center.detach().clone()
     ).to(tissue.center.device)
@@ -206,24 +211,18 @@ def _composed(tissue: Scene, casts: Sequence[Scene], gains: Sequence[tuple[float
         mixed.falloff.copy_(torch.stack([tissue.falloff[0], own_light]))
         for name in ("vignette", "shadow_offsets", "shadow_strengths", "shadow_width"):
             getattr(mixed, name).copy_(getattr(tissue, name))
-    mixed.sh_degree = max(scene.sh_degree for scene in (tissue, *casts))
+    mixed.sh_degree = max(scene.sh_degree for scene in (tissue, *instrument_scenes))
     mixed.background = tissue.background
     return mixed.requires_grad_(False)
 
 
-def _kinematic(scene: Scene) -> Kinematic:
-    assert isinstance(scene.deformation, Kinematic)
-    return scene.deformation
-
-
-def _body(scene: Scene, index: int, columns: int) -> CanonicalGaussians:
-    """One body alone, with as many part logits as the mixed scene has, and how well it was seen."""
+def _body(scene: Scene, index: int, deformation: Deformation) -> CanonicalGaussians:
+    """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
-    logits = canonical.extras[PART_LOGITS][rows]
-    seen = scene.seen()[rows]
-    padded = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
+    seen = scene.visibility()[rows]
+    extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
-    return alone.with_extras(**{PART_LOGITS: padded, SEEN: seen})
+    return alone.with_extras(**extras, **{VISIBILITY: seen})
 
 
 def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:
@@ -232,13 +231,13 @@ def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> C
     return dataclasses.replace(body, sh_dc=brightened(body.sh_dc, factor), sh_rest=body.sh_rest * factor)
 
 
-def _gain(tissue: Scene, cast: Scene) -> tuple[float, float, float]:
-    """By what the colours of `cast` are multiplied to look as under the light of `tissue`'s capture, going by the
-    shafts: grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the same
-    run."""
-    if tissue is cast or not tissue.instruments:
+def _gain(tissue: Scene, instruments: Scene) -> tuple[float, float, float]:
+    """By what the colours of `instruments` are multiplied to look as under the light of `tissue`'s capture, going by
+    the shafts, grey of a like kind in both. 1 where the tissue's run has no instrument to compare with, or it is the
+    same run."""
+    if tissue is instruments or not tissue.instruments:
         return 1.0, 1.0, 1.0
-    ratio = _shaft_color(tissue) / _shaft_color(cast).clamp_min(1e-3)
+    ratio = _shaft_color(tissue) / _shaft_color(instruments).clamp_min(1e-3)
     red, green, blue = (float(value) for value in ratio.clamp(*GAINS))
     return red, green, blue
 

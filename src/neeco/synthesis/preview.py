@@ -7,37 +7,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from neeco.evaluation.difference import outline
+from neeco.capture.model import evenly_spaced
+from neeco.evaluation.image_metrics import outline
 from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED, SKELETON
 from neeco.synthesis.writers.folder import Record
 
 TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
+PART_COLORS = ("#4287f5", "#1cc8a0", "#ff7a45", "#d650c8", "#a0c83c", "#fac83c", "#786ef0", "#eb5569")
 PAPER, INK, FAINT = (250, 250, 248), (30, 32, 36), (120, 124, 130)
 BOX, RECTANGLE, BONE, HIDDEN = (255, 255, 255), (255, 209, 70), (20, 22, 26), (150, 150, 150)
-PALETTE = np.array(
-    [
-        (66, 135, 245),
-        (28, 200, 160),
-        (255, 122, 69),
-        (214, 80, 200),
-        (160, 200, 60),
-        (250, 200, 60),
-        (120, 110, 240),
-        (235, 85, 105),
-    ]
-)
-TINT = 0.42
+PALETTE = np.array([ImageColor.getrgb(color) for color in PART_COLORS])
+TINT = 0.42  # opacity of a part's colour over the image
 CAPTION_FONTS = 13, 12  # px
 LABEL_COLUMN = 210
 
 
 def write_preview(root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]]) -> None:
     """Write preview.png: up to 12 images spread over the data set, parts tinted, with boxes and keypoints."""
-    chosen = [records[k] for k in np.unique(np.linspace(0, len(records) - 1, min(TILES, len(records))).astype(int))]
-    tiles = [draw_tile(root, record) for record in chosen]
+    tiles = [draw_tile(root, records[k]) for k in evenly_spaced(len(records), TILES, floor=True)]
     columns = min(COLUMNS, len(tiles))
     rows = -(-len(tiles) // columns)
     height = max(tile.height for tile in tiles)
@@ -72,7 +62,7 @@ def draw_tile(root: Path, record: Record) -> Image.Image:
     text = ImageDraw.Draw(tile)
     lines = [(line, INK, CAPTION_FONTS[0]) for line in first] + [(line, FAINT, CAPTION_FONTS[1]) for line in second]
     for k, (line, color, font) in enumerate(lines):
-        text.text((0, size[1] + 5 + CAPTION_LINE * k), line, color, _font(font))
+        text.text((0, size[1] + 5 + CAPTION_LINE * k), line, color, ImageFont.load_default(font))
     return tile
 
 
@@ -81,7 +71,7 @@ def wrap(items: Sequence[str], width: float, font: int) -> list[str]:
     lines: list[str] = []
     for item in items:
         longer = f"{lines[-1]} · {item}" if lines else item
-        if lines and _font(font).getlength(longer) <= width:
+        if lines and ImageFont.load_default(font).getlength(longer) <= width:
             lines[-1] = longer
         else:
             lines.append(item)
@@ -115,7 +105,7 @@ def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], scale: float
 
 def _tag(canvas: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
     """The name above the box, or inside it where there is no room above; never beyond the tile's right edge."""
-    font = _font(11)
+    font = ImageFont.load_default(11)
     width = canvas.textlength(text, font=font) + 8
     left, top = min(x, TILE_WIDTH - width), y - 16 if y >= 16 else y
     canvas.rectangle((left, top, left + width, top + 15), fill=BOX)
@@ -142,8 +132,4 @@ def _legend(canvas: ImageDraw.ImageDraw, names: Sequence[tuple[str, str]], width
             canvas.ellipse((x + 2, y + 2, x + 14, y + 14), fill=color, outline=BONE, width=2)
         else:
             canvas.rectangle((x, y, x + 16, y + 16), fill=color)
-        canvas.text((x + 24, y + 1), text, INK, _font(13))
-
-
-def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
-    return ImageFont.load_default(size)
+        canvas.text((x + 24, y + 1), text, INK, ImageFont.load_default(13))

@@ -1,40 +1,128 @@
-"""From what the user asked for to a sampler of states and one of views."""
+"""Samplers of views, and what draws the state and the camera of image `index` as the user asked for them.
+
+Views: recorded cameras, cameras near them, cameras in orbit about the tissue.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import State
+from neeco.capture.model import RecordedStates, State, evenly_spaced
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
-from neeco.synthesis.acceptance import shows_working_end
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Views
-from neeco.synthesis.states import AlongPath, Beyond, Grid, Inside, Listed, StateSampler
-from neeco.synthesis.views import (
-    OrbitViews,
-    PerturbedViews,
-    RecordedViews,
-    ViewSampler,
-    moved_camera,
-    surface_points,
+from neeco.synthesis.states import (
+    ExtrapolatedStates,
+    GridStates,
+    InterpolatedStates,
+    ListedStates,
+    PathStates,
+    StateSampler,
+    rigid,
+    turn_about,
 )
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
 
-AIMS = 50  # views tried before the drawn image decides
+SIMILAR = 10  # recorded frames whose cameras may see a drawn state
+VIEW_ATTEMPTS = 50  # views drawn until one has the instrument in the image
 SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
+
+# Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
+ViewSampler = Callable[[State, Generator], Camera]
+
+
+class SimilarFrames:
+    """Picks one of `count` recorded frames (its index): of the SIMILAR whose instruments stood most like the drawn
+    ones, or any where nothing tells them apart. states: the frames'; empty: nothing does."""
+
+    def __init__(self, states: Sequence[State], count: int, joints: bool) -> None:
+        common = set.intersection(*(set(state.instruments) for state in states)) if states else set()
+        recorded = RecordedStates(states, sorted(common), joints) if common else None
+        self._recorded = None if recorded is None or recorded.still else recorded
+        self._count = count
+
+    def any(self, rng: Generator) -> int:
+        """Any frame."""
+        return int(rng.integers(self._count))
+
+    def like(self, state: State, rng: Generator) -> int:
+        """A frame whose instruments stood like those of `state`."""
+        if self._recorded is None or not set(self._recorded.instruments) <= set(state.instruments):
+            return self.any(rng)
+        nearest = np.argsort(self._recorded.distances(state), kind="stable")[:SIMILAR]
+        return int(nearest[rng.integers(len(nearest))])
+
+
+class RecordedViews:
+    """The camera of a recorded frame, one of the SIMILAR whose instruments stood most like the drawn ones.
+
+    A camera that follows its instrument saw it there: drawn so, instruments stand in the image as recorded ones do,
+    which is what a detector learns from (docs/benchmarks.md). states: the recorded frames'; empty: any camera.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], states: Sequence[State] = ()) -> None:
+        if not cameras:
+            raise NeecoError("views: the scene remembers no recorded camera; train it again with this version")
+        self.cameras = cameras
+        self._frames = SimilarFrames(states, len(cameras), joints=False)
+
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        return self.cameras[self._frames.like(state, rng)]
+
+
+@dataclass(frozen=True)
+class PerturbedViews:
+    """A recorded camera, turned about its centre and shifted, both normally distributed about zero.
+
+    `degrees` and `mm` are standard deviations of the angle about each axis and of the shift along each.
+    """
+
+    recorded: RecordedViews
+    degrees: float = 3.0
+    mm: float = 3.0
+
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        camera = self.recorded(state, rng)
+        turn = Rotation.from_rotvec(np.deg2rad(self.degrees) * rng.standard_normal(3)).as_matrix()
+        offset = rigid(turn, self.mm * rng.standard_normal(3))
+        return moved_camera(camera, to_numpy(camera.world_from_camera) @ offset)
+
+
+@dataclass(frozen=True)
+class OrbitViews:
+    """A recorded camera carried round `centre` (world mm), which stays at its place in the image.
+
+    The turn is uniform in direction and uniform in angle up to `degrees`.
+    """
+
+    recorded: RecordedViews
+    centre: np.ndarray  # [3] mm
+    degrees: float = 20.0
+
+    def __call__(self, state: State, rng: Generator) -> Camera:
+        camera = self.recorded(state, rng)
+        world_from_camera = to_numpy(camera.world_from_camera)
+        direction = 2 * np.pi * rng.random()
+        # the axis lies in the image plane: the camera moves sideways, it does not roll
+        axis = world_from_camera[:3, :3] @ np.array([np.cos(direction), np.sin(direction), 0.0])
+        turn = turn_about(self.centre, np.deg2rad(self.degrees) * rng.random() * axis)
+        return moved_camera(camera, turn @ world_from_camera)
 
 
 @dataclass(frozen=True)
@@ -58,46 +146,52 @@ class Sampler:
     def __call__(self, index: int, rng: Generator) -> tuple[State, Camera]:
         """The next (state, camera) for image `index`.
 
-        Of a moving camera's views most do not show the instrument, and drawing is dear: views are drawn until one has
-        the instrument in the image, if one does.
+        Most views of a moving camera do not show the instrument, and drawing is costly: views are drawn until one has
+        the instrument in the image, VIEW_ATTEMPTS times at most.
         """
         state = self.states(index, rng)
         given = self.cameras[index % len(self.cameras)]
         if given is not None:
             return state, given
+        points = working_ends_or_origins(self.scene, state)
         camera = self.views(state, rng)
-        for _ in range(AIMS):
-            if shows_working_end(self.scene, state, camera):
+        for _ in range(VIEW_ATTEMPTS):
+            if any_in_image(camera, points):
                 break
             camera = self.views(state, rng)
         return state, camera
 
 
 def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: int) -> Sampler:
-    """The sampler named by `states` (inside, beyond, grid, path:FILE or FILE) and `views`. Raises NeecoError."""
+    """The sampler named by `states` (interpolate, extrapolate, grid, path:FILE or FILE) and `views`. Raises
+    NeecoError."""
     recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
-    view_sampler = _view_sampler(scene, views, recorded)
-    if states == "inside":
-        return Sampler(scene, Inside(scene.recorded.states), view_sampler)
-    if states == "beyond":
-        return Sampler(scene, Beyond(scene.recorded.states, scene.instruments, margin), view_sampler)
+    view_sampler: ViewSampler = recorded
+    if views == "perturbed":
+        view_sampler = PerturbedViews(recorded)
+    elif views == "orbit":
+        view_sampler = OrbitViews(recorded, surface_centre(scene))
+    if states == "interpolate":
+        return Sampler(scene, InterpolatedStates(scene.recorded.states), view_sampler)
+    if states == "extrapolate":
+        return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
-        return Sampler(scene, Grid(scene.recorded.states, instrument_axes(scene)), view_sampler)
+        return Sampler(scene, GridStates(scene.recorded.states, instrument_axes(scene)), view_sampler)
     lines = read_states(states_file(states), scene.instruments)
     if states.startswith(PATH_PREFIX):
-        return Sampler(scene, AlongPath([line.state for line in lines], count), view_sampler)
+        return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
     intrinsics = recorded.cameras[0]
     cameras = tuple(
         None if line.world_from_camera is None else moved_camera(intrinsics, line.world_from_camera) for line in lines
     )
-    return Sampler(scene, Listed([line.state for line in lines]), view_sampler, cameras)
+    return Sampler(scene, ListedStates([line.state for line in lines]), view_sampler, cameras)
 
 
 def states_file(states: str) -> Path:
     """The file that `--states` names; NeecoError when it is meant to be a sampler's name but is none."""
     path = Path(states.removeprefix(PATH_PREFIX))
     if path.is_dir() or (not path.suffix and not path.exists()):
-        raise NeecoError(f"--states: {states!r} is neither inside, beyond, grid, path:FILE.jsonl nor a file")
+        raise NeecoError(f"--states: {states!r} is neither interpolate, extrapolate, grid, path:FILE.jsonl nor a file")
     return path
 
 
@@ -105,9 +199,8 @@ def states_fingerprint(states: str) -> str | None:
     """sha256 of the file that `--states` names; None when it names a sampler."""
     if states in SAMPLERS:
         return None
-    path = states_file(states)
-    missing = "no such file; --states takes inside, beyond, grid, path:FILE.jsonl or FILE.jsonl"
-    return hashlib.sha256(read_bytes(path, "a file of states", missing)).hexdigest()
+    missing = "no such file; --states takes interpolate, extrapolate, grid, path:FILE.jsonl or FILE.jsonl"
+    return hashlib.sha256(read_bytes(states_file(states), "a file of states", missing)).hexdigest()
 
 
 @torch.no_grad()
@@ -130,22 +223,29 @@ def instrument_axes(scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return axes
 
 
-def _view_sampler(scene: Scene, views: Views, recorded: RecordedViews) -> ViewSampler:
-    if views == "recorded":
-        return recorded
-    if views == "perturbed":
-        return PerturbedViews(recorded)
-    return OrbitViews(recorded, surface_centre(scene))
+def moved_camera(camera: Camera, world_from_camera: np.ndarray) -> Camera:
+    """The same camera elsewhere; world_from_camera [4, 4] with OpenCV axes."""
+    return replace(camera, world_from_camera=torch.from_numpy(world_from_camera).to(camera.world_from_camera))
+
+
+def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarray:
+    """World points [P, 3] mm under every `step`-th pixel of a depth image [H, W] mm; pixels of depth 0 give none."""
+    rows, columns = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
+    z = depth[rows, columns]
+    points = np.stack(
+        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z, np.ones_like(z)], -1
+    )[z > 0]
+    return (points @ to_numpy(camera.world_from_camera).T)[:, :3]
 
 
 @torch.no_grad()
 def surface_centre(scene: Scene) -> np.ndarray:
     """The median [3] mm of the surface points that recorded cameras see."""
-    frames = np.unique(np.linspace(0, len(scene.recorded.cameras) - 1, SURFACE_VIEWS).astype(int))
+    recorded = scene.recorded
     points = []
-    for k in frames:
-        camera = scene.camera(scene.recorded.cameras[k])
-        points.append(surface_points(surface_depth(rasterize(scene.at(scene.recorded.states[k]), camera)), camera))
+    for k in evenly_spaced(len(recorded.cameras), SURFACE_VIEWS, floor=True):
+        camera = scene.camera(recorded.cameras[k])
+        points.append(surface_points(surface_depth(rasterize(scene.at(recorded.states[k]), camera)), camera))
     seen = np.concatenate(points)
     if len(seen) == 0:
         raise NeecoError("--views orbit: the scene shows no surface to orbit about; use --views recorded")

@@ -1,7 +1,7 @@
 """Samplers of instrument states.
 
-A sampler turns (index, generator) into a state. The generator is seeded by (seed, index) alone, so any image of a data
-set can be made without the others, in any order, and comes out the same.
+A sampler turns (index, random generator) into a state. The generator is seeded by (seed, index) alone, so any image of
+a data set can be drawn without the others, in any order, and comes out the same.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
 
-AT_ZERO = 0.05  # of a joint's range: what lies beyond 0 by less is noise of its sensor
+AT_ZERO = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
 JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
 
 
 class StateSampler(Protocol):
     """Draws the state of image `index`."""
 
-    prescribed: bool  # the state of an index is given, not random: another try can only change the view
+    prescribed: bool  # the state of an index is given, not random: another attempt can only change the view
 
     def __call__(self, index: int, rng: Generator) -> State:
         """The state of image `index`; a random sampler draws anew on every call with the same generator."""
@@ -56,7 +56,7 @@ class JointRange:
             limits = -math.inf, 0.0
         lower, upper = self.lower - reach, self.upper + reach
         if limits is not None:
-            # limits narrower than what was recorded are the recording's fault: they must not cut into it
+            # where the capture states limits narrower than what it recorded, the recording counts
             lower = min(self.lower, max(lower, limits[0]))
             upper = max(self.upper, min(upper, limits[1]))
         return JointRange(lower, upper)
@@ -129,10 +129,10 @@ def _usable(states: Sequence[State]) -> list[State]:
     return usable
 
 
-class Inside:
+class InterpolatedStates:
     """States inside the recorded range.
 
-    A random point between two random recorded states, shaken by a rigid motion common to all instruments (so that
+    A random point between two random recorded states, jittered by a rigid motion common to all instruments (so that
     bodies tracked apart but joined in the world stay together), every position clipped to the recorded bounds; joints
     uniform over their recorded range.
     """
@@ -150,15 +150,15 @@ class Inside:
             self.means[name] = mean_pose(poses)
             self.bounds[name] = positions.min(0), positions.max(0)
         spans = [upper - lower for lower, upper in self.bounds.values()]
-        self.shake_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
-        self.shake_rad = JITTER * float(np.mean([self._angular_spread(name) for name in self.means]))
+        self.jitter_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
+        self.jitter_rad = JITTER * float(np.mean([self._angular_spread(name) for name in self.means]))
 
     def __call__(self, index: int, rng: Generator) -> State:
         first, second = (self.states[k] for k in rng.integers(len(self.states), size=2))
         if not set(first.instruments) & set(second.instruments):
             second = first
         state = interpolate_state(first, second, float(rng.random()))
-        state = self._shaken(state, rng)
+        state = self._jittered(state, rng)
         return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
 
     def _angular_spread(self, name: str) -> float:
@@ -166,10 +166,10 @@ class Inside:
         poses = [to_numpy(s.instruments[name].pose)[:3, :3] for s in self.states if name in s.instruments]
         return float((mean.inv() * Rotation.from_matrix(np.stack(poses))).magnitude().max())
 
-    def _shaken(self, state: State, rng: Generator) -> State:
+    def _jittered(self, state: State, rng: Generator) -> State:
         centre = np.mean([to_numpy(given.pose)[:3, 3] for given in state.instruments.values()], axis=0)
-        turn = Rotation.from_rotvec(self.shake_rad * rng.standard_normal(3)).as_matrix()
-        shift = self.shake_mm * rng.standard_normal(3)
+        turn = Rotation.from_rotvec(self.jitter_rad * rng.standard_normal(3)).as_matrix()
+        shift = self.jitter_mm * rng.standard_normal(3)
         return with_poses(
             state,
             lambda name, pose: rigid(
@@ -178,17 +178,18 @@ class Inside:
         )
 
 
-class Beyond(Inside):
+class ExtrapolatedStates(InterpolatedStates):
     """States from the recorded range widened by `margin`.
 
     Joints are uniform over their range widened by that fraction at either end, within the limits the capture states;
-    poses are drawn as `Inside` does and then moved away from the mean recorded pose by a factor in [1, 1 + 2 margin],
-    as the half range either side of the mean grows by that much; all instruments of a state by the same factor.
+    poses are drawn as `InterpolatedStates` does and then moved away from the mean recorded pose by a factor in
+    [1, 1 + 2 margin], as the half range either side of the mean grows by that much; all instruments of a state by the
+    same factor.
     """
 
     def __init__(self, states: Sequence[State], instruments: Sequence[Instrument], margin: float) -> None:
         if not margin > 0:
-            raise NeecoError(f"--margin: {margin} reaches nowhere beyond the recorded range; give a fraction above 0")
+            raise NeecoError(f"--margin: {margin} does not reach past the recorded range; give a fraction above 0")
         super().__init__(states)
         self.margin = margin
         limits = {(i.name, joint): limit for i in instruments for joint, limit in i.joints.items()}
@@ -200,7 +201,7 @@ class Beyond(Inside):
         return with_poses(state, lambda name, pose: interpolate_pose(self.means[name], pose, factor))
 
 
-class Grid:
+class GridStates:
     """Every joint value with every roll, about recorded poses.
 
     Cell `index` mod (joint_values * rolls): all joints at the same fraction of their recorded ranges, each instrument
@@ -237,7 +238,7 @@ class Grid:
         return with_joints(with_poses(base, rolled), lambda name, joint: self.ranges[name, joint].at(fraction))
 
 
-class AlongPath:
+class PathStates:
     """`count` states evenly spread along key states, first and last included."""
 
     prescribed = True
@@ -253,7 +254,7 @@ class AlongPath:
         return interpolate_state(self.keys[segment], self.keys[segment + 1], position - segment)
 
 
-class Listed:
+class ListedStates:
     """The given states in order; from the start again when more images are asked for than states are given."""
 
     prescribed = True

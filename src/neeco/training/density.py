@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
 from neeco.raster.optimizer import Adam
 from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import CanonicalGaussians

@@ -11,9 +11,8 @@ from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.methods import make_deformation, method_class
-from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import InstrumentSearch, Report, Session
 from neeco.scene.training_views import TrainingViews

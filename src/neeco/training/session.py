@@ -15,8 +15,8 @@ from torch.nn.functional import mse_loss
 
 from neeco.capture.model import Camera, Frame, State
 from neeco.raster import Rendering, rasterize
+from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
-from neeco.raster.on_device import constant, quick_products
 from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
@@ -94,7 +94,7 @@ class GaussianSession(GaussianTraining):
         self.iteration += views
         progress, scene = self.progress, self.scene
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
-        scene.deformation.resting = progress < scene.deformation.warm_up
+        scene.deformation.warming_up = progress < scene.deformation.warm_up
         chosen = [self._next_frame() for _ in range(views)]
         terms: list[Tensor] = []
         for index, following in zip(chosen, [*chosen[1:], *self.queue[:1], None], strict=False):
@@ -123,7 +123,7 @@ class GaussianSession(GaussianTraining):
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
         total = loss + self._regularisation(rendering, penalty)
-        with quick_products(self.views.device) if scene.deformation.large_operations else nullcontext():
+        with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             total.backward(torch.full_like(total, 1 / views))
         gradient = rendering.center_offsets.grad
         assert gradient is not None
@@ -151,13 +151,13 @@ class GaussianSession(GaussianTraining):
     def _perturbation(self, progress: float) -> Perturbation:
         noise = self.schedule.state_noise(progress)
         given = Perturbation(noise) if noise else UNPERTURBED
-        return self.scene.deformation.disturbed(given, self.iteration, progress, self.rng)
+        return self.scene.deformation.perturb(given, self.iteration, progress, self.rng)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
         """The prior on corrected poses, and the method's own term."""
         deformation = self.scene.deformation
         own = None
-        if not deformation.resting:
+        if not deformation.warming_up:
             own = deformation.regularisation(self.scene.canonical, rendering, self.iteration)
         return sum(term for term in (penalty, own) if term is not None)
 
@@ -167,7 +167,7 @@ class GaussianSession(GaussianTraining):
         position_rate = optimizer.position_rate * self.extent * log_linear(1.0, FINAL_RATE, progress)
         rates = self.gaussian_rates | {"means": position_rate}
         learned = [(name, tensor, rates[name]) for name, tensor in scene.canonical.tensors().items() if name in rates]
-        still = scene.deformation.resting or self.iteration < scene.deformation.learns_from
+        still = scene.deformation.warming_up or self.iteration < scene.deformation.start_iteration
         own_rates = scene.deformation.learning_rates(progress)
         for name, parameter in scene.deformation.named_parameters():
             if own_rates[name] > 0 and not still:
@@ -219,7 +219,7 @@ class GaussianSession(GaussianTraining):
                 settings.threshold if grows else math.inf,
                 self.generator,
                 config.density,
-                scene.deformation.lost(scene.canonical, [camera for _, camera in self.given]),
+                scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
@@ -271,7 +271,7 @@ class GaussianSession(GaussianTraining):
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         scene.deformation.finish(self)
-        scene.seen()
+        scene.visibility()
 
 
 def new_session(

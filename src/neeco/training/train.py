@@ -17,8 +17,8 @@ import torch
 
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
-from neeco.capture.fingerprint import fingerprint
 from neeco.capture.model import Frame
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 from neeco.raster.types import Camera
 from neeco.viewer.source import Loaded
 from neeco.viewer.status import Shown
@@ -38,7 +38,7 @@ def draw_run(studio: Studio, number: int, wishes: Wishes, camera: Camera, stood_
     frame = wishes.recorded_frame
     seen = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
     said = ""
-    with loaded.scene.torch_threads(), failures_told():
+    with loaded.scene.torch_threads(), readable_failures():
         if view == DIFFERENCE and frame is not None and seen and loaded.frames:
             photograph = studio.photograph(number, loaded, frame)
             shown = difference(loaded.scene, state, loaded.recorded.cameras[frame], photograph, camera)

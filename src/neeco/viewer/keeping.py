@@ -14,11 +14,11 @@ from neeco.capture.model import State
 from neeco.capture.statefile import StateLine, camera_to_json, read_states, state_to_json
 from neeco.files import own_folder, write_text
 from neeco.labels.annotation import annotate
-from neeco.labels.composited import CompositedLabels
 from neeco.labels.drawing import draw_layers, to_numpy
+from neeco.labels.labellers import CompositedLabels
 from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.settings import Settings
-from neeco.synthesis.views import moved_camera
 from neeco.synthesis.writers.folder import load_record, record_path, write_sample
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Keeper:
         labeller = CompositedLabels(scene)
         camera = self.camera(loaded, world_from_camera)
         with scene.torch_threads(), torch.no_grad():
-            drawing = draw_layers(scene, labeller, state, camera, Settings.speckle)
+            drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = annotate(scene, drawing, labeller.names)
         root = self.folder / SAMPLES
         with self._lock, own_folder(root):

@@ -16,10 +16,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neeco.errors import NeecoError
-from neeco.labels.composited import threshold_of
+from neeco.labels.labellers import threshold_of
 from neeco.raster.sh import SH_C0
-from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.deformations.static import Static
+from neeco.scene.drawable import HingeMotion
 from neeco.viewer.steering import across, shafts_of, slider_ranges
 
 if TYPE_CHECKING:
@@ -55,14 +54,14 @@ class Field:
 def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
-    if refusal := why_not(scene):
+    canonical, motion = scene.canonical, scene.hinge_motion()
+    if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
-    canonical = scene.canonical
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
-    scales, scale_range = _between(_log_scales(scene), 255)
+    scales, scale_range = _between(motion.log_scales.clamp_min(float(np.log(THINNEST_MM))), 255)
     base, base_range = _between(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
-    turns, turn_ranges = _by_column(_turns(scene))
+    turns, turn_ranges = _by_column(motion.turns.flatten(1))
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
     fields = (
         Field("mean", means, "uint24"),
@@ -83,16 +82,15 @@ def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
         "light": _light(scene),
         "threshold": threshold_of(scene),
         "labels": [list(name) for name in scene.label_names],
-        "instruments": _instruments(scene),
-        "recorded": _recorded(scene),
+        "instruments": _instruments(scene, motion),
+        "recorded": _recorded(scene, motion),
     }
     return header, b"".join(field.planes() for field in fields)
 
 
 def why_not(scene: Drawable) -> str | None:
     """Why a page cannot hold `scene`, in a line that says what can show it; None where it can."""
-    # these two and no method made of them: it may pose otherwise
-    if not scene.has_gaussians or type(getattr(scene, "deformation", None)) not in (Kinematic, Static):
+    if scene.hinge_motion() is None:
         return (
             f"method {scene.method} asks a network for every state, which a page cannot; "
             "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"
@@ -106,38 +104,6 @@ def why_not(scene: Drawable) -> str | None:
         if found > most:
             return f"{found} {name}: a page has room for {most}; look at it with `neeco view RUN`"
     return None
-
-
-def _log_scales(scene: Scene) -> Tensor:
-    """[N, 3] of what is drawn: what turns about a hinge is held short."""
-    logs = scene.canonical.log_scales.clone()
-    if isinstance(scene.deformation, Kinematic):
-        for index, instrument in enumerate(scene.instruments):
-            if instrument.joints:
-                rows = scene.canonical.body(index + 1)
-                longest = scene.deformation.hinges_of(index).longest(
-                    scene.deformation.part_weights(scene.canonical, index)
-                )
-                logs[rows] = torch.minimum(logs[rows], longest.log())
-    return logs.clamp_min(float(np.log(THINNEST_MM)))
-
-
-def _turns(scene: Scene) -> Tensor:
-    """[N, 2 J] rad: by how much joint j turns a Gaussian at a reading of 0, and per unit of reading."""
-    if not isinstance(scene.deformation, Kinematic):
-        return scene.canonical.means.new_zeros(len(scene.canonical), 0)
-    most = max((len(item.joints) for item in scene.instruments), default=0)
-    turns = scene.canonical.means.new_zeros(len(scene.canonical), most, 2)
-    for index, instrument in enumerate(scene.instruments):
-        if not instrument.joints:
-            continue
-        hinges, rows = scene.deformation.hinges_of(index), scene.canonical.body(index + 1)
-        weights = scene.deformation.part_weights(scene.canonical, index)
-        for joint in range(len(hinges.joint_names)):
-            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
-            turns[rows, joint, 0] = pair @ hinges.turns(joint, 0.0)
-            turns[rows, joint, 1] = pair @ hinges.gains[joint]
-    return turns.flatten(1)
 
 
 def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
@@ -190,17 +156,17 @@ def _light(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _instruments(scene: Scene) -> list[dict[str, Any]]:
+def _instruments(scene: Scene, motion: HingeMotion) -> list[dict[str, Any]]:
     """Name, shaft and hinges of every instrument that moves, in its own frame, mm and rad: the page steers by them."""
-    if not isinstance(scene.deformation, Kinematic):
+    if not motion.hinges:
         return []
     shafts, ranges = shafts_of(scene), slider_ranges(scene.instruments, scene.recorded.states)
     found = []
-    for index, instrument in enumerate(scene.instruments):
-        hinges, shaft = scene.deformation.hinges_of(index), shafts[instrument.name]
+    for instrument, hinges in zip(scene.instruments, motion.hinges, strict=False):
+        shaft = shafts[instrument.name]
         joints = []
-        for joint, name in enumerate(hinges.joint_names):
-            (pivot, axis), spread = hinges.hinge(joint), ranges[instrument.name, name]
+        for name, (pivot, axis) in zip(instrument.joints, hinges, strict=True):
+            spread = ranges[instrument.name, name]
             ends = [spread.lower, spread.upper]
             joints.append({"name": name, "pivot": pivot.tolist(), "axis": axis.tolist(), "range": ends})
         side, up = across(shaft.along)
@@ -210,9 +176,9 @@ def _instruments(scene: Scene) -> list[dict[str, Any]]:
     return found
 
 
-def _recorded(scene: Scene) -> dict[str, Any]:
+def _recorded(scene: Scene, motion: HingeMotion) -> dict[str, Any]:
     """Names, cameras and states of the frames trained on; matrices are the first three rows, 12 numbers."""
-    moving = scene.instruments if isinstance(scene.deformation, Kinematic) else ()
+    moving = scene.instruments[: len(motion.hinges)]
     states = [scene.registered(state) for state in scene.recorded.states]
     return {
         "names": list(scene.recorded.names),

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.evaluation.image_metrics import psnr
+from neeco.evaluation.image_metrics import psnr, resize_camera
+from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
-from neeco.evaluation.resize import resize_camera
-from neeco.evaluation.truth import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.viewer.source import Loaded
@@ -102,7 +101,7 @@ def coarse_psnr(loaded: Loaded, index: int) -> float:
     mask = frame.load_mask()
     if mask is not None:
         mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
-    drawn = loaded.scene.draw(frame.state, camera).color.clamp(0, 1).cpu()
+    drawn = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
     return psnr(drawn, torch.from_numpy(photograph), mask)
 
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.difference import Pixels, difference_map, overlay_parts
-from neeco.labels.composited import composited_parts, threshold_of
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
+from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.scene import gaussian_scene
@@ -76,7 +76,7 @@ def picture(scene: Drawable, state: State, camera: Camera, view: str, labels: Te
 def difference(scene: Drawable, state: State, taken_by: Camera, photograph: np.ndarray, window: Camera) -> Picture:
     """How far what the camera that took `photograph` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
     camera at the same place with the same vertical field of view. What it shows beside the photograph is black."""
-    rendering = scene.draw(state, taken_by)
+    rendering = scene.render(state, taken_by)
     compared = difference_map(rendering.color.clamp(0, 1).cpu().numpy(), photograph, legend=False)
     rows, columns = _same_rays(taken_by, window)
     inside = (rows >= 0) & (rows < taken_by.height) & (columns >= 0) & (columns < taken_by.width)
@@ -112,12 +112,12 @@ def split(left: Picture, right: Picture, share: float) -> Picture:
 
 def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
     if view in LABELLED and labels is None:
-        return scene.draw(state, camera, labels=True)
+        return scene.render(state, camera, labels=True)
     if view not in (*LABELLED, MADE_UP):
-        return scene.draw(state, camera)
+        return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
     gaussians, camera = posing.at(state), posing.camera(camera)
-    channels = labels if view in LABELLED else posing.made_up(gaussians, camera)[:, None]
+    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 

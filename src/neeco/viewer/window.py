@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
+from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.states import rigid
-from neeco.synthesis.views import moved_camera
 
 if TYPE_CHECKING:
     import viser

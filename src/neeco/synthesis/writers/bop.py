@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.poses import swap_camera_axes
+from neeco.capture.model import swap_camera_axes
 from neeco.files import write_json
-from neeco.labels.contours import bounding_box
+from neeco.labels.annotation import bounding_box
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
 
 FOLDER, SCENE = "bop", "000000"
@@ -68,20 +68,20 @@ def _pose(label: dict[str, Any], number: int) -> dict[str, Any]:
 def _masks(
     root: Path, folder: Path, record: Record, instruments: Sequence[str], ids: dict[int, list[int]]
 ) -> list[dict[str, Any]]:
-    """Write whole and visible mask of every instrument; returns what is to be said of them."""
+    """Write whole and visible mask of every instrument; returns their scene_gt_info entries."""
     name = stem(record["index"])
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
     bits = read_labels(root / "silhouettes" / f"{name}.png").numpy()
     depth = cv2.imread(str(root / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
     assert depth is not None
-    told = []
+    infos = []
     for place, label in enumerate(record["labels"]):
         k = instruments.index(label["name"])
         visible = np.isin(parts, ids[k])
         whole = visible | (bits >> place & 1 > 0)
         for kind, mask in (("mask", whole), ("mask_visib", visible)):
             write_labels(folder / kind / f"{name}_{place:06d}.png", _binary(mask))
-        told.append(
+        infos.append(
             {
                 "bbox_obj": list(bounding_box(whole)) if whole.any() else NOWHERE,
                 "bbox_visib": list(bounding_box(visible)) if visible.any() else NOWHERE,
@@ -91,7 +91,7 @@ def _masks(
                 "visib_fract": round(float(visible.sum() / max(1, whole.sum())), 6),
             }
         )
-    return told
+    return infos
 
 
 def _binary(mask: np.ndarray) -> torch.Tensor:

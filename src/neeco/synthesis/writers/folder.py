@@ -20,7 +20,7 @@ import torch
 from neeco.capture.images import write_image, write_labels, write_png
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_text, write_atomically, write_text
+from neeco.files import read_text, require_like, write_atomically, write_text
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 
@@ -30,10 +30,21 @@ DEPTH_MM_PER_COUNT = 0.05
 SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
-SEAL = "sha256"  # of the rest of a record
+CHECKSUM = "sha256"  # of the rest of a record
 PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MOST_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
+MAX_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
 FOLDERS = (*PIXELS, RECORDS)
+PUBLIC = {  # what every line of states.jsonl holds, among others
+    "index": int,
+    "split": str,
+    "width": int,
+    "height": int,
+    "time": float,
+    "instruments": [{"name": str, "pose": [[float]], "joints": {str: float}}],
+    "camera": [[float]],
+    "intrinsics": {"fl_x": float, "fl_y": float, "cx": float, "cy": float},
+    "labels": [{"name": str, "area": int, "keypoints": {str: [float]}, "camera_from_instrument": [[float]]}],
+}
 VALIDATION_EVERY = 5  # every fifth image is for validation
 
 
@@ -75,7 +86,7 @@ def write_sample(
         **state_to_json(drawing.state),
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
         "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "made_up": round(float(drawing.made_up.mean()), 4),
+        "made_up": round(float(drawing.unobserved.mean()), 4),
         "labels": [label.to_json() for label in labels],
         **facts,
         "refused": dict(sorted(refused.items())),
@@ -88,8 +99,8 @@ def write_sample(
 def silhouettes(drawing: LayeredDrawing) -> torch.Tensor:
     """uint8 [H, W]: bit k is set where instrument k of the labels would be seen if nothing else were there."""
     bits = np.zeros(drawing.depth.shape, np.uint8)
-    for k, alone in enumerate(list(drawing.alone.values())[:MOST_INSTRUMENTS]):
-        bits |= alone.mask.astype(np.uint8) << k
+    for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
+        bits |= layer.mask.astype(np.uint8) << k
     return torch.from_numpy(bits)
 
 
@@ -103,7 +114,7 @@ def write_skipped(
 
 
 def _write_record(root: Path, record: Record) -> None:
-    write_text(record_path(root, record["index"]), json.dumps(record | {SEAL: _digest(record)}, allow_nan=False))
+    write_text(record_path(root, record["index"]), json.dumps(record | {CHECKSUM: _digest(record)}, allow_nan=False))
 
 
 def _digest(record: Record) -> str:
@@ -122,7 +133,7 @@ def load_record(root: Path, index: int) -> Record | None:
     """
     try:
         record = json.loads(read_text(record_path(root, index), "the record of an image"))
-        if record.pop(SEAL, None) != _digest(record):
+        if record.pop(CHECKSUM, None) != _digest(record):
             return None
         files = () if record.get("skipped") else files_of(index)
         sizes = {name: (root / name).stat().st_size for name in files}
@@ -163,14 +174,27 @@ def write_states(root: Path, records: list[Record]) -> None:
     """Write states.jsonl: a line per image, state and labels; readable again as `--states states.jsonl`."""
     lines = []
     for record in records:
-        line = told(record)
+        line = public_record(record)
         line["labels"] = [_without_polygons(label) for label in record["labels"]]
         lines.append(json.dumps(line, allow_nan=False))
     write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
 
 
-def told(record: Record) -> dict[str, Any]:
-    """What a record says of its image, without what it says of the making."""
+def read_public_records(root: Path) -> list[Record]:
+    """The lines of states.jsonl. Raises NeecoError naming the line that is not as `write_states` writes it."""
+    path, records = root / "states.jsonl", []
+    for number, line in enumerate(read_text(path, "one JSON object per image").splitlines(), 1):
+        place = f"{path}: line {number}"
+        try:
+            value = json.loads(line)
+        except (ValueError, RecursionError):
+            raise NeecoError(f"{place}: not valid JSON; write the data set anew") from None
+        records.append(require_like(value, PUBLIC, place, "write the data set anew"))
+    return records
+
+
+def public_record(record: Record) -> dict[str, Any]:
+    """A record without what it says of the making."""
     return {key: value for key, value in record.items() if key not in ("files", "refused")}
 
 

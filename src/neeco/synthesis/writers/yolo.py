@@ -18,7 +18,6 @@ import numpy as np
 import yaml
 
 from neeco.files import write_text
-from neeco.labels.contours import joined_polygon
 from neeco.synthesis.writers.folder import Record, link, stem
 
 FOLDER = "yolo"
@@ -53,6 +52,19 @@ def segment_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
 def oriented_row(label: dict[str, Any], size: np.ndarray) -> list[float]:
     """Corners of the minimum-area rectangle, cut at the image's border."""
     return _shares(np.array(label["rectangle"]), size)
+
+
+def joined_polygon(polygons: list[np.ndarray]) -> np.ndarray:
+    """One polygon [P, 2] out of several, joined by bridges of no width between their nearest corners."""
+    joined, *rest = polygons
+    remaining = list(rest)
+    while remaining:
+        gaps = [np.linalg.norm(joined[:, None] - other[None], axis=2) for other in remaining]
+        nearest = int(np.argmin([gap.min() for gap in gaps]))
+        here, there = np.unravel_index(gaps[nearest].argmin(), gaps[nearest].shape)
+        other = np.roll(remaining.pop(nearest), -int(there), axis=0)
+        joined = np.concatenate([joined[: here + 1], other, other[:1], joined[here:]])
+    return joined
 
 
 def _pose_row(keypoints: Sequence[str]) -> Row:

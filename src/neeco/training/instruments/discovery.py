@@ -18,10 +18,9 @@ from torch import Tensor, nn
 from neeco.errors import NeecoError
 from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
-from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges, SweptVolume
 from neeco.scene.scene import Scene
-from neeco.scene.swept import SweptVolume
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import RefineConfig, SearchConfig, TrainConfig, method_defaults
 from neeco.training.instruments.evidence import (
@@ -47,7 +46,7 @@ MIN_READING_RANGE = 0.05  # rad: the hinge of a joint that moves less is not sea
 STICK_POINTS = 16
 
 
-def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
+def find_instruments(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
     hinges.
 

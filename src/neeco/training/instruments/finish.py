@@ -12,10 +12,10 @@ from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.raster import rasterize
 from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.hinges import Hinged, Hinges
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.scene.scene import Scene
-from neeco.scene.seen import pixels_of
+from neeco.scene.visibility import visible_pixels
 from neeco.training.instruments.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
 from neeco.training.session import GaussianSession
 
@@ -30,7 +30,7 @@ TIP_QUANTILE = 0.97  # of the distances of a part's solid Gaussians from the hin
 
 
 @torch.no_grad()
-def conclude(session: GaussianSession, hinged: Hinged) -> None:
+def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
     into `scene.diagnostics`.
 
@@ -64,7 +64,7 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
 
 
-def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
+def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, joint: int) -> dict[str, Any]:
     """Whether the joint was found: whether its reading explains the image of the moving parts, in the training frames
     of its extreme readings.
 
@@ -110,7 +110,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
     }
 
 
-def _moving_weight(canonical: CanonicalGaussians, hinged: Hinged, index: int, joint: int) -> Tensor:
+def _moving_weight(canonical: CanonicalGaussians, hinged: HingedInstruments, index: int, joint: int) -> Tensor:
     """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
     weight = canonical.means.new_zeros(len(canonical), 1)
     weights = hinged.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
@@ -137,9 +137,9 @@ def drop_occluded(scene: Scene) -> CanonicalGaussians:
         camera = scene.camera(recorded.cameras[index])
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
-        visible += pixels_of(posed, camera)
+        visible += visible_pixels(posed, camera)
         for own in instruments:
-            alone[own] += pixels_of(posed.select(own), camera)
+            alone[own] += visible_pixels(posed.select(own), camera)
     kept = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
     counts = tuple(int(kept[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
     return canonical.map(lambda tensor: tensor[kept], counts)
@@ -216,7 +216,7 @@ def measure_tips(canonical: CanonicalGaussians, index: int, hinges: Hinges, weig
     for joint in range(len(hinges.joint_names)):
         pivot, _ = hinges.hinge(joint)
         found = torch.full_like(hinges.tips[joint], torch.nan)
-        for side, part in enumerate(hinges.left_first(joint).tolist()):
+        for side, part in enumerate(hinges.left_right_order(joint).tolist()):
             of_part = points[solid & (shares[:, 2 + 2 * joint + side] > MIN_PART_SHARE)]
             if len(of_part) < MIN_SOLID:
                 continue

@@ -13,7 +13,7 @@ from neeco.raster.pinhole import pixel_centers, unproject_world
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
-from neeco.scene.hinges import Hinged, Hinges
+from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.training.session import GaussianSession
 
 WRIST_STEPS = 14  # wrist positions whose symmetry is tested
@@ -32,7 +32,7 @@ MIN_SOLID = 10  # solid Gaussians, with fewer nothing is measured
 
 
 @torch.no_grad()
-def place_wrists(session: GaussianSession, hinged: Hinged) -> None:
+def place_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Set every wrist to where it is found."""
     for index in range(len(session.scene.instruments)):
         hinges = hinged.hinges_of(index)
@@ -42,7 +42,7 @@ def place_wrists(session: GaussianSession, hinged: Hinged) -> None:
 
 
 @torch.no_grad()
-def replace_wrists(session: GaussianSession, hinged: Hinged) -> None:
+def replace_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Find every wrist again, and move it unless spinning what then lies behind it costs more than before."""
     for index in range(len(session.scene.instruments)):
         hinges = hinged.hinges_of(index)
@@ -54,12 +54,12 @@ def replace_wrists(session: GaussianSession, hinged: Hinged) -> None:
         hinges.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
 
 
-def _boundary(session: GaussianSession, hinged: Hinged, index: int) -> float:
+def _boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
     boundary = color_boundary(session, hinged, index)
     return _symmetry_boundary(session, hinged, index) if boundary is None else boundary
 
 
-def _symmetry_boundary(session: GaussianSession, hinged: Hinged, index: int) -> float:
+def _symmetry_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
     """Position mm along the shaft up to which spinning what lies behind costs little."""
     scene = session.scene
     hinges = hinged.hinges_of(index)
@@ -74,12 +74,17 @@ def _symmetry_boundary(session: GaussianSession, hinged: Hinged, index: int) -> 
     return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
-def _spun_error(session: GaussianSession, hinged: Hinged, index: int, start: float, frames: list[int]) -> float:
+def _spun_error(
+    session: GaussianSession, hinged: HingedInstruments, index: int, start: float, frames: list[int]
+) -> float:
     """Summed error of the frames' images with what lies behind `start` spun a little, one way and the other in turn.
     Leaves the wrist there."""
     hinged.hinges_of(index).wrist_start.fill_(start)
     angle = session.config.search.spin_angle
-    return sum(_image_error(session, frame, hinged.spun(-angle if k % 2 else angle)) for k, frame in enumerate(frames))
+    return sum(
+        _image_error(session, frame, hinged.spin_perturbation(-angle if k % 2 else angle))
+        for k, frame in enumerate(frames)
+    )
 
 
 def _image_error(session: GaussianSession, index: int, perturbation: Perturbation) -> float:
@@ -90,7 +95,7 @@ def _image_error(session: GaussianSession, index: int, perturbation: Perturbatio
     return float(error.mean() if mask is None else error[mask].mean())
 
 
-def color_boundary(session: GaussianSession, hinged: Hinged, index: int) -> float | None:
+def color_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float | None:
     """Position mm along the shaft where the recorded images' colour along it changes most; None without a clear
     step."""
     hinges = hinged.hinges_of(index)
@@ -130,7 +135,7 @@ def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _profile(
-    session: GaussianSession, hinged: Hinged, index: int, frame_index: int, edges: Tensor
+    session: GaussianSession, hinged: HingedInstruments, index: int, frame_index: int, edges: Tensor
 ) -> tuple[Tensor, Tensor]:
     """A recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and
     two log ratios, to which the light's colour and distance add constants."""

@@ -1,0 +1,213 @@
+"""The two ways to say which pixel shows which part of which instrument.
+
+`CompositedLabels` (the default, and what evaluation scores): every Gaussian carries the instrument and part that it
+belongs to, and compositing gets occlusion by tissue and other instruments right. `ThresholdLabels` (the paper's): what
+moves is the instrument; it knows neither parts nor what stands in front.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.model import State, evenly_spaced
+from neeco.errors import NeecoError
+from neeco.raster import rasterize
+from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.scene.deformations.base import otsu
+
+if TYPE_CHECKING:
+    from neeco.scene import Drawable, Scene
+
+# Measured: the instrument's moving shadow is learned with labels of .3 to .5, so half is too low; .65 to .7 is best.
+LABEL_THRESHOLD = 0.65
+SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: .65 then loses as much of the silhouette's border
+# A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
+# beside the band: one from .15 leaves out mostly tissue, so that the model over-segments (IoU .93 instead of .96).
+CLEAR_SHARES = 0.5, 0.9
+
+BLACK = 0.1  # RGB magnitude (norm) above which a pixel of the instrument drawn alone is the instrument
+THRESHOLD_STATES = 24  # recorded states that Otsu's method looks at
+DELTAS = ("means", "quats", "scales")
+
+
+class Labeller(Protocol):
+    """Says which Gaussian is which instrument's, and which pixel is which part."""
+
+    names: tuple[tuple[str, str], ...]  # (instrument, part) of part id 1, 2, ...
+
+    def owners(self, state: State, posed: Gaussians) -> Tensor:
+        """[N] int64: index of each Gaussian's instrument in `instruments_of(names)`, -1 for tissue."""
+        ...
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
+        """The whole scene drawn, its part ids [H, W] uint8, and the share of instrument of each pixel [H, W]. Where
+        `unobserved` [N] is given, it is the rendering's last channel."""
+        ...
+
+
+def threshold_of(scene: Drawable) -> float:
+    """The share of a pixel from which the scene's labels count it as instrument, unless a user says otherwise."""
+    return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
+
+
+def instruments_of(names: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
+    """The instruments of (instrument, part) names, in order of first appearance."""
+    return tuple(dict.fromkeys(instrument for instrument, _ in names))
+
+
+def composited_parts(rendering: Rendering, threshold: float) -> Tensor:
+    """uint8 [H, W] part ids of an image drawn with `channels=scene.label_channels()` (see `composited_labels`)."""
+    return composited_labels(rendering, threshold)[0]
+
+
+def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, Tensor]:
+    """Part ids (uint8 [H, W]) and share of instrument ([H, W]) of an image drawn with the scene's label channels.
+
+    The share is the sum of a pixel's label columns; where it exceeds `threshold`, the pixel's id is the index of its
+    largest column + 1, elsewhere 0 (tissue). Raises NeecoError when there are no such channels.
+    """
+    channels = rendering.channels
+    if channels is None:
+        raise NeecoError(
+            "labels: the image was drawn without label channels; draw it with channels=scene.label_channels()"
+        )
+    channels = channels.detach()
+    share = channels.sum(dim=-1)
+    if channels.shape[-1] == 0:
+        return torch.zeros_like(share, dtype=torch.uint8), share
+    ids = channels.argmax(dim=-1) + 1
+    return torch.where(share > threshold, ids, 0).to(torch.uint8), share
+
+
+class CompositedLabels:
+    """The labeller that goes by what every Gaussian carries (`scene.label_channels()`)."""
+
+    def __init__(self, scene: Scene, threshold: float | None = None) -> None:
+        self.names = tuple(scene.label_names)
+        if not self.names:
+            raise NeecoError(
+                f"scene: method {scene.method!r} learns no instrument labels; "
+                "use --labels threshold, or train with --method kinematic"
+            )
+        self.threshold = threshold_of(scene) if threshold is None else threshold
+        with torch.no_grad():
+            self.channels = scene.label_channels()  # [N, L]
+        columns = [instruments_of(self.names).index(instrument) for instrument, _ in self.names]
+        per_instrument = self.channels.new_zeros(len(self.channels), max(columns) + 1)
+        per_instrument.index_add_(1, torch.tensor(columns, device=self.channels.device), self.channels)
+        owner = per_instrument.argmax(dim=1)
+        self._owners = torch.where(per_instrument.sum(dim=1) > 0.5, owner, -1)
+
+    def owners(self, state: State, posed: Gaussians) -> Tensor:
+        """[N] the instrument that holds most of a Gaussian, -1 when the tissue holds half of it or more."""
+        return self._owners
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
+        """One pass: colour and label channels together."""
+        channels = self.channels if unobserved is None else torch.cat([self.channels, unobserved[:, None]], 1)
+        rendering = rasterize(gaussians, camera, channels=channels)
+        assert rendering.channels is not None
+        labels = replace(rendering, channels=rendering.channels[..., : len(self.names)])
+        return rendering, *composited_labels(labels, self.threshold)
+
+
+@dataclass(frozen=True)
+class DeltaThresholds:
+    """Magnitudes above which a Gaussian counts as moved: position (mm), rotation (quaternion), scale (mm).
+
+    A kind of delta that is the same for all Gaussians has no threshold.
+    """
+
+    means: float | None
+    quats: float | None
+    scales: float | None
+
+    def moved(self, magnitudes: dict[str, Tensor]) -> Tensor:
+        """[N] bool: which Gaussians exceed every threshold there is."""
+        tests = [magnitudes[kind] > limit for kind, limit in vars(self).items() if limit is not None]
+        return torch.stack(tests).all(dim=0)
+
+
+class ThresholdLabels:
+    """The paper's labeller: Gaussians whose deltas exceed thresholds are drawn alone on black; what is not black is the
+    mask. The paper knows one instrument; of several, the nearest owns a moved Gaussian."""
+
+    def __init__(self, scene: Scene, thresholds: DeltaThresholds | None = None, black: float = BLACK) -> None:
+        instruments = tuple(instrument.name for instrument in scene.instruments)
+        if not instruments:
+            raise NeecoError("scene: --labels threshold needs a scene with instruments; this one was trained without")
+        self.names = tuple((name, "instrument") for name in instruments)
+        self.scene = scene
+        self.black = black
+        self.thresholds = thresholds or find_thresholds(scene)
+
+    def owners(self, state: State, posed: Gaussians) -> Tensor:
+        """[N] the instrument nearest to a Gaussian that moved, -1 for one that did not."""
+        moved = self.thresholds.moved(delta_magnitudes(self.scene, state))
+        means = posed.means
+        origins = torch.stack(
+            [
+                state.instruments[name].pose[:3, 3].to(means)
+                if name in state.instruments
+                else means.new_full((3,), torch.inf)
+                for name, _ in self.names
+            ]
+        )
+        return torch.where(moved, torch.cdist(means, origins).argmin(dim=1), -1)
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
+    ) -> tuple[Rendering, Tensor, Tensor]:
+        """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
+        moved = owners >= 0
+        shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
+        alone = rasterize(gaussians.select(moved), camera, channels=shares)
+        assert alone.channels is not None
+        ids = alone.channels.argmax(dim=2) + 1
+        lit = alone.color.norm(dim=2) > self.black
+        rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
+        return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
+
+
+@torch.no_grad()
+def delta_magnitudes(scene: Scene, state: State) -> dict[str, Tensor]:
+    """How far `state` moves each Gaussian from canonical: norms [N] of the deltas of "means", "quats", "scales"."""
+    deltas = scene.deltas(state)
+    return {kind: getattr(deltas, kind).norm(dim=1) for kind in DELTAS}
+
+
+def find_thresholds(scene: Scene) -> DeltaThresholds:
+    """Thresholds by Otsu's method on the deltas' log-magnitude over recorded states (the paper leaves them open).
+
+    Raises NeecoError when no kind of delta tells Gaussians apart, as in a scene in which nothing moves.
+    """
+    states = scene.recorded.states
+    found = [delta_magnitudes(scene, states[k]) for k in evenly_spaced(len(states), THRESHOLD_STATES, floor=True)]
+    limits = {
+        kind: otsu_of_magnitudes(torch.cat([magnitudes[kind].cpu() for magnitudes in found])) if found else None
+        for kind in DELTAS
+    }
+    if all(limit is None for limit in limits.values()):
+        raise NeecoError(
+            f"scene: method {scene.method!r} moves nothing with the state; --labels threshold needs deltas"
+        )
+    return DeltaThresholds(**limits)
+
+
+def otsu_of_magnitudes(magnitudes: Tensor) -> float | None:
+    """Otsu's threshold of log10 of magnitudes [N] >= 0, in the magnitudes' unit; None when they are all alike."""
+    values = magnitudes.double()
+    largest = float(values.max()) if len(values) else 0.0
+    if largest <= 0 or float(values.min()) > 0.999 * largest:
+        return None
+    logs = np.log10(np.maximum(values.numpy(), 1e-6 * largest))  # exact zeros form one class at the bottom
+    return 10 ** otsu(torch.from_numpy(logs))

@@ -1,0 +1,103 @@
+"""Pages from templates, which escape all text that is put into them, and the pictures inside pages."""
+
+from __future__ import annotations
+
+import base64
+import io
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+from torch import Tensor
+
+import neeco
+from neeco.capture.model import Capture
+from neeco.errors import NeecoError
+from neeco.evaluation.image_metrics import difference_map
+from neeco.files import write_text
+
+REPORT_FILE = "report.html"
+MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail
+SPLITS = {  # what the usual names of splits mean
+    "test": "states inside the recorded range",
+    "unseen": "states outside the recorded range",
+    "novel_view": "a camera that training never used",
+    "train": "frames it learned from",
+}
+
+
+def write_page(path: Path, template: str, **data: Any) -> Path:
+    """Write one page: style, pictures, charts and data are inside it, nothing is fetched. Returns `path`.
+
+    Every page takes `title` and for its header `name`, `subtitle` and `stamps`: facts to stand beside time and version.
+    """
+    page = _templates().get_template(template)
+    made_at = f"{now():%Y-%m-%d %H:%M %Z}"
+    write_text(path, page.render({"made_at": made_at, "version": neeco.__version__, "stamps": [], **data}) + "\n")
+    return path
+
+
+def split_counts(capture: Capture) -> str:
+    """`40 train, 5 test`."""
+    return ", ".join(f"{len(capture.split(name))} {name}" for name in capture.splits)
+
+
+def now() -> datetime:
+    """The time that a page states."""
+    return datetime.now().astimezone()
+
+
+def difference(image: np.ndarray, photograph: np.ndarray, counted: Tensor | None) -> str:
+    """The difference map of two images [H, W, 3] as a data URI; black also where `counted` [H, W] is False."""
+    compared = image if counted is None else np.where(counted.numpy()[..., None], image, photograph)
+    return png(difference_map(compared, photograph))
+
+
+def jpeg(pixels: np.ndarray) -> str:
+    """A data URI of uint8 [H, W, 3], shrunk to at most MAX_WIDTH px wide."""
+    return _uri(Image.fromarray(pixels), "JPEG", "image/jpeg", quality=88)
+
+
+def png(pixels: np.ndarray) -> str:
+    """The same without loss, for maps whose colours mean numbers."""
+    return _uri(Image.fromarray(pixels), "PNG", "image/png", optimize=True)
+
+
+def file_uri(path: Path, max_width: int = 1400) -> str:
+    """An image file as a data URI. Raises NeecoError when it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            return _uri(image.convert("RGB"), "JPEG", "image/jpeg", max_width=max_width, quality=86)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise NeecoError(f"{path}: synthesis preview: cannot be read: {error}") from error
+
+
+def _uri(image: Image.Image, form: str, mime: str, max_width: int = MAX_WIDTH, **options: Any) -> str:
+    if image.width > max_width:
+        image = image.resize((max_width, round(image.height * max_width / image.width)), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    image.save(stream, form, **options)
+    return f"data:{mime};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] of an image in [0, 1]."""
+    return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
+
+
+@cache
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("neeco.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.globals["SPLITS"] = SPLITS
+    templates.filters["base64"] = lambda text: base64.b64encode(text.encode("utf-8")).decode("ascii")
+    return templates

@@ -1,0 +1,345 @@
+"""Camera effects of a data set: the ranges they are drawn from, motion blur, and what lens, sensor and file do.
+
+Light is linear, an image is stored by the sRGB curve: "stored" images and "linear" light are [H, W, 3] float32, 1 is
+white. Motion while the shutter is open is that of a recorded moment that is much alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.documents import as_float
+from neeco.capture.model import InstrumentState, State
+from neeco.errors import NeecoError
+from neeco.files import parse_yaml, read_text
+from neeco.labels.annotation import place_in_image, working_ends
+from neeco.labels.drawing import LayeredDrawing, to_numpy
+from neeco.raster.types import Camera
+from neeco.synthesis.samplers import SimilarFrames, moved_camera, surface_points
+from neeco.synthesis.states import rigid
+
+if TYPE_CHECKING:
+    from neeco.scene import Recorded, Scene
+
+SoftMasks = Literal["mid", "mean"]
+SOFT_MASKS = "soft_masks"
+SMOKE_MM = 100.0  # distance over which `smoke` is stated
+MAX_SUBFRAMES = 64
+SUBFRAME_PX = 1.0  # at most, between two subframes of an exposure
+TISSUE_STEP_PX = 40  # spacing of the places on the tissue that are followed
+MAX_GAP_S = 0.5  # between recorded frames; a speed over a longer one means nothing
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One value that is drawn for every image."""
+
+    lowest: float
+    highest: float
+    meaning: str
+
+
+# in the order in which they are drawn: a new one goes to the end, or old files give other images
+EFFECTS = {
+    "shutter_s": Effect(0, 0.2, "s for which the shutter is open; instrument and camera go on moving as recorded"),
+    "smoke": Effect(0, 0.95, "share of the light that smoke takes away over 100 mm"),
+    "smoke_grey": Effect(0, 1, "brightness of the smoke, of white"),
+    "lens_blur_px": Effect(0, 20, "px, standard deviation of the lens's blur"),
+    "vignette": Effect(0, 1, "share of the light that the corners lose"),
+    "field_of_view": Effect(0.3, 1.2, "radius of the image circle, of half the image's diagonal; black beyond"),
+    "exposure_stops": Effect(-4, 4, "stops, + is brighter"),
+    "red_gain": Effect(0.25, 4, "white balance: red against green"),
+    "blue_gain": Effect(0.25, 4, "white balance: blue against green"),
+    "shot_noise": Effect(0, 0.3, "standard deviation at white, of white; falls with the root of brightness"),
+    "read_noise": Effect(0, 0.3, "standard deviation everywhere, of white"),
+    "gamma": Effect(0.3, 3, "exponent on the stored image; above 1 is darker"),
+    "jpeg_quality": Effect(1, 100, "of the JPEG that the image went through; left out: none"),
+}
+SMOKE_GREY = 0.6  # where the file asks for smoke and does not name its brightness
+
+
+@dataclass(frozen=True)
+class Range:
+    """A value is uniform from `low` to `high` for `share` of the images; the others go without the effect."""
+
+    low: float
+    high: float
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class CameraEffects:
+    """What an effects file asks for. `soft_masks`: the `soft` images show the middle of the exposure or the mean over
+    it."""
+
+    ranges: Mapping[str, Range]
+    soft_masks: SoftMasks = "mid"
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything moves while the shutter is open."""
+        return "shutter_s" in self.ranges
+
+    def draw(self, rng: Generator) -> dict[str, float]:
+        """The effects of one image by name. Always draws as many numbers, so that a value depends on no other's
+        range."""
+        values = {}
+        for name in EFFECTS:
+            applies, place = rng.random(), rng.random()
+            given = self.ranges.get(name)
+            if given is not None and applies < given.share:
+                values[name] = round(given.low + (given.high - given.low) * place, 5)
+        return values
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain values, for dataset.json."""
+        ranges = {name: [item.low, item.high, item.share] for name, item in sorted(self.ranges.items())}
+        return {"ranges_and_shares": ranges, SOFT_MASKS: self.soft_masks}
+
+
+def read_effects(path: Path) -> CameraEffects:
+    """Read an effects file: YAML, a line per effect, each a number, [LOW, HIGH], or {range: [LOW, HIGH], share: S}.
+    Raises NeecoError naming file and field."""
+    text = read_text(path, "a YAML file of camera effects; docs/synthesis.md shows one")
+    given = parse_yaml(path, text, "repair it")
+    if not isinstance(given, dict) or not given:
+        raise NeecoError(f"{path}: names no effect; give some of {', '.join(EFFECTS)}")
+    soft = given.pop(SOFT_MASKS, "mid")
+    if soft not in ("mid", "mean"):
+        raise NeecoError(f"{path}: {SOFT_MASKS}: {soft!r} is neither mid nor mean")
+    unknown = sorted(set(map(str, given)) - set(EFFECTS))
+    if unknown:
+        raise NeecoError(f"{path}: {unknown[0]}: no such effect; there are {', '.join([*EFFECTS, SOFT_MASKS])}")
+    return CameraEffects({name: _range(value, EFFECTS[name], f"{path}: {name}") for name, value in given.items()}, soft)
+
+
+def _range(value: Any, effect: Effect, where: str) -> Range:
+    share: Any = 1.0
+    if isinstance(value, dict):
+        if not set(value) <= {"range", "share"} or "range" not in value:
+            raise NeecoError(f"{where}: give a number, [LOW, HIGH], or {{range: [LOW, HIGH], share: S}}")
+        value, share = value["range"], value.get("share", 1.0)
+    ends = value if isinstance(value, list) else [value, value]
+    numbers = [number for number in map(as_float, (*ends, share)) if number is not None]
+    if len(ends) != 2 or len(numbers) != 3:
+        raise NeecoError(f"{where}: {value!r} is no range; give a number or [LOW, HIGH]")
+    low, high, share = numbers
+    if not effect.lowest <= low <= high <= effect.highest:
+        raise NeecoError(
+            f"{where}: {value} is out of range; give LOW <= HIGH within {effect.lowest:g} to {effect.highest:g} "
+            f"({effect.meaning})"
+        )
+    if not 0 <= share <= 1:
+        raise NeecoError(f"{where}: share: {share:g} is not a share of the images; give 0 to 1")
+    return Range(low, high, share)
+
+
+def srgb_to_linear(image: np.ndarray) -> np.ndarray:
+    """Stored image to linear light (IEC 61966-2-1)."""
+    image = np.clip(image, 0, 1)
+    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_to_srgb(light: np.ndarray) -> np.ndarray:
+    """Linear light to stored image, the inverse of `srgb_to_linear`; what is brighter than white is white."""
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def average_exposure(images: Sequence[np.ndarray]) -> np.ndarray:
+    """The stored image of an exposure that consists of these stored images, each for the same time."""
+    if len(images) == 1:
+        return images[0]
+    return linear_to_srgb(np.mean([srgb_to_linear(image) for image in images], axis=0))
+
+
+def apply_effects(image: np.ndarray, depth: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
+    """A drawn image as a camera with these effects (see EFFECTS) would have stored it.
+
+    depth [H, W] mm, 0 = none (taken as the image's farthest). Noise is drawn from `rng`.
+    """
+    if not set(values) - {"shutter_s", "smoke_grey"}:
+        return image
+    height, width = depth.shape
+    light = _smoked(srgb_to_linear(image), depth, values)
+    if values.get("lens_blur_px", 0) > 0:
+        light = cv2.GaussianBlur(light, (0, 0), values["lens_blur_px"])
+    if values.get("vignette", 0) > 0:
+        light = light * (1 - values["vignette"] * _distance_from_centre(height, width) ** 2)[..., None]
+    if "field_of_view" in values:
+        light = light * image_circle(height, width, values["field_of_view"])[..., None]
+    gains = [values.get("red_gain", 1.0), 1.0, values.get("blue_gain", 1.0)]
+    light = light * np.float32(2 ** values.get("exposure_stops", 0.0) * np.array(gains))
+    stored = linear_to_srgb(_noisy(light, values, rng)) ** np.float32(values.get("gamma", 1.0))
+    return _jpeg_compressed(stored, values["jpeg_quality"]) if "jpeg_quality" in values else stored
+
+
+def image_circle(height: int, width: int, radius: float) -> np.ndarray:
+    """[H, W] in [0, 1]: 1 within `radius` (of half the diagonal) of the image's centre, with an edge one pixel wide."""
+    half = np.hypot(height, width) / 2
+    return np.clip((radius - _distance_from_centre(height, width)) * half + 0.5, 0, 1).astype(np.float32)
+
+
+def _distance_from_centre(height: int, width: int) -> np.ndarray:
+    """[H, W] distance from the image's centre, 1 in the corners."""
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32) + np.float32(0.5)
+    return np.hypot(x - width / 2, y - height / 2) / (np.hypot(height, width) / 2)
+
+
+def _smoked(light: np.ndarray, depth: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+    """Homogeneous smoke (Beer-Lambert): light from far away is attenuated and replaced by the smoke's own."""
+    density = values.get("smoke", 0.0)
+    if density <= 0:
+        return light
+    far = np.where(depth > 0, depth, depth.max(initial=SMOKE_MM))
+    transmission = ((1 - density) ** (far / SMOKE_MM)).astype(np.float32)[..., None]
+    grey = srgb_to_linear(np.full(3, values.get("smoke_grey", SMOKE_GREY)))
+    return light * transmission + grey * (1 - transmission)
+
+
+def _noisy(light: np.ndarray, values: Mapping[str, float], rng: Generator) -> np.ndarray:
+    """Shot and read noise, both normally distributed (Poisson-Gaussian noise of many photons)."""
+    shot, read = values.get("shot_noise", 0.0), values.get("read_noise", 0.0)
+    if shot == read == 0:
+        return light
+    deviation = np.sqrt(shot**2 * np.clip(light, 0, 1) + read**2)
+    return light + (deviation * rng.standard_normal(light.shape)).astype(np.float32)
+
+
+def _jpeg_compressed(stored: np.ndarray, quality: float) -> np.ndarray:
+    pixels = np.round(stored[..., ::-1] * 255).astype(np.uint8)
+    _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, round(quality)])
+    decoded = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded[..., ::-1].astype(np.float32) / 255
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Speeds at a moment: twists [6] (rad/s, then mm/s, each in its own body's frame) and joint rates per s."""
+
+    instruments: Mapping[str, np.ndarray]
+    joints: Mapping[str, Mapping[str, float]]
+    camera: np.ndarray
+
+    def advanced(self, state: State, camera: Camera, seconds: float) -> tuple[State, Camera]:
+        """State and camera `seconds` later (or earlier), at these speeds."""
+        moved = {
+            name: InstrumentState(
+                torch.from_numpy(to_numpy(given.pose) @ _moved(self.instruments[name], seconds)).to(given.pose),
+                {joint: value + seconds * self.joints[name][joint] for joint, value in given.joints.items()},
+            )
+            for name, given in state.instruments.items()
+        }
+        pose = to_numpy(camera.world_from_camera) @ _moved(self.camera, seconds)
+        return replace(state, instruments=moved, time=state.time + seconds), moved_camera(camera, pose)
+
+
+class RecordedMotion:
+    """Draws motions: those of one of the recorded frames whose instruments stood most like the drawn ones."""
+
+    def __init__(self, recorded: Recorded) -> None:
+        order = sorted(range(len(recorded.states)), key=lambda k: recorded.states[k].time)
+        self._motions, states = [], []
+        for first, second in pairwise(order):
+            a, b = recorded.states[first], recorded.states[second]
+            if 0 < b.time - a.time <= MAX_GAP_S and set(a.instruments) == set(b.instruments):
+                self._motions.append(motion_between(a, recorded.cameras[first], b, recorded.cameras[second]))
+                states.append(a)
+        self._frames = SimilarFrames(states, len(states), joints=True)
+
+    @property
+    def known(self) -> bool:
+        """Whether the recording says how anything moved."""
+        return bool(self._motions)
+
+    def any(self, rng: Generator) -> Motion:
+        """That of any recorded frame."""
+        return self._motions[self._frames.any(rng)]
+
+    def __call__(self, state: State, rng: Generator) -> Motion:
+        """How everything moves in `state`."""
+        return self._motions[self._frames.like(state, rng)]
+
+
+class MixedMotion:
+    """Draws motions of instruments and a camera that were not recorded together: each from a frame of its own
+    recording."""
+
+    def __init__(self, tissue: Recorded, instruments: Sequence[Recorded]) -> None:
+        self._tissue = RecordedMotion(tissue)
+        self._instruments = [RecordedMotion(recorded) for recorded in instruments]
+
+    @property
+    def known(self) -> bool:
+        """Whether every recording says how anything moved."""
+        return self._tissue.known and all(recorded.known for recorded in self._instruments)
+
+    def __call__(self, state: State, rng: Generator) -> Motion:
+        """How everything moves in `state`."""
+        motions = [recorded.any(rng) for recorded in self._instruments]
+        return Motion(
+            {name: twist for motion in motions for name, twist in motion.instruments.items()},
+            {name: rates for motion in motions for name, rates in motion.joints.items()},
+            self._tissue.any(rng).camera,
+        )
+
+
+def subframes(scene: Scene, drawing: LayeredDrawing, motion: Motion, shutter_s: float) -> list[tuple[State, Camera]]:
+    """States and cameras spread evenly over an exposure of which `drawing` is the middle: so many that nothing moves
+    by more than SUBFRAME_PX from one to the next (MAX_SUBFRAMES at most), and an odd number, so that the middle is
+    one of them."""
+    ends = [motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2) for side in (-1, 1)]
+    apart = _pixels_between(scene, drawing, *ends)
+    count = 2 * int(np.clip(np.ceil(apart / SUBFRAME_PX / 2), 0, MAX_SUBFRAMES // 2 - 1)) + 1
+    times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
+    return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
+
+
+def _pixels_between(
+    scene: Scene, drawing: LayeredDrawing, start: tuple[State, Camera], end: tuple[State, Camera]
+) -> float:
+    """The furthest that a working end or a place on the tissue moves in the image, in px."""
+    places = []
+    for state, camera in (start, end):
+        points = [point for ends in working_ends(scene, state).values() for point in ends]
+        points += list(surface_points(drawing.tissue_depth, drawing.camera, TISSUE_STEP_PX))
+        places.append([place_in_image(point, camera) for point in points])
+    moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
+    return float(max(moved, default=0.0))
+
+
+def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:
+    """The constant speeds that lead from one recorded frame to a later one."""
+    seconds = b.time - a.time
+    twists = {
+        name: _twist(to_numpy(given.pose), to_numpy(b.instruments[name].pose), seconds)
+        for name, given in a.instruments.items()
+    }
+    joints = {
+        name: {joint: (b.instruments[name].joints[joint] - value) / seconds for joint, value in given.joints.items()}
+        for name, given in a.instruments.items()
+    }
+    camera = _twist(to_numpy(camera_a.world_from_camera), to_numpy(camera_b.world_from_camera), seconds)
+    return Motion(twists, joints, camera)
+
+
+def _twist(start: np.ndarray, end: np.ndarray, seconds: float) -> np.ndarray:
+    """Constant twist [6], in its own frame, that takes pose `start` [4, 4] to `end` in `seconds`."""
+    between = np.linalg.inv(start) @ end
+    turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
+    return np.concatenate([turn, between[:3, 3]]) / seconds
+
+
+def _moved(twist: np.ndarray, seconds: float) -> np.ndarray:
+    return rigid(Rotation.from_rotvec(seconds * twist[:3]).as_matrix(), seconds * twist[3:])

@@ -1,0 +1,328 @@
+"""Draws the samples of a data set: sample a state and a view, draw, judge, apply camera effects, annotate.
+
+Sample `index` depends on scene, settings and index alone: in whichever process and order it is drawn, it is the same.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, product
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.random import Generator
+
+from neeco.capture.model import evenly_spaced
+from neeco.errors import NeecoError
+from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
+from neeco.labels.drawing import MOSTLY, LayeredDrawing, draw_layers
+from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
+from neeco.raster.native import keep_freed_memory, set_threads
+from neeco.scene.io import load_scene
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.camera_effects import (
+    CameraEffects,
+    MixedMotion,
+    RecordedMotion,
+    apply_effects,
+    average_exposure,
+    image_circle,
+    read_effects,
+    subframes,
+)
+from neeco.synthesis.mixing import MixedSampler, Mixture
+from neeco.synthesis.samplers import Sampler, make_sampler
+from neeco.synthesis.settings import Settings
+from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+
+VERB = "synthesize"
+EFFECTS_STREAM = 1  # of an image's random numbers: camera effects do not change which state and view are drawn
+BURIED_SHARE = 0.05  # of an instrument's pixels that may lie deeper than the tolerance: edges are uncertain
+TOLERANCE_MM = (2.0, 5.0)  # range of tolerances found from the recording
+TOLERANCE_STATES = 12  # recorded states from which the tolerance is found
+APART_MM = 6.0  # surfaces of two instruments nearer than about a shaft's thickness: the instruments intersect
+CROSSING = 5  # px nearer than that: instruments are taken to intersect
+MAX_UNOBSERVED_IMAGE = 0.25  # of an image's pixels
+LEAVES_IMAGE, ENTERS_TISSUE, ENTERS_ANOTHER = "leaves the image", "enters the tissue", "enters another"
+UNOBSERVED_TISSUE = "stands before tissue that no frame saw"
+UNOBSERVED_SIDE = "shows sides that no frame saw"
+
+
+class StatesRefused(NeecoError):
+    """No state drawn for an image was acceptable; `refused`: how many were refused, by reason."""
+
+    def __init__(self, message: str, refused: Mapping[str, int] = MappingProxyType({})) -> None:
+        super().__init__(message)
+        self.refused = refused
+
+
+@dataclass(frozen=True)
+class LabelledSample:
+    """One labelled image of a data set, in memory."""
+
+    index: int
+    drawing: LayeredDrawing  # `image` as the camera with its effects sees it
+    labels: list[InstrumentLabel]
+    refused: Mapping[str, int]  # states refused before this one, by reason
+    facts: Mapping[str, Any] = field(default_factory=dict)  # what else its record says, such as its camera effects
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Which drawn states to refuse.
+
+    min_share: of the image's pixels that the instruments must cover together. tolerance_mm: how deep an instrument may
+    lie behind the tissue surface, as this camera sees it (see `buried_depth`); None: any depth. A single view cannot
+    tell "inside the tissue" from "behind a fold of it": both are refused. max_unobserved: share of the instruments'
+    pixels that may be mostly unobserved. recorded_together: groups of instruments; only those of one group may touch;
+    empty: all may.
+    """
+
+    min_share: float
+    tolerance_mm: float | None
+    max_unobserved: float = 1.0
+    recorded_together: tuple[frozenset[str], ...] = ()
+
+    def refusal(self, scene: Scene, drawing: LayeredDrawing) -> str | None:
+        """The reason to refuse the drawing, or None."""
+        keypoints = working_ends(scene, drawing.state)
+        # first: an instrument wholly behind the tissue shows no pixels either
+        if self.tolerance_mm is not None and buried_depth(scene, drawing) > self.tolerance_mm:
+            return ENTERS_TISSUE
+        if int(drawing.parts.count_nonzero()) < self.min_share * drawing.parts.numel():
+            return LEAVES_IMAGE
+        if keypoints and not any_in_image(drawing.camera, keypoints):
+            return LEAVES_IMAGE
+        unobserved = drawing.unobserved > MOSTLY
+        if float(unobserved.float().mean()) > MAX_UNOBSERVED_IMAGE:
+            return UNOBSERVED_TISSUE
+        if float(unobserved[drawing.parts > 0].float().mean()) > self.max_unobserved:
+            return UNOBSERVED_SIDE
+        if any(_intersect(drawing, a, b) for a, b in combinations(self.recorded_together, 2)):
+            return ENTERS_ANOTHER
+        return None
+
+
+@dataclass(frozen=True)
+class SampleGenerator:
+    """Draws the samples of one data set; writes nothing."""
+
+    scene: Scene
+    labeller: Labeller
+    sampler: Sampler | MixedSampler
+    acceptance: Acceptance
+    settings: Settings
+    effects: CameraEffects | None = None
+    motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
+    gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
+
+    @classmethod
+    def of(cls, scene: Scene, settings: Settings, instrument_scenes: Sequence[Scene] = ()) -> SampleGenerator:
+        """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `instrument_scenes`.
+        Raises NeecoError where the scenes cannot give it."""
+        sampler: Sampler | MixedSampler
+        groups: tuple[frozenset[str], ...] = ()
+        gains: tuple[tuple[float, float, float], ...] = ()
+        tissue = scene
+        if instrument_scenes:
+            mixture = Mixture.of(scene, instrument_scenes)
+            scene, sampler, gains = mixture.scene, mixture.sampler(settings), mixture.gains
+            groups = tuple(frozenset(item.name for item in given.instruments) for given in instrument_scenes)
+        else:
+            sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
+        labeller = make_labeller(scene, settings)
+        effects, motion = None, None
+        if settings.camera_effects is not None:
+            effects = read_effects(Path(settings.camera_effects))
+            motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
+        tolerance = None
+        if settings.tissue_check:
+            tolerance = settings.tissue_tolerance_mm
+            tolerance = find_tolerance(scene, labeller) if tolerance is None else tolerance
+        acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
+        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
+
+    def draw(self, index: int) -> LabelledSample:
+        """Draw sample `index`.
+
+        A random state is drawn again until one is acceptable, `settings.max_attempts` times at most. A prescribed state
+        is only drawn from other views. Raises StatesRefused where none was acceptable.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, index, EFFECTS_STREAM]))
+        effects = {} if self.effects is None else self.effects.draw(rng)
+        drawing, refused = self._first_acceptable(index, effects)
+        labels = annotate(self.scene, drawing, self.labeller.names)
+        facts = {} if self.effects is None else {"camera_effects": effects}
+        return LabelledSample(index, self._through_camera(drawing, effects, rng), labels, refused, facts)
+
+    def _first_acceptable(self, index: int, effects: Mapping[str, float]) -> tuple[LayeredDrawing, Counter[str]]:
+        settings = self.settings
+        rng = np.random.default_rng(np.random.SeedSequence([settings.seed, index]))
+        refused: Counter[str] = Counter()
+        for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
+            state, camera = self.sampler(index, rng)
+            drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
+            if "field_of_view" in effects:
+                drawing = _within_circle(drawing, effects["field_of_view"])
+            reason = self.acceptance.refusal(self.scene, drawing)
+            if reason is None:
+                return drawing, refused
+            refused[reason] += 1
+        if self.sampler.prescribed:
+            raise StatesRefused(f"image {index}: its given state was refused ({format_counts(refused)})", refused)
+        raise StatesRefused(
+            f"image {index}: no acceptable state in {settings.max_attempts} attempts ({format_counts(refused)}); "
+            "use --states interpolate, a smaller --margin, --no-tissue-check or --resume with more --max-attempts",
+            refused,
+        )
+
+    def _through_camera(self, drawing: LayeredDrawing, effects: Mapping[str, float], rng: Generator) -> LayeredDrawing:
+        """The drawing as a camera with these effects sees it; labels stay those of the middle of the exposure."""
+        if not effects:
+            return drawing
+        drawing = self._motion_blurred(drawing, effects.get("shutter_s", 0.0), rng)
+        if "field_of_view" in effects:
+            drawing = _within_circle(drawing, effects["field_of_view"])
+        image = apply_effects(drawing.image.numpy(), drawing.depth, effects, rng)
+        return replace(drawing, image=torch.from_numpy(np.ascontiguousarray(image)))
+
+    @torch.no_grad()
+    def _motion_blurred(self, drawing: LayeredDrawing, shutter_s: float, rng: Generator) -> LayeredDrawing:
+        if self.motion is None or shutter_s <= 0:
+            return drawing
+        assert self.effects is not None
+        images, shares = [], []
+        for state, camera in subframes(self.scene, drawing, self.motion(drawing.state, rng), shutter_s):
+            gaussians = self.scene.at(state)
+            rendering, _, share = self.labeller.draw(gaussians, camera, self.labeller.owners(state, gaussians))
+            images.append(rendering.color.clamp(0, 1).cpu().numpy())
+            shares.append(share.clamp(0, 1).cpu())
+        drawing = replace(drawing, image=torch.from_numpy(average_exposure(images)))
+        return drawing if self.effects.soft_masks == "mid" else replace(drawing, share=torch.stack(shares).mean(0))
+
+
+@dataclass(frozen=True)
+class GeneratorSpec:
+    """Scene files and how to draw them: small enough to be sent to another process. `instrument_scenes`: those whose
+    instruments are drawn over the tissue of `scene`, instead of its own."""
+
+    scene: Path
+    settings: Settings
+    device: str = "cpu"
+    instrument_scenes: tuple[Path, ...] = ()
+
+    def open(self) -> SampleGenerator:
+        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
+        device = torch.device(self.device)
+        paths = (self.scene, *self.instrument_scenes)
+        scene, *others = (gaussian_scene(load_scene(path).to(device), VERB) for path in paths)
+        return SampleGenerator.of(scene, self.settings, others)
+
+
+def limit_threads(threads: int) -> None:
+    """In a process of its own that draws: kernels use `threads` threads, torch one; freed memory is kept for the next
+    sample."""
+    set_threads(threads)
+    torch.set_num_threads(1)
+    keep_freed_memory()
+
+
+def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
+    """Draw sample `index` and write it to `output`; returns its record, which for a prescribed state that was refused
+    says so. Raises NeecoError where no random state was acceptable, or the files cannot be written."""
+    try:
+        sample = generator.draw(index)
+    except StatesRefused as error:
+        if generator.sampler.prescribed:
+            return write_skipped(output, index, error.refused)
+        raise NeecoError(f"{output}: {error}") from None
+    return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts)
+
+
+def make_labeller(scene: Scene, settings: Settings) -> Labeller:
+    """The way of labelling that the settings ask for."""
+    if settings.labels == "composited":
+        return CompositedLabels(scene, settings.label_threshold)
+    given = settings.delta_thresholds
+    return ThresholdLabels(scene, None if given is None else DeltaThresholds(*given))
+
+
+def find_tolerance(scene: Scene, labeller: Labeller) -> float:
+    """The tolerance, in mm, under which nine of ten recorded states are acceptable, between 2 and 5 mm.
+
+    No recorded instrument was in the tissue: where the model says so, that is the model's error. More than 5 mm is no
+    such error: there, tissue stood before the instrument.
+    """
+    recorded = scene.recorded
+    depths = [
+        buried_depth(scene, draw_layers(scene, labeller, recorded.states[k], recorded.cameras[k], min_component=0.0))
+        for k in evenly_spaced(len(recorded.states), TOLERANCE_STATES, floor=True)
+    ]
+    return float(np.ceil(100 * np.clip(np.quantile(depths, 0.9), *TOLERANCE_MM)) / 100)
+
+
+def buried_depth(scene: Scene, drawing: LayeredDrawing) -> float:
+    """How far, in mm, the worst instrument lies behind the tissue surface that this camera sees; 0 for none.
+
+    All but the deepest BURIED_SHARE of an instrument's pixels are above this depth, and all keypoints of its working
+    end.
+    """
+    deepest = 0.0
+    keypoints = working_ends(scene, drawing.state)
+    surface = drawing.tissue_depth
+    for name, layer in drawing.layers.items():
+        below = np.where(surface > 0, layer.depth - surface, 0.0)[layer.mask & (layer.depth > 0)]
+        if len(below):
+            deepest = max(deepest, float(np.quantile(below, 1 - BURIED_SHARE)))
+        for point in keypoints.get(name, []):
+            if place := place_in_image(point, drawing.camera):
+                x, y, z = place
+                under = float(surface[int(y), int(x)])
+                deepest = max(deepest, z - under if under > 0 else 0.0)
+    return deepest
+
+
+def format_counts(refused: Mapping[str, int]) -> str:
+    """`leaves the image: 3, enters the tissue: 1`."""
+    return ", ".join(f"{reason}: {count}" for reason, count in refused.items())
+
+
+def _intersect(drawing: LayeredDrawing, some: frozenset[str], others: frozenset[str]) -> bool:
+    """Whether any of `some` instruments comes so near any of the `others` that they must intersect, as far as this
+    camera sees it."""
+    for a, b in product(sorted(some & drawing.layers.keys()), sorted(others & drawing.layers.keys())):
+        first, second = drawing.layers[a], drawing.layers[b]
+        both = first.mask & second.mask & (first.depth > 0) & (second.depth > 0)
+        if int((np.abs(first.depth - second.depth)[both] < APART_MM).sum()) >= CROSSING:
+            return True
+    return False
+
+
+def _motion(scene: Scene, instrument_scenes: Sequence[Scene], settings: Settings) -> RecordedMotion | MixedMotion:
+    """How everything moves while a shutter is open. Raises NeecoError where the recordings do not tell."""
+    motion: RecordedMotion | MixedMotion = RecordedMotion(scene.recorded)
+    if instrument_scenes:
+        motion = MixedMotion(scene.recorded, [given.recorded for given in instrument_scenes])
+    if not motion.known:
+        raise NeecoError(
+            f"{settings.camera_effects}: shutter_s: no two recorded frames are close enough in time to tell how "
+            "anything moved; leave it out"
+        )
+    return motion
+
+
+def _within_circle(drawing: LayeredDrawing, radius: float) -> LayeredDrawing:
+    """Labelled only where the camera's image circle shows anything."""
+    height, width = drawing.depth.shape
+    shown = torch.from_numpy(image_circle(height, width, radius) > 0.5)
+    return replace(
+        drawing, parts=torch.where(shown, drawing.parts, 0).to(drawing.parts.dtype), share=drawing.share * shown
+    )

@@ -1,0 +1,104 @@
+"""`neeco render`: draw the frames of a split, or given states, with part ids and masks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from neeco.capture import read_capture
+from neeco.capture.images import write_image, write_labels
+from neeco.capture.model import Frame, State
+from neeco.capture.statefile import read_states
+from neeco.errors import NeecoError
+from neeco.evaluation.mask_folders import PARTS_FILE
+from neeco.files import write_json
+from neeco.labels.drawing import draw
+from neeco.raster.types import Camera
+from neeco.synthesis.samplers import moved_camera, states_file
+
+if TYPE_CHECKING:
+    from neeco.scene import Drawable
+    from neeco.training.run import Run
+
+STATES_FOLDER = "states"
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What was drawn, and where it lies."""
+
+    folder: Path
+    images: int
+    labelled: bool  # False: the scene's method learns no labels, so there are no part ids and masks
+
+
+@dataclass(frozen=True)
+class View:
+    """One image to draw."""
+
+    name: str
+    state: State
+    camera: Camera
+
+
+def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[View]:
+    """The frames of one split of a capture (the run's own unless given), named by their files' stems.
+
+    Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
+    """
+    capture = run.capture() if capture_path is None else read_capture(capture_path)
+    frames = capture.split(split)
+    if not frames:
+        known = ", ".join(capture.splits) or "none"
+        raise NeecoError(f"{capture.root}: split {split!r} has no frames; the capture has {known}")
+    names = _unique_names(frames, capture.root)
+    return [View(name, frame.state, frame.camera) for name, frame in zip(names, frames, strict=True)]
+
+
+def state_views(scene: Drawable, path: Path) -> list[View]:
+    """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
+    first = scene.recorded.cameras[0]
+    views = []
+    for k, line in enumerate(read_states(states_file(str(path)), scene.instruments)):
+        camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
+        views.append(View(f"{k:06d}", line.state, camera))
+    return views
+
+
+def render(
+    scene: Drawable, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
+) -> Rendered:
+    """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
+    mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
+    labelled = bool(scene.label_names)
+    done = 0
+    for done, view in enumerate(views, 1):
+        drawing = draw(scene, view.state, view.camera)
+        write_image(folder / f"{view.name}.png", drawing.image)
+        if drawing.parts is not None:
+            write_labels(folder / f"{view.name}_parts.png", drawing.parts)
+            write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
+        on_progress(done)
+    if labelled:
+        names = [
+            {"id": index + 1, "instrument": name, "part": part} for index, (name, part) in enumerate(scene.label_names)
+        ]
+        write_json(folder / PARTS_FILE, {"ids": [{"id": 0, "part": "tissue"}, *names]})
+    return Rendered(folder, done, labelled)
+
+
+def _unique_names(frames: tuple[Frame, ...], root: Path) -> list[str]:
+    counts = Counter(frame.name for frame in frames)
+    names = []
+    for frame in frames:
+        if counts[frame.name] == 1:
+            names.append(frame.name)
+            continue
+        path = frame.image_path.with_suffix("")
+        names.append("_".join(path.relative_to(root).parts if path.is_relative_to(root) else path.parts[-2:]))
+    return names
