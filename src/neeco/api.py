@@ -16,13 +16,13 @@ from typing import Any, Literal, overload
 from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
 from neeco.capture.model import Instrument
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.evaluation.lpips import find_lpips
+from neeco.evaluation.image_metrics import find_lpips
 from neeco.labels.labelled_image import LabelledImage, RGBDImage, draw_labelled
 from neeco.raster.devices import device_of
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training import run as runs
-from neeco.training.options import variant_config
+from neeco.training.config import variant_config
 from neeco.training.train import ProgressRow
 from neeco.training.train import train as train_run
 
