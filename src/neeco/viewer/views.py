@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.difference import Pixels, difference_map, overlay_parts
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
@@ -117,7 +117,7 @@ def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels:
         return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
     gaussians, camera = posing.at(state), posing.camera(camera)
-    channels = labels if view in LABELLED else posing.made_up(gaussians, camera)[:, None]
+    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 
