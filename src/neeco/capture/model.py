@@ -48,11 +48,20 @@ class InstrumentState:
 class State:
     """Everything that moves, at one moment: each instrument's state by its name, and the time.
 
-    State({"grasper": InstrumentState(world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
+    An instrument's state may be given as (pose, joints), too: world_from_instrument [4, 4] in mm, and name -> rad.
+
+        State({"grasper": (world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
     """
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
+
+    def __post_init__(self) -> None:
+        given = {
+            name: InstrumentState(*state) if isinstance(state, tuple) else state
+            for name, state in self.instruments.items()
+        }
+        object.__setattr__(self, "instruments", given)
 
     def to(self, device: torch.device | str) -> State:
         """The same state, its poses on `device`."""

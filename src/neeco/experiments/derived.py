@@ -106,8 +106,4 @@ def _copy_masks(root: Path, name: str, output: Path) -> None:
     for folder in MASK_FOLDERS:
         source = root / folder / f"{name}.png"
         if source.is_file():
-            write_atomically(output / folder / source.name, partial(_copy, source))
-
-
-def _copy(source: Path, target: Path) -> None:
-    shutil.copyfile(source, target)
+            write_atomically(output / folder / source.name, partial(shutil.copyfile, source))
