@@ -34,10 +34,9 @@ from neeco.experiments.derived import derive_capture
 from neeco.experiments.tables import latex_table
 from neeco.report.study_pages import write_ablation_report
 from neeco.settings import plain
-from neeco.training import train as train_module
 from neeco.training.run import read_config
 
-SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
+SMALL = ("deformation.width=8", "deformation.depth=2", "max_tissue_gaussians=120")
 
 
 @pytest.fixture(autouse=True)
@@ -46,10 +45,10 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
+def plan(capture: Path, tmp_path: Path) -> AblationPlan:
+    settings = (*SMALL, "log_interval=2")
     return AblationPlan(
-        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL, device="cpu"
+        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=settings, device="cpu"
     )
 
 
@@ -63,7 +62,7 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
     for config in configs.values():
         assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
         assert config["deformation"]["warm_up"] == 0.25
-        assert (config["iterations"], config["initial_points"], config["tissue_budget"]) == (12, 30, 120)
+        assert (config["iterations"], config["initial_points"], config["max_tissue_gaussians"]) == (12, 30, 120)
     changed = {key for key, value in configs["neeco-no-uniform-motion"].items() if value != configs["neeco"][key]}
     assert changed == {"schedule"}
     schedule = configs["neeco-no-uniform-motion"]["schedule"]
@@ -102,10 +101,9 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
 
 
 def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
-    plan: AblationPlan, monkeypatch: pytest.MonkeyPatch
+    plan: AblationPlan,
 ) -> None:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 50)
-    ablation = run_ablations(replace(plan, tables=("uniform-motion",)))
+    ablation = run_ablations(replace(plan, tables=("uniform-motion",), settings=SMALL))
     assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
     assert ablation.failures == []
     assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation.notes)

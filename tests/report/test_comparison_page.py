@@ -55,7 +55,7 @@ def comparison_of(capture, jobs, seeds=(0, 1)):
                     "python": "3.11", "torch": "2.13", "backend": "cpu"},
         budget={"minutes": None, "iterations": 60, "clock": "wall"},
         transforms="transforms.json",
-        settings=["tissue_budget=500"],
+        settings=["max_tissue_gaussians=500"],
         seeds=list(seeds),
         splits=["test", "unseen"],
         methods=[{"name": name, "method": name, "source": "train", "folder": "runs"} for name in names],

@@ -48,7 +48,7 @@ class Compare:
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A field of every method's training config, as NAME=VALUE (e.g. tissue_budget=5000); repeatable."""
+    """A field of every method's training config, as NAME=VALUE (e.g. max_tissue_gaussians=5000); repeatable."""
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
     device: Device = "auto"

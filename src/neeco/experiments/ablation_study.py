@@ -55,11 +55,9 @@ from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_settings
 from neeco.settings import plain
-from neeco.training.config import TrainConfig
-from neeco.training.options import training_config
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import open_run
-from neeco.training.schedule import CLOSEST_RESETS
-from neeco.training.train import ROW_INTERVAL
+from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
@@ -151,6 +149,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
     failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
     folders = {job.name: job.folder for job in jobs if job.name in finished}
     methods = [method for method in ("neeco", "kinematic") if any(v.method == method for v in variants)]
+    log_intervals = {job.config.method: job.config.log_interval for job in jobs}
     labels, unscored = _label_scores(chosen, folders, capture, splits, device)
     result = AblationResult(
         schema=SCHEMA,
@@ -164,7 +163,9 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
         tables=[table_of(table, folders, finished, labels, splits) for table in chosen],
         runs=list(finished.values()),
         failures=failures + unscored,
-        notes=[note for method in methods for note in _shortcomings(method, _steps(plan, method))],
+        notes=[
+            note for method in methods for note in _shortcomings(method, _steps(plan, method), log_intervals[method])
+        ],
     )
     write_json(plan.output / "ablation.json", plain(result))
     return result
@@ -239,21 +240,21 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
     """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
     if config.initial_points is not None:
         return config
-    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.max_tissue_gaussians)))
 
 
-def _shortcomings(method: str, steps: int) -> list[str]:
+def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
     """What runs of so many steps are too short to show."""
     notes = []
-    if method == "neeco" and PHASE_1_SHARE * steps < ROW_INTERVAL:
+    if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
         notes.append(
             f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
-            f"({ROW_INTERVAL} steps); give --iterations {math.ceil(ROW_INTERVAL / PHASE_1_SHARE)} or more"
+            f"({log_interval} steps); give --iterations {math.ceil(log_interval / PHASE_1_SHARE)} or more"
         )
-    if method == "neeco" and TrainConfig().density_stop * steps <= CLOSEST_RESETS:
+    if method == "neeco" and TrainConfig().density_stop * steps <= MIN_RESET_INTERVAL:
         notes.append(
-            f"opacity reset: none comes in {steps} steps (intervals do not scale below {CLOSEST_RESETS}, and density "
-            "control ends half-way), so P_oi changes nothing here"
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
+            "density control ends half-way), so P_oi changes nothing here"
         )
     if method == "kinematic" and steps < KINEMATIC_LEAST:
         notes.append(

@@ -47,8 +47,7 @@ from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.settings import plain
-from neeco.training.config import TrainConfig
-from neeco.training.options import variant_config
+from neeco.training.config import TrainConfig, variant_config
 from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from neeco.capture.model import evenly_spaced
 from neeco.labels.drawing import to_numpy
-from neeco.scene.seen import spread_frames
 from neeco.viewer.source import Loaded
 from neeco.viewer.window import DISTANCE_UNITS, field_of_view, pose_of, wxyz_of
 
@@ -91,7 +91,7 @@ class Overlays:
         if loaded.capture is None or not len(loaded.capture.points.positions):
             return None
         points = loaded.capture.points
-        chosen = spread_frames(len(points.positions), MOST_POINTS)
+        chosen = evenly_spaced(len(points.positions), MOST_POINTS)
         return self._scene.add_point_cloud(
             "/points",
             (points.positions[chosen] * self._unit).astype(np.float32),
@@ -110,7 +110,7 @@ def _frame_clicked(clicked: Callable[[int], None], frame: int, _: object) -> Non
 def _apart(loaded: Loaded) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
     chosen: dict[bytes, int] = {}
-    for frame in spread_frames(len(loaded.recorded.cameras), MOST_FRUSTA):
+    for frame in evenly_spaced(len(loaded.recorded.cameras), MOST_FRUSTA):
         pose = to_numpy(loaded.recorded.cameras[frame].world_from_camera)
         chosen.setdefault(pose.round(3).tobytes(), frame)
     return list(chosen.values())

@@ -16,10 +16,9 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
+from neeco.scene.drawable import Recorded
 from neeco.scene.io import load_scene
-from neeco.scene.recorded import Recorded
-from neeco.training.checkpoint import checkpoint_path, read_checkpoint
-from neeco.training.run import read_config
+from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.steering import Shaft, shafts_of
 
 if TYPE_CHECKING:

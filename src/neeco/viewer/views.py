@@ -117,7 +117,7 @@ def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels:
         return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
     gaussians, camera = posing.at(state), posing.camera(camera)
-    channels = labels if view in LABELLED else posing.made_up(gaussians, camera)[:, None]
+    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 

@@ -1,25 +1,31 @@
-"""One instrument's shaft and hinges, in its own tracked frame: what `kinematic` learns about how it moves."""
+"""The geometry of instruments: a shaft and hinges in the tracked frame, and the volume that instruments sweep."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
+from neeco.raster.devices import CachedPredicate
 from neeco.raster.posing import HingedBody, part_weights
 from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
 
-BEHIND_HINGE = 1.0  # radii of the shaft: how far behind its hinge a jaw may reach
-LONGEST = 0.6  # radii: standard deviation of what turns, or its far end would swing out behind the hinge
-BEHIND_SOFT = 0.25  # radii
-FARTHEST, WIDEST = 1e9, 1e6  # mm: where the radius is not known, a gate so far behind that everything is beyond it
-STILL = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
-STILL_BEYOND = 0.75  # radii of the shaft beyond the hinge, where nothing but jaws is
 PART_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that part weights are the softmax of
+# in radii of the shaft
+JAW_BEHIND_HINGE = 1.0  # how far behind its hinge a jaw may reach
+JAW_BEHIND_SOFTNESS = 0.25  # width of that limit
+MAX_JAW_SCALE = 0.6  # standard deviation of what turns, or its far end would swing out behind the hinge
+JAWS_BEYOND = 0.75  # beyond the hinge, where nothing but jaws is
+
+FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
+MAX_RADIUS, MAX_SOFTNESS = 1e9, 1e6  # mm: where the radius is not known, so far behind that everything is beyond it
+CELLS = 64  # per side of a swept volume
 
 
 class Hinges(nn.Module):
@@ -34,27 +40,25 @@ class Hinges(nn.Module):
     Parts are soft: a Gaussian turns by its part weights times the parts' angles.
     """
 
-    base: Tensor
-    wrist_start: Tensor
-    extent: Tensor
-    middle: Tensor
-    closed: Tensor
-    radius: Tensor
-    tips: Tensor
+    base: Tensor  # [4, 4] instrument_from_shaft
+    wrist_start: Tensor  # mm along the shaft: where its rotational symmetry ends
+    extent: Tensor  # [2] mm along the shaft, first and last solid Gaussian
+    middle: Tensor  # [J] rad or mm, as the readings
+    closed: Tensor  # [J] the lowest recorded reading; nan: not known
+    radius: Tensor  # mm, of the shaft as carved
+    tips: Tensor  # [J, 2, 3] mm, of each joint's parts as learned; nan: not measured
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         super().__init__()
         count = len(joint_names)
         self.joint_names = joint_names
         self.register_buffer("base", torch.eye(4))
-        self.register_buffer(
-            "wrist_start", torch.tensor(-math.inf)
-        )  # mm along the shaft; rotational symmetry ends here
-        self.register_buffer("extent", torch.zeros(2))  # mm along the shaft, first and last solid Gaussian
-        self.register_buffer("middle", torch.zeros(count))  # rad or mm, as the readings
-        self.register_buffer("closed", torch.full((count,), math.nan))  # the lowest recorded reading; nan: not known
-        self.register_buffer("radius", torch.tensor(math.inf))  # mm, of the shaft as carved
-        self.register_buffer("tips", torch.full((count, 2, 3), math.nan))  # mm, of each joint's parts as learned
+        self.register_buffer("wrist_start", torch.tensor(-math.inf))
+        self.register_buffer("extent", torch.zeros(2))
+        self.register_buffer("middle", torch.zeros(count))
+        self.register_buffer("closed", torch.full((count,), math.nan))
+        self.register_buffer("radius", torch.tensor(math.inf))
+        self.register_buffer("tips", torch.full((count, 2, 3), math.nan))
         self.shaft_tilt = nn.Parameter(torch.zeros(2))
         self.shaft_shift = nn.Parameter(torch.zeros(2))
         self.hinge_angle = nn.Parameter(torch.zeros(count))
@@ -112,7 +116,7 @@ class Hinges(nn.Module):
             *shaft,
             self.wrist_start,
             *self._gate(),
-            LONGEST * self.radius,
+            MAX_JAW_SCALE * self.radius,
             roll,
         )
 
@@ -120,8 +124,8 @@ class Hinges(nn.Module):
     def _gate(self) -> tuple[Tensor, Tensor]:
         """(start [], width []) mm along the shaft: what lies far behind the first hinge never turns about it."""
         first = self.hinge_depth.min() if self.joint_names else torch.zeros_like(self.radius)
-        start = first - (BEHIND_HINGE * self.radius).clamp_max(FARTHEST)
-        return start, BEHIND_SOFT * self.radius.clamp_max(WIDEST)
+        start = first - (JAW_BEHIND_HINGE * self.radius).clamp_max(MAX_RADIUS)
+        return start, JAW_BEHIND_SOFTNESS * self.radius.clamp_max(MAX_SOFTNESS)
 
     def part_weights(self, points: Tensor, logits: Tensor) -> Tensor:
         """Part weights [M, part_count] of Gaussians at points [M, 3] mm with part logits [M, part_count or more]."""
@@ -152,13 +156,13 @@ class Hinges(nn.Module):
         known = self.tips[joint].isfinite().all(1)  # [2]
         points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
         angles = torch.where(known, self.turns(joint, reading), self.opened(joint, reading))
-        return rotate_about(points, axis, pivot, angles).index_select(0, self.left_first(joint))
+        return rotate_about(points, axis, pivot, angles).index_select(0, self.left_right_order(joint))
 
     def longest(self, weights: Tensor) -> Tensor:
         """[M, 1] mm: how long the Gaussians may be (standard deviation), by their part weights [M, part_count]: what
         does not turn as long as it likes."""
         turning = 1 - weights[:, :1]
-        return LONGEST * self.radius / turning.clamp_min(1e-6)
+        return MAX_JAW_SCALE * self.radius / turning.clamp_min(1e-6)
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
         """[M, 2 + 2 J] shares of shaft, wrist, and every joint's left and right part in Gaussians at points [M, 3] mm
@@ -170,16 +174,16 @@ class Hinges(nn.Module):
         jaws: list[Tensor] = []
         for joint in range(len(self.joint_names)):
             gains = self.gains[joint].detach().abs()
-            still = (gains < STILL) & (gains == gains.min())  # [2]
-            beyond = along > self.hinge_depth[joint] + STILL_BEYOND * self.radius  # [M]
+            still = (gains < FIXED_JAW_GAIN) & (gains == gains.min())  # [2]
+            beyond = along > self.hinge_depth[joint] + JAWS_BEYOND * self.radius  # [M]
             kept = body[:, None] * (beyond[:, None] & still)
             pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + kept
             body = body - kept.sum(1)
-            jaws += pair.index_select(1, self.left_first(joint)).unbind(1)
+            jaws += pair.index_select(1, self.left_right_order(joint)).unbind(1)
         wrist = (along >= self.wrist_start).to(weights.dtype)
         return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)
 
-    def left_first(self, joint: int) -> Tensor:
+    def left_right_order(self, joint: int) -> Tensor:
         """A joint's two parts (0 and 1) as indices [2], the left one first.
 
         The hinge axis is given the sign that makes its largest component in the instrument frame positive; the left
@@ -191,23 +195,74 @@ class Hinges(nn.Module):
         return torch.stack([left, 1 - left])
 
 
-class Hinged(Protocol):
-    """What the search for instruments asks of a deformation with hinges. Bodies: 0 tissue, then one per instrument in
+class HingedInstruments:
+    """Instruments with a shaft and hinges each. Bodies of the canonical Gaussians: 0 tissue, then one per instrument in
     its own frame."""
+
+    hinges: nn.ModuleList  # `Hinges` of each instrument
+
+    def hinges_of(self, index: int) -> Hinges:
+        """The shaft and hinges of instrument `index`."""
+        hinges = self.hinges[index]
+        assert isinstance(hinges, Hinges)
+        return hinges
 
     @property
     def logit_count(self) -> int:
         """Columns of PART_LOGITS: the largest part count of any instrument."""
-        ...
-
-    def hinges_of(self, index: int) -> Hinges:
-        """The shaft and hinges of instrument `index`."""
-        ...
+        return max((self.hinges_of(index).part_count for index in range(len(self.hinges))), default=1)
 
     def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """Part weights [M, part_count] of one instrument's Gaussians."""
-        ...
+        rows = canonical.body(index + 1)
+        return self.hinges_of(index).part_weights(canonical.means[rows], canonical.extras[PART_LOGITS][rows])
 
-    def spun(self, roll: float) -> Any:
+    def spin_perturbation(self, roll: float) -> Any:
         """The perturbation of `Scene.at` that spins everything behind the wrists by `roll` rad about the shafts."""
-        ...
+        raise NotImplementedError
+
+
+class SweptVolume(nn.Module):
+    """All of space until `cover` is called, then what lies within `margin_mm` of the points given to it.
+
+    Its buffers are saved with its owner.
+    """
+
+    low: Tensor  # [3] mm, world frame: corner of the grid
+    cell: Tensor  # [3] mm; 0 while nothing is covered
+    occupied: Tensor  # [CELLS, CELLS, CELLS] bool
+
+    def __init__(self, margin_mm: float) -> None:
+        super().__init__()
+        self.margin_mm = margin_mm
+        self.register_buffer("low", torch.zeros(3))
+        self.register_buffer("cell", torch.zeros(3))
+        self.register_buffer("occupied", torch.zeros(CELLS, CELLS, CELLS, dtype=torch.bool))
+        self._covered = CachedPredicate(lambda cell: cell.any())
+
+    @property
+    def bounded(self) -> bool:
+        """Has a volume been covered?"""
+        return self._covered(self.cell)
+
+    def cover(self, points: Tensor) -> None:
+        """Make it the cells whose centre lies within the margin of a cell that holds one of `points` [P, 3] mm."""
+        margin = self.margin_mm
+        low = points.min(0).values - margin
+        size = (points.max(0).values + margin - low).clamp_min(1e-3)
+        self.low.copy_(low)
+        self.cell.copy_(size / CELLS)
+        index = ((points - self.low) / self.cell).long().clamp(0, CELLS - 1)
+        holds = np.zeros((CELLS,) * 3, bool)
+        holds[tuple(index.T.cpu().numpy())] = True
+        distance = distance_transform_edt(~holds, sampling=self.cell.tolist())
+        self.occupied.copy_(torch.from_numpy(distance <= margin))
+
+    def contains(self, points: Tensor) -> Tensor:
+        """[N] bool for points [N, 3] mm, world frame."""
+        if not self.bounded:
+            return torch.ones(len(points), dtype=torch.bool, device=points.device)
+        index = ((points - self.low) / self.cell).floor().long()
+        inside = ((index >= 0) & (index < CELLS)).all(1)
+        x, y, z = index.clamp(0, CELLS - 1).unbind(1)
+        return inside & self.occupied[x, y, z]
