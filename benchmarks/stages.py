@@ -13,7 +13,7 @@ import torch
 from raster import FLOPS_BACKWARD, FLOPS_FORWARD, STAGES
 from torch import Tensor
 
-from neeco.raster.threads import synchronise
+from neeco.raster.native import synchronise
 
 MODEL = (  # by which shares of the peaks are told
     "Bytes: every number of every array that a stage takes or makes, once; what caches serve twice, and what a sort "

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco.capture import Capture, Frame, Instrument, InstrumentState, PointCloud, State, write_capture
 from neeco.capture.images import write_labels
-from neeco.capture.poses import swap_camera_axes
+from neeco.capture.model import swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import write_atomically, write_json, write_text
 from neeco.raster.types import Camera

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture
-from neeco.capture.poses import RIGID_TOLERANCE, rigid_fault, rotation_error, swap_camera_axes
+from neeco.capture.model import swap_camera_axes
 from neeco.capture.statefile import camera_to_json, read_states
 from neeco.errors import NeecoError
+from neeco.raster.rotations import RIGID_TOLERANCE, rigid_fault, rotation_error
 
 once_a_folder = settings(
     max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]

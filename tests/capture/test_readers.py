@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
-from neeco.capture.model import Frame, State
-from neeco.capture.points import read_ply
-from neeco.capture.reader import stand_in_points
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
+from neeco.capture.points import points_in_view, read_ply
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.raster import Camera
 
 ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")
@@ -106,7 +106,9 @@ def test_a_scope_that_turns_about_its_trocar_gets_points_in_front_of_it():
         pose[:3, :3] = torch.from_numpy(tilt)
         pose[:3, 3] = 120 * pose[:3, 2]  # the lens, 120 mm from the trocar at the origin, looking away from it
         frames.append(Frame(Path("none.png"), Camera(pose, 100, 100, 32, 24, 64, 48), State(), "train"))
-    points = torch.from_numpy(stand_in_points(frames).positions).double()
+    points = torch.from_numpy(
+        points_in_view(np.stack([frame.camera.world_from_camera for frame in frames])).positions
+    ).double()
     for frame in frames:
         pose = frame.camera.world_from_camera
         depth = (points - pose[:3, 3]) @ pose[:3, 2]
@@ -269,3 +271,111 @@ def test_a_folder_that_is_not_there_is_told_in_one_plain_line(tmp_path):
     with pytest.raises(NeecoError) as raised:
         read_capture(missing)
     assert str(raised.value) == f"{missing}: no such folder; give the folder of a capture"
+
+
+def arrays(count=5):
+    """What a user's own recording may hold: images, camera poses, instrument poses, jaw angles."""
+    random = np.random.default_rng(3)
+    turns = Rotation.from_rotvec(random.uniform(-0.3, 0.3, (2, count, 3)).reshape(-1, 3)).as_matrix()
+    poses = np.tile(np.eye(4), (2 * count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns, random.uniform(-20, 20, (2 * count, 3))
+    return random.uniform(0, 1, (count, 24, 32, 3)), poses[:count], poses[count:], random.uniform(0, 1, count)
+
+
+def own_frames(images, cameras, instruments, jaws):
+    return [
+        Frame(
+            f"{index:04d}.png",
+            Camera(cameras[index], 40.0, 41.0, 16.5, 12.0, 32, 24),
+            State(
+                {"grasper": InstrumentState(instruments[index].tolist(), {"jaw_angle": jaws[index]})}, time=index / 25
+            ),
+            "test" if index == 0 else "train",
+        )
+        for index in range(len(images))
+    ]
+
+
+def test_a_capture_made_of_arrays_is_written_and_reads_back(tmp_path):
+    images, cameras, instruments, jaws = arrays()
+    points = PointCloud(np.random.default_rng(1).uniform(-10, 10, (30, 3)), np.full((30, 3), 0.2))
+    grasper = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
+    capture = Capture("mine", own_frames(images, cameras, instruments, jaws), [grasper], points)
+    write_capture(capture, tmp_path, images=images)
+    read = read_capture(tmp_path)
+    assert_same(capture, read)
+    for index, frame in enumerate(read.frames):
+        assert np.abs(frame.load_image().numpy() - images[index]).max() <= 0.5 / 255 + 1e-6
+        assert np.array_equal(frame.state.instruments["grasper"].pose, instruments[index])
+        assert np.array_equal(frame.camera.world_from_camera, cameras[index].astype(np.float32))
+    bytes_of = (images * 255).round().astype(np.uint8)
+    write_capture(capture, tmp_path / "bytes", images=bytes_of)
+    assert np.array_equal((read_capture(tmp_path / "bytes").frames[2].load_image() * 255).round(), bytes_of[2])
+    write_capture(Capture("mine", capture.frames), tmp_path / "bare", images=images)
+    bare = read_capture(tmp_path / "bare")
+    assert [instrument.name for instrument in bare.instruments] == ["grasper"]
+    assert not bare.points.measured
+
+
+def test_images_that_do_not_fit_their_frames_are_refused(tmp_path):
+    images, *poses = arrays()
+    capture = Capture("mine", own_frames(images, *poses))
+    with pytest.raises(NeecoError, match="images: there are 4 for 5 frames"):
+        write_capture(capture, tmp_path, images=images[:4])
+    with pytest.raises(NeecoError, match=r"0000\.png: image has shape \(24, 31, 3\), its camera says \(24, 32, 3\)"):
+        write_capture(capture, tmp_path, images=images[:, :, :31])
+    assert not (tmp_path / "transforms.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (np.eye(3), r"expected a 4x4 matrix, found shape \(3, 3\)"),
+        (np.diag([2.0, 2, 2, 1]), "is not rigid: its rotation is scaled by 2"),
+        (np.diag([1.0, 1, -1, 1]), "is a reflection"),
+        ([["a"] * 4] * 4, "expected a 4x4 matrix of numbers, found list"),
+        ([[1, 0, 0, 0], [0, 1, 0]], "expected a 4x4 matrix of numbers, found list"),
+        (torch.eye(3), r"expected a 4x4 matrix, found shape \(3, 3\)"),
+    ],
+)
+def test_what_is_no_pose_is_refused_with_the_fields_name(pose, words):
+    with pytest.raises(NeecoError, match=f"InstrumentState.pose: {words}"):
+        InstrumentState(pose)
+    with pytest.raises(NeecoError, match=f"Camera.world_from_camera: {words}"):
+        Camera(pose, 40.0, 40.0, 16, 12, 32, 24)
+
+
+def test_poses_of_any_kind_become_tensors_and_tensors_keep_their_gradients():
+    assert InstrumentState(np.eye(4, dtype=int)).pose.dtype == torch.float64
+    assert Camera(np.eye(4).tolist(), 40.0, 40.0, 16, 12, 32, 24).world_from_camera.dtype == torch.float32
+    moving = torch.eye(4, requires_grad=True)
+    assert InstrumentState(moving).pose is moving
+    given = np.eye(4)
+    state = InstrumentState(given)
+    given[0, 3] = 5.0
+    assert state.pose[0, 3] == 0
+
+
+def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):
+    images, *poses = arrays(1)
+    (frame,) = own_frames(images, *poses)
+    stretched = State({"grasper": InstrumentState(torch.diag(torch.tensor([2.0, 2, 2, 1])))})
+    with pytest.raises(NeecoError, match=r"0000\.png: grasper: pose: is not rigid"):
+        write_capture(Capture("mine", [replace(frame, state=stretched)]), tmp_path, images=images)
+
+
+def test_points_that_are_not_rows_of_three_are_refused():
+    with pytest.raises(NeecoError, match=r"PointCloud.positions: expected shape \[P, 3\], found \[4, 2\]"):
+        PointCloud(np.zeros((4, 2)))
+    with pytest.raises(NeecoError, match=r"PointCloud.colors: expected shape \[4, 3\], found \[3, 3\]"):
+        PointCloud(np.zeros((4, 3)), np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 4), (1, 4), (3, 4), (10, 4), (1000, 128)])
+@pytest.mark.parametrize("floor", [False, True])
+def test_evenly_spaced_items_run_from_the_first_to_the_last(count, most, floor):
+    chosen = evenly_spaced(count, most, floor=floor)
+    assert len(chosen) == min(count, most)
+    assert chosen == sorted(set(chosen))
+    assert chosen[:1] + chosen[-1:] == ([0, count - 1] if count else [])
+    assert max(np.diff(chosen), default=1) - min(np.diff(chosen), default=1) <= 1

@@ -66,7 +66,7 @@ def test_the_share_that_is_made_up_is_told(scene, state, camera):
     tissue = slice(0, plain.counts[0])
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[tissue] = plain.means[tissue, 0] > 0
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         halved, _ = labelled(scene, recorded, camera)
     finally:
@@ -86,7 +86,7 @@ def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of
     recorded, plain = scene.recorded.states[0], scene.canonical
     unseen = torch.zeros(len(plain), dtype=torch.bool)
     unseen[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
-    scene.canonical = plain.with_extras(seen=scene.seen().masked_fill(unseen[:, None], 0.0))
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
     try:
         for labeller in (CompositedLabels(scene), ThresholdLabels(scene)):
             drawing, _ = labelled(scene, recorded, camera, labeller)
@@ -140,11 +140,11 @@ def test_the_pose_is_given_in_the_camera_frame(scene, state, camera):
 
 
 def test_visibility_counts_hidden_pixels():
-    layers, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
-    layers[:, :2] = True
+    alone, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    alone[:, :2] = True
     seen[:, 0] = True
-    assert visibility(seen, layers) == 0.5
-    assert visibility(seen & False, layers & False) == 0.0
+    assert visibility(seen, alone) == 0.5
+    assert visibility(seen & False, alone & False) == 0.0
 
 
 def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, camera):

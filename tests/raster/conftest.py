@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from neeco import _native
-from neeco.raster.threads import set_threads
+from neeco.raster.native import set_threads
 
 
 @pytest.fixture(params=_native.runnable_simd())

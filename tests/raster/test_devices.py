@@ -9,7 +9,7 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.raster import devices
-from neeco.raster.devices import device_failure, device_of, failures_told
+from neeco.raster.devices import device_failure, device_of, readable_failures
 
 FULL = (
     "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 7.78 GiB of which 1.02 GiB is free. "
@@ -134,8 +134,8 @@ def test_a_device_that_gives_up_is_told_in_a_line(said: str) -> None:
 
 
 def test_other_errors_are_left_as_they_are() -> None:
-    with pytest.raises(RuntimeError, match="shapes"), failures_told():
+    with pytest.raises(RuntimeError, match="shapes"), readable_failures():
         raise RuntimeError("shapes differ")
-    with pytest.raises(NeecoError, match="more were asked") as error, failures_told():
+    with pytest.raises(NeecoError, match="more were asked") as error, readable_failures():
         raise torch.cuda.OutOfMemoryError(FULL)
     assert isinstance(error.value.__cause__, torch.cuda.OutOfMemoryError)

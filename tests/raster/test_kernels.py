@@ -15,9 +15,8 @@ from raster_scenes import draw, leaves, make_scene
 from neeco.errors import NeecoError
 from neeco.raster import kernels, rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.raster.native import Family, goes_native
+from neeco.raster.native import Family, runs_native, torch_threads
 from neeco.raster.optimizer import adam_step
-from neeco.raster.threads import torch_threads
 
 LEARNED = {"means": 0.02, "quats": 0.002, "scales": 0.01, "opacities": 0.002, "sh": 0.01, "falloff": 0.01}
 
@@ -56,15 +55,15 @@ def test_two_hundred_steps_learn_the_same() -> None:
 def test_the_switch_holds_for_its_block_and_its_thread() -> None:
     tensor, seen = torch.zeros(1), []
     with kernels("torch"):
-        assert not goes_native(tensor)
+        assert not runs_native(tensor)
         with kernels("native"):
-            assert goes_native(tensor)
-        thread = Thread(target=lambda: seen.append(goes_native(tensor)))
+            assert runs_native(tensor)
+        thread = Thread(target=lambda: seen.append(runs_native(tensor)))
         thread.start()
         thread.join()
-    assert goes_native(tensor)
+    assert runs_native(tensor)
     assert seen == [True]
-    assert not goes_native(tensor.to("meta"))
+    assert not runs_native(tensor.to("meta"))
 
 
 def test_an_unknown_family_is_named() -> None:

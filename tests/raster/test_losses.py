@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from neeco.errors import NeecoError
 from neeco.raster import kernels
 from neeco.raster.losses import photometric_loss, photometric_loss_reference
-from neeco.raster.native import Family
-from neeco.raster.threads import set_threads
+from neeco.raster.native import Family, set_threads
 
 
 def images(height: int, width: int, masked: bool) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:

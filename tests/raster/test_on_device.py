@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neeco.raster.on_device import Answer, constant, quick_products
+from neeco.raster.devices import CachedPredicate, constant, tf32_products
 from neeco.raster.triton import ready
 
 CPU, CUDA, META = torch.device("cpu"), torch.device("cuda"), torch.device("meta")
@@ -26,7 +26,7 @@ def test_an_answer_is_asked_for_again_when_the_tensor_has_changed() -> None:
         asked.append(1)
         return tensor.any()
 
-    answer, tensor = Answer(any_of), torch.nn.Parameter(torch.zeros(3))
+    answer, tensor = CachedPredicate(any_of), torch.nn.Parameter(torch.zeros(3))
     assert not answer(tensor)
     assert not answer(tensor)
     assert len(asked) == 1
@@ -41,13 +41,13 @@ def test_an_answer_is_asked_for_again_when_the_tensor_has_changed() -> None:
 
 def test_only_cuda_multiplies_networks_in_fewer_bits_and_only_in_the_block() -> None:
     assert torch.get_float32_matmul_precision() == "highest"
-    with quick_products(CPU):
+    with tf32_products(CPU):
         assert torch.get_float32_matmul_precision() == "highest"
     inside = ""
 
     def fail() -> None:
         nonlocal inside
-        with quick_products(CUDA):
+        with tf32_products(CUDA):
             inside = torch.get_float32_matmul_precision()
             raise KeyError
 
@@ -58,8 +58,8 @@ def test_only_cuda_multiplies_networks_in_fewer_bits_and_only_in_the_block() -> 
 
 
 def test_kernels_are_launched_for_float32_on_cuda_devices_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not ready.goes_triton(torch.zeros(3))
-    assert not ready.goes_triton(torch.zeros(3, device=META))
+    assert not ready.runs_triton(torch.zeros(3))
+    assert not ready.runs_triton(torch.zeros(3, device=META))
     monkeypatch.setattr(ready, "installed", lambda: False)
     ready.require_triton.cache_clear()
     ready.starts_on.cache_clear()

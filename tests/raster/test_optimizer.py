@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from neeco.errors import NeecoError
 from neeco.raster import kernels
-from neeco.raster.native import Family
+from neeco.raster.native import Family, set_threads
 from neeco.raster.optimizer import adam_step
-from neeco.raster.threads import set_threads
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (501, 16, 3), (0, 4)])

@@ -15,9 +15,9 @@ from posing_worlds import assert_same_as_definition, make_world, posed
 
 from neeco.errors import NeecoError
 from neeco.raster import kernels
+from neeco.raster.native import set_threads
 from neeco.raster.posing import pose_bodies
 from neeco.raster.rotations import quat_to_matrix
-from neeco.raster.threads import set_threads
 
 
 @pytest.mark.parametrize("roll", [0.0, 2.1])

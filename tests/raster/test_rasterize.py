@@ -19,7 +19,7 @@ from raster_scenes import Scene, assert_same_as_reference, decided_pixels, draw,
 
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
-from neeco.raster.threads import set_threads
+from neeco.raster.native import set_threads
 
 
 @pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
@@ -266,7 +266,7 @@ def test_unknown_and_missing_backends_are_named() -> None:
 def test_an_instruction_set_that_is_not_there_is_refused() -> None:
     code = """
 from neeco.errors import NeecoError
-from neeco.raster.threads import simd
+from neeco.raster.native import simd
 try:
     simd()
 except NeecoError as error:

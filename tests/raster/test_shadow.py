@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from neeco.raster import Camera, Gaussians, Headlight, Rendering, kernels, rasterize
-from neeco.raster.blur import LEAST, blur
-from neeco.raster.native import Family
-from neeco.raster.shadow import GAMMA, Casting, _light_camera, blocked, blocked_reference
-from neeco.raster.threads import set_threads
+from neeco.raster.native import Family, set_threads
+from neeco.raster.shadow import GAMMA, LEAST, Casting, _light_camera, blocked, blocked_reference, blur
 from neeco.raster.types import Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)

@@ -168,7 +168,7 @@ def test_the_kernels_of_posing_compile_without_a_gpu(
 ) -> None:
     import triton
 
-    from neeco.raster.triton.posed import Posing
+    from neeco.raster.triton.posing import Posing
 
     triton.runtime.driver.set_active(NoDevice(capability))
     numbers, shapes = [None, torch.rand(22 + 8 * joints)], [(9, 3), (9, 4), (9, 3), (9, 5)]

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of
 @pytest.fixture(autouse=True)
 def by_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     """float32 on the CPU is posed by the kernels, as float32 on a CUDA device is elsewhere."""
-    from neeco.raster.triton.posed import Posing
+    from neeco.raster.triton.posing import Posing
 
     monkeypatch.setattr(posing, "_kernel", lambda given: Posing if given[0].dtype == torch.float32 else None)
 

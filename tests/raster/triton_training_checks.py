@@ -24,8 +24,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of
 def by_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a CUDA device."""
     for module in (losses, optimizer):
-        monkeypatch.setattr(module, "all_native", lambda *tensors: False)
-        monkeypatch.setattr(module, "goes_triton", lambda tensor: tensor.dtype == torch.float32)
+        monkeypatch.setattr(module, "all_run_native", lambda *tensors: False)
+        monkeypatch.setattr(module, "runs_triton", lambda tensor: tensor.dtype == torch.float32)
 
 
 def images(height: int, width: int, masked: bool, seed: int = 0) -> tuple[Tensor, Tensor, Tensor | None]:

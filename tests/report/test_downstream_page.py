@@ -12,8 +12,8 @@ import torch
 from html_page import HOSTILE, Page, check_hostile_names
 
 from neeco.capture.images import write_labels
-from neeco.experiments.downstream.plan import job_folder
-from neeco.experiments.downstream.results import answers_of, comparisons, summarise_folds, verdict
+from neeco.experiments.downstream.job import job_folder
+from neeco.experiments.downstream.results import comparisons, findings, summarise_folds, verdict
 from neeco.experiments.downstream.samples import CLASSES, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_figures import differences, families, question, score_chart, signed
@@ -86,7 +86,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
         "jobs": jobs, "summary": summarise_folds(jobs, answers, SPLITS),
         "paired": comparisons(done, answers, SPLITS, list(sets)), "notes": ["a <note>"],
     }  # fmt: skip
-    return made | {"answers": answers_of(made)}
+    return made | {"answers": findings(made)}
 
 
 def jobs_of(capture, output, *, models=("unet", "dfine"), conditions=CONDITIONS, counts=(5, 20), folds=2, **options):
@@ -163,7 +163,7 @@ def test_no_difference_and_harm_stand_as_plainly(capture, output):
     experiment = experiment_of(capture, worse)
     for row in experiment["paired"]:
         row |= {"low": -0.1, "high": 0.1}
-    experiment["answers"] = answers_of(experiment)
+    experiment["answers"] = findings(experiment)
     text, _ = page_of(output, experiment, capture)
     assert "drawn images show no difference in 2 of 2 comparisons" in text
     assert '<b><span class="soft">no difference shown</span></b>' in text
@@ -329,12 +329,14 @@ def test_a_logarithmic_axis_has_the_points_as_ticks():
 def test_the_command_makes_the_same_experiment(experiment):
     told = command_of(experiment)
     assert told.startswith("neeco downstream ")
-    assert "--sets kinematic=/sets/kinematic --models unet dfine --real 0 5 all --folds 2 --splits test unseen" in told
+    assert (
+        "--sets kinematic=/sets/kinematic --models unet dfine --num-real 0 5 all --folds 2 --splits test unseen" in told
+    )
     assert "--conditions" not in told
     experiment["jobs"][0]["condition"] = "kinematic+soft"
     assert "--conditions kinematic+soft real real+augment kinematic kinematic+real" in command_of(experiment)
     experiment["jobs"] = [job for job in experiment["jobs"] if job["condition"] in ("real", "kinematic+real")]
-    assert "--real 5 all" in command_of(experiment)
+    assert "--num-real 5 all" in command_of(experiment)
     assert "--conditions real kinematic+real" in command_of(experiment)
 
 

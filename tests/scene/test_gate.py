@@ -13,10 +13,10 @@ from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_can
 
 from neeco.errors import NeecoError
 from neeco.scene import Scene
-from neeco.scene.deformations._moving import mark_moving
+from neeco.scene.deformations.base import mark_moving
 from neeco.scene.deformations.nps import NPS, NPSSettings
+from neeco.scene.instruments import SweptVolume
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.swept import SweptVolume
 
 MARGIN_MM = 4.0
 

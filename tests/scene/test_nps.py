@@ -14,9 +14,8 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.scene import Scene
-from neeco.scene.deformations._moving import mark_moving, otsu
+from neeco.scene.deformations.base import encode, mark_moving, otsu
 from neeco.scene.deformations.nps import NPS, NPSSettings
-from neeco.scene.encoding import encode
 from neeco.scene.methods import make_deformation, method_settings
 
 
@@ -36,7 +35,7 @@ def test_the_head_starts_at_zero_and_still_learns(neeco: Scene) -> None:
 
 def test_a_resting_network_is_not_evaluated(neeco: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(NPS, "network", lambda *_: pytest.fail("evaluated"))
-    neeco.deformation.resting = True
+    neeco.deformation.warming_up = True
     posed = neeco.at(neeco.recorded.states[0])
     assert torch.equal(posed.means, neeco.canonical.means)
 

@@ -10,10 +10,10 @@ import torch
 from neeco.capture.model import State
 from neeco.raster.types import Camera
 from neeco.scene.canonical import SH_C0, CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.drawable import Recorded
 from neeco.scene.methods import make_deformation, method_settings
-from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP, continue_tissue, never_in_view, views_of
 from neeco.scene.scene import Scene
+from neeco.scene.visibility import EXTRAPOLATED, count_views, extrapolate_tissue, outside_all_views
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
 DEPTH, COLOR = 100.0, (0.6, 0.3, 0.2)
@@ -43,7 +43,7 @@ def test_a_view_beyond_the_rim_shows_the_continued_wall() -> None:
     beyond = moved(x=25.0)
     with torch.no_grad():
         before = scene_of(canonical).render(State(), beyond)
-        after = scene_of(continue_tissue(canonical, [CAMERA])).render(State(), beyond)
+        after = scene_of(extrapolate_tissue(canonical, [CAMERA])).render(State(), beyond)
     assert float(before.alpha[32, 75]) < 0.05
     assert float(after.alpha[8:56, 66:].min()) > 0.9
     assert torch.allclose(after.color[32, 75], torch.tensor(COLOR), atol=0.05)
@@ -56,7 +56,7 @@ def test_what_was_seen_looks_as_before() -> None:
     with torch.no_grad():
         for camera in cameras:
             before = scene_of(canonical).render(State(), camera)
-            after = scene_of(continue_tissue(canonical, cameras)).render(State(), camera)
+            after = scene_of(extrapolate_tissue(canonical, cameras)).render(State(), camera)
             inner = (slice(6, -6), slice(6, -6))
             assert torch.allclose(after.color[inner], before.color[inner], atol=0.02)
 
@@ -64,18 +64,18 @@ def test_what_was_seen_looks_as_before() -> None:
 def test_made_up_gaussians_are_tissue_and_marked_and_the_others_stay() -> None:
     body = seed_gaussians(torch.tensor([[0.0, 0.0, 50.0]]), torch.ones(1, 3), torch.ones(1))
     canonical = join_bodies([wall(), body]).with_extras(part_logits=torch.arange(2001.0)[:, None])
-    continued = continue_tissue(canonical, [CAMERA])
+    continued = extrapolate_tissue(canonical, [CAMERA])
     added = continued.counts[0] - canonical.counts[0]
     assert added > 100
     assert continued.counts[1] == 1
-    marks = continued.extras[MADE_UP]
+    marks = continued.extras[EXTRAPOLATED]
     assert int(marks.sum()) == added
     assert bool((marks[canonical.counts[0] : continued.counts[0]] == 1).all())
     kept = marks == 0
     for name, tensor in canonical.tensors().items():
         assert torch.equal(continued.tensors()[name][kept], tensor), name
-    made_up = continued.means[marks == 1]
-    assert not bool(views_of(made_up, [CAMERA]).any())
+    unobserved = continued.means[marks == 1]
+    assert not bool(count_views(unobserved, [CAMERA]).any())
 
 
 def test_the_look_is_taken_from_nearby() -> None:
@@ -83,8 +83,8 @@ def test_the_look_is_taken_from_nearby() -> None:
     left = canonical.means[:, 0] < 0
     colors = torch.where(left[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9]))
     canonical = replace(canonical, sh_dc=((colors - 0.5) / SH_C0)[:, None])
-    continued = continue_tissue(canonical, [CAMERA])
-    new = continued.extras[MADE_UP] == 1
+    continued = extrapolate_tissue(canonical, [CAMERA])
+    new = continued.extras[EXTRAPOLATED] == 1
     color = continued.sh_dc[new][:, 0] * SH_C0 + 0.5
     x = continued.means[new][:, 0]
     red, blue = color[x < -60], color[x > 60]
@@ -95,10 +95,10 @@ def test_the_look_is_taken_from_nearby() -> None:
 def test_without_anything_well_seen_nothing_is_made_up() -> None:
     canonical = wall()
     behind = replace(canonical, means=canonical.means * torch.tensor([1.0, 1.0, -1.0]))
-    assert continue_tissue(behind, [CAMERA]) is behind
+    assert extrapolate_tissue(behind, [CAMERA]) is behind
 
 
 def test_views_are_counted_inside_the_images_alone() -> None:
     points = torch.tensor([[0.0, 0.0, 100.0], [60.0, 0.0, 100.0], [0.0, 0.0, -100.0]])
-    assert views_of(points, [CAMERA, moved(x=20.0)]).tolist() == [2, 1, 0]
-    assert never_in_view(points, [CAMERA, moved(x=20.0)]).tolist() == [False, False, True]
+    assert count_views(points, [CAMERA, moved(x=20.0)]).tolist() == [2, 1, 0]
+    assert outside_all_views(points, [CAMERA, moved(x=20.0)]).tolist() == [False, False, True]

@@ -13,11 +13,10 @@ from neeco.capture.model import State
 from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.drawable import Recorded
 from neeco.scene.methods import make_deformation, method_settings
-from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP
 from neeco.scene.scene import Scene
-from neeco.scene.seen import DIRECTIONS, measure_seen
+from neeco.scene.visibility import DIRECTIONS, EXTRAPOLATED, measure_visibility
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=80.0, fy=80.0, cx=32.0, cy=24.0, width=64, height=48)
 FRONT = pose_of(0, 0, 0, 0, 0, 0)  # both in the camera's frame: an instrument is moved, the camera stays
@@ -46,9 +45,9 @@ def still(canonical: CanonicalGaussians, cameras: tuple[Camera, ...] = (CAMERA,)
     return Scene("3dgs", canonical, deformation, (), recorded, torch.tensor([0.0, 0.0, 50.0]))
 
 
-def made_up(scene: Scene, state: State, camera: Camera) -> Tensor:
+def unobserved(scene: Scene, state: State, camera: Camera) -> Tensor:
     posed = scene.at(state)
-    channels = scene.made_up(posed, camera)[:, None]
+    channels = scene.unobserved(posed, camera)[:, None]
     rendering = rasterize(posed, camera, channels=channels)
     return rendering.channels[..., 0][rendering.alpha > 0.99]
 
@@ -68,7 +67,7 @@ def test_a_gaussian_is_seen_by_as_many_pixels_as_its_share_of_them_adds_up_to() 
     with torch.no_grad():
         alpha = rasterize(pair.at(State()), CAMERA).alpha
     left, right = float(alpha[:, :32].sum()), float(alpha[:, 32:].sum())
-    directions, seen = torch.tensor(DIRECTIONS), measure_seen(pair.canonical, pair.recorded, pair.at)
+    directions, seen = torch.tensor(DIRECTIONS), measure_visibility(pair.canonical, pair.recorded, pair.at)
     for k, (pixels, x) in enumerate(((left, -10.0), (right, 10.0))):
         outward = torch.nn.functional.normalize(torch.tensor([-x, 0.0, -50.0]), dim=0)
         shares = (directions @ outward).clamp_min(0) ** 4 * pixels / ((left + right) / 2)
@@ -80,9 +79,9 @@ def test_the_other_side_of_a_ball_is_made_up() -> None:
     scene = still(ball())
     behind = replace(CAMERA, world_from_camera=BACK)
     beside = replace(CAMERA, world_from_camera=pose_of(0, np.pi / 2, 0, -50, 0, 50))
-    assert float(made_up(scene, State(), CAMERA).mean()) < 0.2
-    assert float(made_up(scene, State(), behind).mean()) > 0.9
-    half = made_up(scene, State(), beside)
+    assert float(unobserved(scene, State(), CAMERA).mean()) < 0.2
+    assert float(unobserved(scene, State(), behind).mean()) > 0.9
+    half = unobserved(scene, State(), beside)
     assert 0.25 < float((half > 0.5).float().mean()) < 0.75
 
 
@@ -96,8 +95,8 @@ def test_sides_of_an_instrument_turn_with_it() -> None:
     canonical = canonical.with_extras(**dict(deformation.initial_extras(canonical)) | {"part_logits": logits})
     recorded = Recorded(("0",), ("train",), (grasper_state(FRONT),), (CAMERA,))
     scene = Scene("kinematic", canonical, deformation, (GRASPER,), recorded, torch.zeros(3))
-    assert float(made_up(scene, grasper_state(FRONT), CAMERA).mean()) < 0.2
-    assert float(made_up(scene, grasper_state(BACK), CAMERA).mean()) > 0.9
+    assert float(unobserved(scene, grasper_state(FRONT), CAMERA).mean()) < 0.2
+    assert float(unobserved(scene, grasper_state(BACK), CAMERA).mean()) > 0.9
 
 
 @torch.no_grad()
@@ -107,17 +106,17 @@ def test_what_stands_behind_is_made_up_and_what_was_marked_stays_so() -> None:
     hidden = torch.tensor([[0.0, 0.0, 80.0]])
     scene = still(body(torch.cat([wall, hidden])))
     posed = scene.at(State())
-    found = scene.made_up(posed, CAMERA)
+    found = scene.unobserved(posed, CAMERA)
     middle = wall[:, :2].abs().amax(1) < 15
     assert float(found[-1]) > 0.95
     assert float(found[:-1][middle].max()) < 0.6
     marks = torch.zeros(len(scene.canonical))
     marks[:100] = 1
-    marked = still(body(torch.cat([wall, hidden])).with_extras(**{MADE_UP: marks}))
-    assert bool((marked.made_up(posed, CAMERA)[:100] == 1).all())
+    marked = still(body(torch.cat([wall, hidden])).with_extras(**{EXTRAPOLATED: marks}))
+    assert bool((marked.unobserved(posed, CAMERA)[:100] == 1).all())
 
 
 @torch.no_grad()
 def test_without_recorded_frames_everything_is_made_up() -> None:
     scene = still(ball(), ())
-    assert bool((scene.made_up(scene.at(State()), CAMERA) == 1).all())
+    assert bool((scene.unobserved(scene.at(State()), CAMERA) == 1).all())

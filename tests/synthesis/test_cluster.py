@@ -16,7 +16,7 @@ import pytest
 from ball_world import ball_scene, run_of
 
 from neeco.errors import NeecoError
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 

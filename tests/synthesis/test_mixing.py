@@ -18,7 +18,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import CompositedLabels
-from neeco.raster.threads import torch_threads
+from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.synthesis.dataset import synthesize

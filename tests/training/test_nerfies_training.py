@@ -14,11 +14,10 @@ from safetensors.torch import load_file, save_file
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.nerfies.scene import NerfScene
-from neeco.training.options import training_config, variant_config
+from neeco.scene.nerfies.field import NerfScene
+from neeco.training.config import training_config, variant_config
 from neeco.training.train import ProgressRow, train
 
-pytestmark = pytest.mark.usefixtures("short_intervals")
 SIZES = [
     "rays=32",
     "coarse_samples=6",
@@ -33,6 +32,7 @@ SIZES = [
 
 def config_of(*assignments: str, iterations: int = 30):
     small = [f"deformation.{size}" for size in (*SIZES, *assignments)]
+    small += ["log_interval=5", "checkpoint_interval=20"]
     return training_config("nerfies", {"iterations": iterations}, small)
 
 

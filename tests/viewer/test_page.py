@@ -20,7 +20,7 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
 from neeco.viewer.export import pack, page_of

@@ -14,8 +14,8 @@ from viewer_world import FRAMES, brighter, grasper_scene, write_photographs, wri
 
 from neeco.errors import NeecoError
 from neeco.scene.io import save_scene
-from neeco.training.checkpoint import checkpoint_path
 from neeco.training.config import TrainConfig
+from neeco.training.run import checkpoint_path
 from neeco.training.train import train
 from neeco.viewer.runs import SCENE_FILE, ViewedRuns, WatchedRun
 
@@ -117,7 +117,7 @@ def test_no_run_folder_is_refused(tmp_path: Path) -> None:
 
 def test_while_it_is_trained_the_checkpoint_is_shown_and_then_the_scene(made_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    train(made_run.parent / "capture", run, TrainConfig(method="3dgs", iterations=6, tissue_budget=200))
+    train(made_run.parent / "capture", run, TrainConfig(method="3dgs", iterations=6, max_tissue_gaussians=200))
     scene = (run / SCENE_FILE).rename(tmp_path / "scene")
     source = WatchedRun(run)
     assert source.loaded.iteration == 6

@@ -1,11 +1,13 @@
 """Captures: what was recorded, how it is read, written and checked."""
 
-from neeco.capture.check import Problem, check_capture, errors_only
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.capture.check import check_capture
+from neeco.capture.documents import Problem, errors_only
+from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import write_capture
 
 __all__ = [
+    "Camera",
     "Capture",
     "Frame",
     "Instrument",

@@ -1,6 +1,6 @@
 """Read COLMAP sparse models, binary and text (format: COLMAP's documentation, "Output Format").
 
-Ours beside pycolmap on purpose: captures are read without it, damage becomes one line, and poses stay the same bits.
+Not by pycolmap, which an installation may lack and which ends in a traceback for damaged files.
 """
 
 from __future__ import annotations
@@ -8,18 +8,19 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.model import Frame, PointCloud, State
-from neeco.capture.parsed import Parsed, Place, inside, relative_name
-from neeco.capture.problems import ProblemReport, shown
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.raster.rotations import quat_to_matrix
 from neeco.raster.types import Camera
 
 _MODELS = {
@@ -27,9 +28,6 @@ _MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
 }  # fmt: skip
-
-
-_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -63,108 +61,83 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     """
     parsed = Parsed(root, timed=False)
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
-    binary = suffix == ".bin"
+    parse_cameras, parse_images, parse_points = _PARSERS[suffix]
     try:
-        cameras = _parse(model / f"cameras{suffix}", _cameras_binary if binary else _cameras_text)
-        images = _parse(model / f"images{suffix}", _images_binary if binary else _images_text)
+        cameras = _parse(model / f"cameras{suffix}", parse_cameras)
+        images = _parse(model / f"images{suffix}", parse_images)
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _add_points(model / f"points3D{suffix}", binary, parsed, report)
+    _add_points(model / f"points3D{suffix}", parse_points, parsed, report)
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
-        place = Place(file, shown(image.name))
-        frame = _frame(image, cameras, root, order, place, report)
-        if frame is not None:
-            parsed.frames.append(frame)
+        place = Node(None, file, printable(image.name), report)
+        try:
+            parsed.frames.append(_frame(image, cameras, root, order))
             parsed.places.append(place)
+        except NeecoError as error:
+            place.error_from(error)
     return parsed
 
 
-def _add_points(path: Path, binary: bool, parsed: Parsed, report: ProblemReport) -> None:
-    parsed.points_place = Place(relative_name(path, parsed.root), "")
+def _add_points(
+    path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
+) -> None:
+    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
     try:
-        rows = _parse(path, _points_binary if binary else _points_text)
+        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
     except NeecoError as error:
-        report.error(parsed.points_place.file, "", str(error).removeprefix(f"{path}: "))
+        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
         return
-    positions = np.array([row[:3] for row in rows], dtype=np.float32).reshape(-1, 3)
-    colors = np.array([row[3:6] for row in rows], dtype=np.float32).reshape(-1, 3) / 255
+    positions = rows[:, :3].astype(np.float32)
     if not np.isfinite(positions).all():
-        report.error(parsed.points_place.file, "", "holds points that are NaN or infinite", "remove them")
+        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
         return
-    parsed.points = PointCloud(positions, colors.clip(0, 1))
+    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
 
 
-def _frame(
-    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: ProblemReport
-) -> Frame | None:
-    intrinsics = cameras.get(image.camera_id)
-    if intrinsics is None:
-        report.error(
-            place.file, place.field, f"uses camera {image.camera_id}, which the model lacks", "export it again"
-        )
-        return None
-    pose = _world_from_camera(image)
-    if pose is None:
-        report.error(place.file, place.field, "its pose is not a finite unit quaternion and translation", "drop it")
-        return None
-    try:
-        focal = _pinhole(intrinsics)
-        path = inside(root, root / "images", image.name)
-    except NeecoError as error:
-        report.refused(place.file, place.field, error)
-        return None
+def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int) -> Frame:
+    """Raises NeecoError, which does not name the frame."""
+    if image.camera_id not in cameras:
+        raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
+    intrinsics = cameras[image.camera_id]
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    camera = Camera(pose, *_pinhole(intrinsics), intrinsics.width, intrinsics.height)
+    path = inside(root, root / "images", image.name)
     if not path.is_file():
-        report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
-        return None
-    camera = Camera(torch.from_numpy(pose).float(), *focal, intrinsics.width, intrinsics.height)
-    split = "test" if order % TEST_EVERY == 0 else "train"
-    return Frame(path, camera, State(time=float(order)), split)
+        raise NeecoError("no such file in images/; put the undistorted images there")
+    return Frame(path, camera, State(time=float(order)), "test" if order % TEST_EVERY == 0 else "train")
 
 
 def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy. Raises NeecoError for distorted or impossible cameras."""
-    if camera.model == "SIMPLE_PINHOLE":
-        fx, cx, cy = camera.params
-        fy = fx
-    elif camera.model == "PINHOLE":
-        fx, fy, cx, cy = camera.params
-    else:
+    if camera.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
         raise NeecoError(
             f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
         )
+    fx, fy, cx, cy = (camera.params[0], *camera.params)[-4:]  # a simple one has one focal length
     usable = all(np.isfinite(camera.params)) and fx > 0 and fy > 0
     if not (usable and 0 < cx < camera.width and 0 < cy < camera.height and max(camera.width, camera.height) < 65_536):
         raise NeecoError("its camera has impossible intrinsics; repair the cameras file")
     return fx, fy, cx, cy
 
 
-def _world_from_camera(image: _Image) -> np.ndarray | None:
-    """[4, 4] from COLMAP's camera_from_world, None when it is no rigid transform."""
+def _world_from_camera(image: _Image) -> np.ndarray:
+    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all() and np.abs(translation).max() < 1e9):
-        return None
     norm = np.linalg.norm(quaternion)
-    if not 0.99 < norm < 1.01:
-        return None
-    w, x, y, z = quaternion / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
+        raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
+    rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ translation
     return pose
 
 
-def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
+def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
     """`parse` applied to a file's content; damage becomes NeecoError."""
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
@@ -174,7 +147,7 @@ def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
 
 
 class _Stream:
-    """Little-endian values out of bytes, one after the other."""
+    """Little-endian values of a binary file, one after the other."""
 
     def __init__(self, content: bytes) -> None:
         self.content, self.offset = content, 0
@@ -227,8 +200,7 @@ def _points_binary(content: bytes) -> list[tuple[float, ...]]:
 
 
 def _lines(content: bytes) -> list[str]:
-    lines = content.decode("utf-8").splitlines()
-    return [line for line in lines if not line.startswith("#")]
+    return [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
 
 
 def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
@@ -236,7 +208,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
     for line in _lines(content):
         if line.strip():
             camera_id, model, width, height, *params = line.split()
-            expected = {name: count for name, count in _MODELS.values()}.get(model, len(params))
+            expected = dict(_MODELS.values()).get(model, len(params))
             if len(params) != expected:
                 raise ValueError("parameters missing")
             cameras[int(camera_id)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
@@ -246,10 +218,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
 def _images_text(content: bytes) -> list[_Image]:
     images = []
     # two lines an image; the second (observations) may be empty, so only every other line is read
-    lines = _lines(content)
-    while lines and not lines[0].strip():
-        lines.pop(0)
-    for line in lines[::2]:
+    for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
         if line.strip():
             _, *pose, camera_id, name = line.split(maxsplit=9)
             values = tuple(map(float, pose))
@@ -262,3 +231,9 @@ def _points_text(content: bytes) -> list[tuple[float, ...]]:
     if any(len(row) != 6 for row in rows):
         raise ValueError("columns missing")
     return rows
+
+
+_PARSERS = {
+    ".bin": (_cameras_binary, _images_binary, _points_binary),
+    ".txt": (_cameras_text, _images_text, _points_text),
+}

@@ -1,33 +1,67 @@
-"""What a capture is: frames, cameras, instrument states, splits, sparse points."""
+"""The data model: what a recording consists of, in the units and axes that the whole program uses.
+
+Lengths are mm, angles rad, times s. The world is right-handed and fixed to the tissue. Cameras have OpenCV axes
+(x right, y down, z forward). Poses are rigid transforms [4, 4], named by both ends: `world_from_camera`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
+from neeco.capture.points import PointCloud
+from neeco.raster.rotations import as_pose
 from neeco.raster.types import Camera
+
+STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
+_OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class InstrumentState:
-    """Where one instrument is and how its joints stand."""
+    """Where one instrument is and how its joints stand.
+
+    The pose may be given as a tensor, an array or nested lists; what is no tensor becomes float64. Raises NeecoError
+    when it is not 4x4, or given so and no rotation and translation.
+    """
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
-    joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad
+    joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
+
+    if TYPE_CHECKING:  # what may be given
+
+        def __init__(self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ...) -> None: ...
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything that moves, at one moment: each instrument's state by name, and the time."""
+    """Everything that moves, at one moment: each instrument's state by its name, and the time.
+
+    An instrument's state may be given as (pose, joints), too: world_from_instrument [4, 4] in mm, and name -> rad.
+
+        State({"grasper": (world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
+    """
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
+
+    def __post_init__(self) -> None:
+        given = {
+            name: InstrumentState(*state) if isinstance(state, tuple) else state
+            for name, state in self.instruments.items()
+        }
+        object.__setattr__(self, "instruments", given)
 
     def to(self, device: torch.device | str) -> State:
         """The same state, its poses on `device`."""
@@ -50,9 +84,12 @@ class Frame:
     image_path: Path
     camera: Camera
     state: State
-    split: str
+    split: str  # train, test, unseen, or any other name
     mask_path: Path | None = None  # black pixels are ignored by the loss
     background: float = 1.0  # what shows through transparent pixels: 0 black, 1 white
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image_path", Path(self.image_path))
 
     @property
     def name(self) -> str:
@@ -71,24 +108,19 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class PointCloud:
-    """Sparse coloured points in the world frame."""
-
-    positions: np.ndarray  # [P, 3] float32, mm
-    colors: np.ndarray  # [P, 3] float32 in [0, 1]
-    measured: bool = True  # False: random points, because the capture has none
-
-
-@dataclass(frozen=True)
 class Capture:
-    """A recording ready to learn from."""
+    """A recording ready to learn from. `read_capture` reads one from a folder, `write_capture` writes one."""
 
-    root: Path
+    root: Path  # the folder it was read from
     frames: tuple[Frame, ...]
-    instruments: tuple[Instrument, ...]
-    points: PointCloud
+    instruments: tuple[Instrument, ...] = ()
+    points: PointCloud = field(default_factory=lambda: PointCloud(measured=False))
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
+
+    def __post_init__(self) -> None:
+        for name, kind in {"root": Path, "frames": tuple, "instruments": tuple}.items():
+            object.__setattr__(self, name, kind(getattr(self, name)))
 
     def split(self, name: str) -> tuple[Frame, ...]:
         """The frames of one split, in recorded order."""
@@ -98,6 +130,52 @@ class Capture:
     def splits(self) -> tuple[str, ...]:
         """Names of the splits present, in order of first appearance."""
         return tuple(dict.fromkeys(frame.split for frame in self.frames))
+
+
+class RecordedStates:
+    """Distances of states from the recorded ones, in standard deviations of those.
+
+    A state's coordinates are the instruments' positions (mm), the entries of their rotation matrices and their joints
+    (rad), or the time (s) where no instrument is asked for. Each is divided by its standard deviation over the recorded
+    states; coordinates that stand still there are left out. joints: whether they are to count.
+    """
+
+    def __init__(self, states: Sequence[State], instruments: Sequence[str], joints: bool = True) -> None:
+        self.instruments, self.joints = tuple(instruments), joints
+        points = np.array([self._coordinates(state) for state in states], np.float64)
+        deviation = points.std(0) if len(points) else np.zeros(0)
+        self._moving = deviation > STILL
+        self._deviation = deviation[self._moving]
+        self._points = points[:, self._moving] / self._deviation if len(points) else points
+
+    @property
+    def still(self) -> bool:
+        """Whether nothing moved, so that no state is nearer than another."""
+        return not self._moving.any()
+
+    def distances(self, state: State) -> np.ndarray:
+        """[R] root mean square over the coordinates, in standard deviations, to every recorded state."""
+        point = np.array(self._coordinates(state))[self._moving] / self._deviation
+        return np.sqrt(((self._points - point) ** 2).mean(-1))
+
+    def _coordinates(self, state: State) -> list[float]:
+        if not self.instruments:
+            return [state.time]
+        values: list[float] = []
+        for name in self.instruments:
+            given = state.instruments[name]
+            values += given.pose[:3].detach().cpu().double().numpy().ravel().tolist()
+            values += [given.joints[joint] for joint in sorted(given.joints)] if self.joints else []
+        return values
+
+
+def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
+    """Turn camera poses [..., 4, 4] from OpenGL axes (x right, y up, z back) to OpenCV axes (y down, z forward), or
+    back.
+
+    The only place where the two conventions meet.
+    """
+    return world_from_camera * _OPENGL_FROM_OPENCV
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:

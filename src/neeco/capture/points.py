@@ -1,15 +1,16 @@
-"""Sparse points: PLY files read and written, and random points where there are none."""
+"""Sparse points: read and written as PLY, and random ones where a capture has none."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.model import PointCloud
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
 
+UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -19,21 +20,44 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
+@dataclass(frozen=True)
+class PointCloud:
+    """Sparse coloured points in the world frame. Arrays of other types become float32, no colours become grey.
+
+    Raises NeecoError when the positions are not [P, 3], or the colours not of their shape.
+    """
+
+    positions: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [P, 3] float32, mm
+    colors: np.ndarray = None  # type: ignore[assignment]  # [P, 3] float32 in [0, 1]
+    measured: bool = True  # False: random points, because the capture has none
+
+    def __post_init__(self) -> None:
+        positions = np.asarray(self.positions, np.float32)
+        colors = np.full_like(positions, 0.5) if self.colors is None else np.asarray(self.colors, np.float32)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise NeecoError(f"PointCloud.positions: expected shape [P, 3], found {list(positions.shape)}")
+        if colors.shape != positions.shape:
+            raise NeecoError(f"PointCloud.colors: expected shape {list(positions.shape)}, found {list(colors.shape)}")
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "colors", colors)
+
+
 def read_ply(path: Path) -> PointCloud:
     """Read a PLY file's vertices: x y z and, where present, red green blue (grey otherwise). Other data is ignored.
 
     Positions may hold NaN. Raises NeecoError when the file is missing, damaged or has no usable vertices.
     """
-    content = read_bytes(Path(path), "a point cloud as PLY")
-    encoding, count, properties, body = _parse_header(Path(path), content)
-    vertices = _vertices(Path(path), encoding, count, properties, body)
+    path = Path(path)
+    content = read_bytes(path, "a point cloud as PLY")
+    encoding, count, properties, body = _parse_header(path, content)
+    vertices = _vertices(path, encoding, count, properties, body)
     if not {"x", "y", "z"} <= vertices.keys():
         raise NeecoError(f"{path}: vertex: has no x, y, z; write a point cloud with positions")
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
     for names in _COLORS:
         if set(names) <= vertices.keys():
             return PointCloud(positions, np.stack([_unit(vertices[name]) for name in names], axis=1))
-    return PointCloud(positions, np.full_like(positions, 0.5))
+    return PointCloud(positions)
 
 
 def write_ply(path: Path, points: PointCloud) -> None:
@@ -54,8 +78,25 @@ def random_points(center: np.ndarray, half_size: float, count: int = 20_000, see
     """Grey points spread evenly in a cube, as 3DGS starts where SfM gave nothing. center [3]. Seeded."""
     generator = np.random.default_rng(seed)
     positions = np.asarray(center) + generator.uniform(-half_size, half_size, (count, 3))
-    colors = np.full((count, 3), 0.5, dtype=np.float32)
-    return PointCloud(positions.astype(np.float32), colors, measured=False)
+    return PointCloud(positions.astype(np.float32), measured=False)
+
+
+def points_in_view(poses: np.ndarray) -> PointCloud:
+    """Random points where the cameras look, world_from_camera [F, 4, 4], for captures that bring none.
+
+    A cube about the point nearest to all optical axes, as wide as the cameras are far from it. Axes that meet nowhere,
+    or behind the cameras (a scope turns about its trocar), leave the distance unknown.
+    """
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along each axis
+    normal = across.sum(axis=0)
+    meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
+    if np.linalg.eigvalsh(normal)[0] >= 1e-3 * len(poses):  # else the axes are parallel
+        nearest = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
+        if np.median(((nearest - centers) * axes).sum(axis=1)) > 0:
+            meeting = nearest
+    distance = float(np.median(np.linalg.norm(centers - meeting, axis=1)))
+    return random_points(meeting, 0.5 * max(distance, 1e-3))
 
 
 def _parse_header(path: Path, content: bytes) -> tuple[str, int, list[tuple[str, str]], bytes]:
@@ -92,7 +133,7 @@ def _vertices(
     """Each vertex property as an array [count]."""
     short = NeecoError(f"{path}: holds fewer than the {count} vertices its header promises; it is truncated")
     if encoding == "ascii":
-        # every value needs a digit and a separator, so this bounds what a lying header can make us allocate
+        # every value needs a digit and a separator, so this bounds what a wrong header can make us allocate
         words = body.split() if count * len(properties) <= len(body) else []
         if len(words) < count * len(properties):
             raise short

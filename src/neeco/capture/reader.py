@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from neeco.capture.blender import is_blender, parse_blender
 from neeco.capture.colmap import find_model, parse_colmap
+from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
-from neeco.capture.model import Capture, Frame, PointCloud
-from neeco.capture.parsed import Parsed, inside
-from neeco.capture.points import random_points
-from neeco.capture.problems import ProblemReport, errors_only
-from neeco.capture.transforms import load_document, parse_transforms
+from neeco.capture.model import Capture
+from neeco.capture.points import points_in_view
+from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
-
-UNKNOWN_DISTANCE_MM = 100.0  # how far a single, still camera is taken to look
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
@@ -26,7 +21,7 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
     path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
     background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
-    Raises NeecoError with the first problem found; `check_capture` tells all of them.
+    Raises NeecoError with the first problem found; `check_capture` finds all of them.
     """
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms, background)
@@ -38,7 +33,9 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 def capture_of(parsed: Parsed) -> Capture:
     """What was read without an error, as a capture."""
-    points = parsed.points if parsed.points is not None else stand_in_points(parsed.frames)
+    points = parsed.points
+    if points is None:
+        points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
     return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed)
 
 
@@ -55,7 +52,7 @@ def parse_capture(
     try:
         file = inside(path, path, transforms)
     except NeecoError as error:
-        report.refused(transforms, "", error)
+        Node(None, transforms, "", report).error_from(error)
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)
@@ -65,7 +62,8 @@ def parse_capture(
     if transforms != "transforms.json":
         report.error(transforms, "", "no such file", "name a transforms file of the capture")
         return Parsed(path)
-    if blender_files := [file for file in _blender_files(path) if file.is_file()]:
+    splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
+    if blender_files := [file for file in splits if file.is_file()]:
         return parse_blender({file: load_document(file, path, report) for file in blender_files}, path, background)
     if (model := find_model(path)) is not None:
         return parse_colmap(model, path, report)
@@ -74,26 +72,3 @@ def parse_capture(
     message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"
     report.error("transforms.json", "", message, "is it a capture?")
     return Parsed(path)
-
-
-def stand_in_points(frames: Sequence[Frame]) -> PointCloud:
-    """Random points where the cameras look, for captures that bring none.
-
-    A cube about the point nearest to all optical axes, as wide as the cameras are far from it. Axes that meet nowhere,
-    or behind the cameras (a scope turns about its trocar), leave the distance unknown.
-    """
-    poses = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])  # [F, 4, 4]
-    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # removes what lies along each axis
-    normal = across.sum(axis=0)
-    meeting = centers.mean(axis=0) + UNKNOWN_DISTANCE_MM * axes.mean(axis=0)
-    if np.linalg.eigvalsh(normal)[0] >= 1e-3 * len(frames):  # else the axes are parallel
-        nearest = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
-        if np.median(((nearest - centers) * axes).sum(axis=1)) > 0:
-            meeting = nearest
-    distance = float(np.median(np.linalg.norm(centers - meeting, axis=1)))
-    return random_points(meeting, 0.5 * max(distance, 1e-3))
-
-
-def _blender_files(root: Path) -> list[Path]:
-    return [root / f"transforms_{split}.json" for split in ("train", "val", "test")]

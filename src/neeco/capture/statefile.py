@@ -1,26 +1,27 @@
-"""States written as JSON lines: read what a user gives, write what was drawn.
+"""Instrument states in JSON: those of a transforms file's frames, and files of one state a line.
 
-One state a line: `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: rad}}], "camera": 4x4}`;
+A line is `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: rad}}], "camera": 4x4}`;
 `camera` (world_from_camera, OpenGL axes, as in transforms.json) and `time` may be left out, other keys are ignored.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from neeco.capture.instruments import parse_instruments, passes_limits
-from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.capture.nodes import Node
-from neeco.capture.poses import swap_camera_axes
-from neeco.capture.problems import Refusal
+from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.capture.model import Frame, Instrument, InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_text
+
+Limits = tuple[float, float] | None
+LIMIT_TOLERANCE = 1e-3  # rad (mm for sliding joints) by which rounding and noise may pass a limit
 
 
 @dataclass(frozen=True)
@@ -63,13 +64,84 @@ def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
     return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
 
 
+def passes_limits(value: float, limits: Limits) -> bool:
+    """Whether a joint's value lies outside its limits by more than rounding explains."""
+    return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
+
+
+def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
+    """The instrument states of one frame ({} where it lists none), or None when one of them could not be read."""
+    if not frame.has("instruments"):
+        return {}
+    node = frame.child("instruments")
+    states: dict[str, InstrumentState] = {}
+    good = isinstance(node.value, list)
+    for item in node.items():
+        if not item.is_object():
+            good = False
+            continue
+        name = item.child("name").text()
+        pose = item.child("pose").rigid()
+        nodes = _joint_nodes(item)
+        joints = {joint: child.number() for joint, child in (nodes or {}).items()}
+        known = {joint: value for joint, value in joints.items() if value is not None}
+        if name in states:
+            item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
+            good = False
+        if name is None or pose is None or nodes is None or len(known) < len(joints):
+            good = False
+            continue
+        states[name] = InstrumentState(torch.from_numpy(pose), known)
+    return states if good else None
+
+
+def declared_instruments(document: Node) -> tuple[Instrument, ...]:
+    """The instruments of the header, with their joints' limits; () where the header lists none."""
+    if not document.has("instruments"):
+        return ()
+    instruments: dict[str, Instrument] = {}
+    for item in document.child("instruments").items():
+        if not item.is_object():
+            continue
+        name = item.child("name").text()
+        joints: dict[str, Limits] = {}
+        for joint, node in (_joint_nodes(item) or {}).items():
+            has_limits = node.value is not None and node.is_object() and node.has("limits")
+            joints[joint] = node.child("limits").range("rad") if has_limits else None
+        if name is None:
+            continue
+        if name in instruments:
+            item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
+        instruments[name] = Instrument(name, joints)
+    return tuple(instruments.values())
+
+
+def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -> tuple[Instrument, ...]:
+    """Declared instruments, then those that only frames name; joints likewise."""
+    joints: dict[str, dict[str, Limits]] = {item.name: dict(item.joints) for item in declared}
+    for frame in frames:
+        for name, state in frame.state.instruments.items():
+            known = joints.setdefault(name, {})
+            for joint in state.joints:
+                known.setdefault(joint, None)
+    return tuple(Instrument(name, limits) for name, limits in joints.items())
+
+
+def _joint_nodes(item: Node) -> dict[str, Node] | None:
+    """What stands under each name in `joints` ({} where there is none), or None when that is no object."""
+    if not item.has("joints"):
+        return {}
+    node = item.child("joints")
+    return {name: node.child(name) for name in node.value} if node.is_object() else None
+
+
 def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> StateLine:
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:  # beside what is no JSON: endless numbers and nesting
         reason = error.msg if isinstance(error, json.JSONDecodeError) else "a number or the nesting is beyond measure"
         raise NeecoError(f"{where}: not valid JSON: {reason}; give one JSON object per line") from None
-    node = Node(value, where, "", Refusal())
+    node = Node(value, where, "", RaisingReport())
     if not isinstance(node.child("instruments").value, list):
         node.child("instruments").error("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
     known = {instrument.name: instrument for instrument in instruments}
@@ -82,12 +154,15 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     if isinstance(camera.value, dict):
         camera = camera.child("transform_matrix")
     pose = None if camera.value is None else camera.rigid()
-    # in the scene's order, so that files list them in one order
-    states = {name: _scene_joints(given[name], known[name]) for name in known}
+    # in the scene's order, so that files list them in one order, without joints that the scene does not have
+    states = {
+        name: InstrumentState(given[name].pose, {joint: given[name].joints[joint] for joint in instrument.joints})
+        for name, instrument in known.items()
+    }
     return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
 
 
-def _check_names(node: Node, known: dict[str, Instrument]) -> None:
+def _check_names(node: Node, known: Mapping[str, Instrument]) -> None:
     """Refuse instruments that the scene does not have, and lines without one that it has."""
     given = [item.child("name") for item in node.child("instruments").items()]
     for name in given:
@@ -105,8 +180,3 @@ def _check_joints(item: Node, instrument: Instrument) -> None:
     for joint, limits in instrument.joints.items():
         if passes_limits(joints.value[joint], limits):
             joints.child(joint).error(f"{joints.value[joint]:.4g} rad is outside its limits {list(limits or ())}")
-
-
-def _scene_joints(state: InstrumentState, instrument: Instrument) -> InstrumentState:
-    """The state without joints that the scene does not have: training drops those that say nothing."""
-    return InstrumentState(state.pose, {joint: state.joints[joint] for joint in instrument.joints})

@@ -1,4 +1,4 @@
-"""Read `transforms.json`: neeco-capture/1 and what nerfstudio writes."""
+"""Read transforms files: neeco-capture/1, what nerfstudio writes, and Blender's and D-NeRF's of one split each."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.images import image_size
-from neeco.capture.instruments import declared_instruments, parse_instruments, seen_instruments
-from neeco.capture.model import Frame, State
-from neeco.capture.nodes import Node
-from neeco.capture.parsed import Parsed, Place, inside, relative_name
-from neeco.capture.points import read_ply
-from neeco.capture.poses import swap_camera_axes
-from neeco.capture.problems import ProblemReport, shown
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
+from neeco.capture.images import EXTENSIONS, image_size
+from neeco.capture.model import Frame, State, swap_camera_axes
+from neeco.capture.points import random_points, read_ply
+from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
 from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.raster.types import Camera
@@ -26,21 +23,22 @@ from neeco.raster.types import Camera
 SCHEMA = "neeco-capture/1"
 LARGEST_SIZE = 65_535  # px
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
+BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 
 def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     """A JSON file as the node of its object. What cannot be parsed is reported and gives an empty object."""
     name = relative_name(file, root)
+    value: Any = {}
     try:
         value = read_json(file)
     except NeecoError as error:
         report.error(name, "", str(error).removeprefix(f"{file}: "))
-        value = {}
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels
         report.error(name, "", "not usable JSON: a number or the nesting is beyond all measure")
-        value = {}
     node = Node(value, name, "", report)
     return node if node.is_object() else Node({}, name, "", report)
 
@@ -49,33 +47,68 @@ def parse_transforms(document: Node, folder: Path, root: Path, background: float
     """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
     file."""
     parsed = Parsed(root)
-    parse_header(document, parsed)
-    parse_frames(document, folder, parsed, background=background)
-    parse_points(document, folder, parsed)
-    parsed.instruments = seen_instruments(parsed.frames, declared_instruments(document))
+    _parse_header(document, parsed)
+    _parse_frames(document, folder, parsed, background)
+    _parse_points(document, folder, parsed)
+    parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
     return parsed
 
 
-def parse_header(document: Node, parsed: Parsed) -> None:
-    """Check what holds for the whole file: schema, units, camera model, and read `instrument_frame`."""
+def is_blender(document: Node) -> bool:
+    """Whether a transforms file gives the field of view instead of intrinsics, as Blender's exporters do."""
+    value = document.value
+    return "camera_angle_x" in value and "fl_x" not in value and "instruments" not in value
+
+
+def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0) -> Parsed:
+    """Read the files of a Blender capture, given with their content, one split each, named by the file.
+
+    Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used. Where no frame
+    at all has a time nothing moves (NeRF's synthetic scenes): every frame then has time 0.
+    """
+    parsed = Parsed(root)
+    for file, document in files.items():
+        suffix = file.stem.rpartition("_")[2]
+        split = suffix if suffix in ("train", "val", "test") else None
+        _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS)
+        if parsed.points is None:
+            _parse_points(document, file.parent, parsed)
+    if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
+        parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
+        parsed.timed = True
+    if parsed.points is None:
+        parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
+        parsed.points_place = next(iter(files.values())).child("ply_file_path")
+    return parsed
+
+
+def _frame_objects(document: Node) -> list[dict[str, Any]]:
+    frames = document.value.get("frames")
+    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+
+
+def _parse_header(document: Node, parsed: Parsed) -> None:
+    """Check what holds for the whole file: schema and units, and read `instrument_frame`."""
     value = document.value
     schema = value.get("schema", SCHEMA)
     if schema != SCHEMA:
-        document.child("schema").error(f"is {shown(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it")
-    if value.get("units", "mm") not in ("mm", "millimeter", "millimetre", "millimeters", "millimetres"):
-        document.child("units").error(f"is {shown(value['units'])}; lengths must be mm", "convert all poses and points")
+        document.child("schema").error(
+            f"is {printable(schema)}, not {SCHEMA!r}", "use a version of neeco that knows it"
+        )
+    if value.get("units", "mm") not in _MILLIMETRES:
+        message = f"is {printable(value['units'])}; lengths must be mm"
+        document.child("units").error(message, "convert all poses and points")
     registration = value.get("instrument_frame", "world")
     if registration not in ("world", "unregistered"):
-        document.child("instrument_frame").error(f"is {shown(registration)}", "write 'world' or 'unregistered'")
+        document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
     parsed.registered = registration != "unregistered"
     parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA
 
 
-def parse_frames(
+def _parse_frames(
     document: Node,
     folder: Path,
     parsed: Parsed,
-    *,
     background: float,
     split: str | None = None,
     extensions: tuple[str, ...] = (),
@@ -86,9 +119,9 @@ def parse_frames(
         nodes.error("is missing", "list the images and their cameras there")
         return
     if not isinstance(nodes.value, list):
-        nodes.error(f"expected a list, found {shown(nodes.value)}")
+        nodes.error(f"expected a list, found {printable(nodes.value)}")
         return
-    splits, shared = _Splits(document, split), _Shared(document, nodes.value)
+    splits, header = _Splits(document, split), _HeaderReport(document, len(nodes.value))
     timed = 0
     for index, node in enumerate(nodes.items()):
         if not node.is_object():
@@ -102,48 +135,43 @@ def parse_frames(
         instruments = parse_instruments(node)
         if image_path is None:
             continue
-        camera = _camera(node, shared, image_path)
+        camera = _Intrinsics(node, header.document, image_path).camera()
         if name is None or time is None or instruments is None:
             continue
         if pose is None or camera is None:
             parsed.without_camera.add(len(parsed.frames))
-        camera = camera or _stand_in(image_path)
+        if camera is None:  # a placeholder: images and states can still be checked
+            width, height = _size_or_largest(image_path)
+            camera = Camera(torch.eye(4), width, width, width / 2, height / 2, width, height)
         if pose is not None:
             opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
             camera = replace(camera, world_from_camera=opencv)
-        state = State(instruments, time)
-        parsed.frames.append(Frame(image_path, camera, state, name, mask_path, background))
-        parsed.places.append(Place(node.file, node.field))
-    shared.tell()
+        parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
+        parsed.places.append(node)
+    header.pass_on()
     if nodes.value == []:
         nodes.error("is empty", "list the images and their cameras there")
-    elif timed < len(nodes.value):
+    elif timed < len(nodes.value):  # where not every frame has a time, the order stands in for all: no mix of units
         parsed.timed = False
-        _time_by_order(parsed.frames)
+        for order, frame in enumerate(parsed.frames):
+            parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
-def _time_by_order(frames: list[Frame]) -> None:
-    """Where not every frame has a time, seconds and counts must not mix: the order stands in for all."""
-    for order, frame in enumerate(frames):
-        frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
-
-
-def parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
+def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
-    parsed.points_place = Place(document.file, "ply_file_path")
+    parsed.points_place = document.child("ply_file_path")
     path = _optional_file(document, "ply_file_path", folder, parsed.root)
     if path is None:
         return
-    parsed.points_place = Place(relative_name(path, parsed.root), "vertex")
+    name = relative_name(path, parsed.root)
+    parsed.points_place = Node(None, name, "vertex", document.report)
     try:
         parsed.points = read_ply(path)
     except NeecoError as error:
-        document.report.error(relative_name(path, parsed.root), "", str(error).removeprefix(f"{path}: "))
+        document.report.error(name, "", str(error).removeprefix(f"{path}: "))
         return
-    bad = int((~np.isfinite(parsed.points.positions).all(axis=1)).sum())
-    if bad:
-        place = parsed.points_place
-        document.report.error(place.file, place.field, f"{bad} points are NaN or infinite", "remove them from the file")
+    if bad := int((~np.isfinite(parsed.points.positions).all(axis=1)).sum()):
+        parsed.points_place.error(f"{bad} points are NaN or infinite", "remove them from the file")
         parsed.points = None
 
 
@@ -160,9 +188,7 @@ class _Splits:
                 for item in node.items() if node.value is not None else ():
                     text = item.text()
                     self.listed.update({} if text is None else {text: name})
-        frames = document.value.get("frames")
-        frames = frames if isinstance(frames, list) else []
-        self.some_say = any(isinstance(frame, dict) and frame.get("split") is not None for frame in frames)
+        self.some_say = any(frame.get("split") is not None for frame in _frame_objects(document))
 
     def of(self, frame: Node, index: int) -> str | None:
         if self.fixed is not None:
@@ -193,90 +219,81 @@ def _optional_file(parent: Node, key: str, folder: Path, root: Path) -> Path | N
 
 
 def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
-    """The existing file inside the capture that a node names."""
+    """The existing file inside the capture that a node names; `extensions` are tried on paths without one."""
     text = node.text()
     if text is None:
         return None
     try:
-        path = inside(root, folder, text)
-        candidates = [path, *(inside(root, folder, text + extension) for extension in extensions)]
+        candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
     except NeecoError as error:
-        node.report.refused(node.file, node.field, error)
+        node.error_from(error)
         return None
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    node.error(f"no such file: {shown(text)}", "put it there or correct the path")
+    node.error(f"no such file: {printable(text)}", "put it there or correct the path")
     return None
 
 
-class _Shared(ProblemReport):
-    """What is wrong with the camera at the file's top level: told once, with how many frames it concerns.
+class _HeaderReport(ProblemReport):
+    """What is wrong with the camera at the file's top level: reported once, with how many frames it concerns.
 
     A number that neither a frame nor the top level gives counts as the top level's.
     """
 
-    def __init__(self, document: Node, frames: list[Any]) -> None:
+    def __init__(self, document: Node, frames: int) -> None:
         super().__init__()
         self.document = Node(document.value, document.file, document.field, self)
         self.report, self.first, self.frames = document.report, len(document.report.problems), frames
 
-    def tell(self) -> None:
+    def pass_on(self) -> None:
         """Pass the problems on, each once, before those of the frames."""
-        told = []
+        merged = []
         for problem, count in Counter(self.problems).items():
-            concerned = "" if len(self.frames) == 1 else f", for {count} of {len(self.frames)} frames"
-            told.append(replace(problem, message=problem.message + concerned))
-        self.report.problems[self.first : self.first] = told
+            concerned = "" if self.frames == 1 else f", for {count} of {self.frames} frames"
+            merged.append(replace(problem, message=problem.message + concerned))
+        self.report.problems[self.first : self.first] = merged
 
 
-def _camera(frame: Node, shared: _Shared, image_path: Path) -> Camera | None:
-    """The frame's pinhole camera at the origin, intrinsics from the frame or else from the top level."""
-    numbers = _Intrinsics(frame, shared.document)
-    is_pinhole = numbers.is_pinhole()
-    size = numbers.size(image_path)
-    width, height = size or _stand_in_size(image_path)
-    fx = numbers.focal("fl_x", "camera_angle_x", width)
-    fy = numbers.focal("fl_y", "camera_angle_y", height) if numbers.has("fl_y", "camera_angle_y") else fx
-    cx, cy = numbers.center("cx", width), numbers.center("cy", height)
-    if size is None or fx is None or fy is None or cx is None or cy is None or not is_pinhole:
-        return None
-    return Camera(torch.eye(4), fx, fy, cx, cy, width, height)
-
-
-def _stand_in(image_path: Path) -> Camera:
-    """A camera of the image's size, where the frame's own is wrong: images and states can still be checked."""
-    width, height = _stand_in_size(image_path)
-    return Camera(torch.eye(4), width, width, width / 2, height / 2, width, height)
-
-
-def _stand_in_size(image_path: Path) -> tuple[int, int]:
+def _size_or_largest(image_path: Path) -> tuple[int, int]:
     try:
         return image_size(image_path)
-    except NeecoError:  # told when the images are checked
+    except NeecoError:  # reported when the images are checked
         return LARGEST_SIZE, LARGEST_SIZE
 
 
 class _Intrinsics:
     """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
 
-    def __init__(self, frame: Node, document: Node) -> None:
-        self.frame, self.document = frame, document
+    def __init__(self, frame: Node, document: Node, image_path: Path) -> None:
+        self.frame, self.document, self.image_path = frame, document, image_path
 
-    def has(self, *keys: str) -> bool:
+    def camera(self) -> Camera | None:
+        """The frame's pinhole camera at the origin; None, and reported, where its numbers are wrong."""
+        is_pinhole = self._is_pinhole()
+        size = self._size()
+        width, height = size or _size_or_largest(self.image_path)
+        fx = self._focal("fl_x", "camera_angle_x", width)
+        fy = self._focal("fl_y", "camera_angle_y", height) if self._has("fl_y", "camera_angle_y") else fx
+        cx, cy = self._center("cx", width), self._center("cy", height)
+        if size is None or fx is None or fy is None or cx is None or cy is None or not is_pinhole:
+            return None
+        return Camera(torch.eye(4), fx, fy, cx, cy, width, height)
+
+    def _has(self, *keys: str) -> bool:
         return any(self.frame.has(key) or self.document.has(key) for key in keys)
 
-    def node(self, key: str) -> Node:
+    def _node(self, key: str) -> Node:
         return (self.frame if self.frame.has(key) else self.document).child(key)
 
-    def is_pinhole(self) -> bool:
+    def _is_pinhole(self) -> bool:
         """False (and reported) for distorted images: undistorting belongs before the capture."""
-        model = self.node("camera_model")
+        model = self._node("camera_model")
         if model.value is not None and model.value not in _PINHOLE_MODELS:
-            model.error(f"is {shown(model.value)}; only PINHOLE is drawn", "undistort the images first")
+            model.error(f"is {printable(model.value)}; only PINHOLE is drawn", "undistort the images first")
             return False
         for key in _DISTORTION:
-            node = self.node(key)
+            node = self._node(key)
             if node.value is None:
                 continue
             value = node.number()
@@ -287,45 +304,45 @@ class _Intrinsics:
                 return False
         return True
 
-    def size(self, image_path: Path) -> tuple[int, int] | None:
+    def _size(self) -> tuple[int, int] | None:
         """(width, height), from the image itself where not stated."""
-        if not (self.has("w") or self.has("h")):
+        if not self._has("w", "h"):
             try:
-                return image_size(image_path)
+                return image_size(self.image_path)
             except NeecoError as error:
-                message = str(error).removeprefix(f"{image_path}: ")
-                self.frame.child("file_path").error(f"{shown(image_path.name)}: {message}")
+                message = str(error).removeprefix(f"{self.image_path}: ")
+                self.frame.child("file_path").error(f"{printable(self.image_path.name)}: {message}")
                 return None
         width, height = (self._positive(key) for key in ("w", "h"))
         if width is None or height is None:
             return None
         if width % 1 or height % 1 or max(width, height) > LARGEST_SIZE:
-            self.node("w").error(f"image size {width:g} x {height:g} is not usable", "write whole numbers of pixels")
+            self._node("w").error(f"image size {width:g} x {height:g} is not usable", "write whole numbers of pixels")
             return None
         return int(width), int(height)
 
-    def focal(self, key: str, angle_key: str, extent: int) -> float | None:
+    def _focal(self, key: str, angle_key: str, extent: int) -> float | None:
         """Focal length in px, from the field of view where only that is given."""
-        if self.has(key) or not self.has(angle_key):
+        if self._has(key) or not self._has(angle_key):
             return self._positive(key)
         angle = self._positive(angle_key)
         if angle is not None and angle >= math.pi:
-            self.node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
+            self._node(angle_key).error(f"is {angle:g} rad, not below pi", "give the field of view in radians")
             return None
         return None if angle is None else 0.5 * extent / math.tan(0.5 * angle)
 
-    def center(self, key: str, extent: int) -> float | None:
+    def _center(self, key: str, extent: int) -> float | None:
         """Principal point in px: inside the image, its middle where not stated."""
-        if not self.has(key):
+        if not self._has(key):
             return extent / 2
-        value = self.node(key).number()
+        value = self._node(key).number()
         if value is not None and not 0 < value < extent:
-            self.node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
+            self._node(key).error(f"is {value:g}, outside the image (0 .. {extent})", "give it in pixels of this image")
             return None
         return value
 
     def _positive(self, key: str) -> float | None:
-        node = self.node(key)
+        node = self._node(key)
         if node.value is None:
             node.error("is missing", "give the camera's intrinsics at the top level or in every frame")
             return None

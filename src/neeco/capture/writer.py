@@ -1,34 +1,60 @@
-"""Write a capture as neeco-capture/1."""
+"""Write a capture as neeco-capture/1, and tell one capture from another by a fingerprint."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from neeco.capture.images import has_alpha, write_image
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Capture, Frame, swap_camera_axes
 from neeco.capture.points import write_ply
-from neeco.capture.poses import swap_camera_axes
+from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.capture.transforms import SCHEMA
 from neeco.errors import NeecoError
-from neeco.files import write_atomically, write_json
+from neeco.files import read_bytes, write_atomically, write_json
+from neeco.raster.rotations import rigid_fault
 
 
-def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False) -> None:
+def write_capture(
+    capture: Capture,
+    path: Path | str,
+    *,
+    images: Sequence[Tensor | np.ndarray] | None = None,
+    overwrite: bool = False,
+) -> None:
     """Write a capture folder: images/, masks/, sparse.ply and, last, transforms.json; every file whole or not at all.
 
     Images and masks are copied bit by bit (transparent images are flattened on their background); poses read back
-    exactly. Random stand-in points are not written. Raises NeecoError when the disk refuses, an image cannot be
-    copied, or `path` already holds a capture and `overwrite` is not set.
+    exactly. Random points are not written. `images`: the pixels of every frame, [H, W, 3] in [0, 1] or uint8,
+    where the frames have no files yet; each is written as PNG under its frame's name. Raises NeecoError when the disk
+    refuses, an image cannot be copied or has not its camera's size, a pose is not rigid, or `path` already holds a
+    capture and `overwrite` is not set.
+
+        frames = [
+            Frame(Path(f"{k:04d}.png"), Camera(world_from_camera[k], fx, fy, cx, cy, width, height),
+                  State({"grasper": InstrumentState(world_from_grasper[k], {"jaw_angle": jaw[k]})}, time=k / 25),
+                  split="test" if k % 8 == 0 else "train")
+            for k in range(len(pixels))
+        ]
+        grasper = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
+        capture = Capture(Path("mine"), tuple(frames), (grasper,), PointCloud(xyz, rgb))
+        write_capture(capture, "mine", images=pixels)
     """
     path = Path(path)
     if (path / "transforms.json").exists() and not overwrite:
         raise NeecoError(f"{path}: already holds a capture; choose another folder or ask to overwrite it")
+    if images is not None and len(images) != len(capture.frames):
+        raise NeecoError(f"images: there are {len(images)} for {len(capture.frames)} frames; give one for each")
     names = _names(capture)
     header: dict[str, Any] = {"schema": SCHEMA, "camera_model": "PINHOLE", "units": "mm"}
     header["instrument_frame"] = "world" if capture.registered else "unregistered"
@@ -41,11 +67,38 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
         }
         for instrument in capture.instruments
     ]
-    header["frames"] = [_write_frame(frame, name, path) for frame, name in zip(capture.frames, names, strict=True)]
+    pixels = [None] * len(names) if images is None else images
+    header["frames"] = [
+        _write_frame(frame, name, path, image) for frame, name, image in zip(capture.frames, names, pixels, strict=True)
+    ]
     if capture.points.measured:
         write_ply(path / "sparse.ply", capture.points)
         header["ply_file_path"] = "sparse.ply"
     write_json(path / "transforms.json", header)
+
+
+def fingerprint(capture: Capture) -> str:
+    """SHA-256 (hex) of all that is read of a capture: the files of its images and masks, cameras, states, splits,
+    instruments, points; not of where it lies. Raises NeecoError for an image that cannot be read."""
+    digest = hashlib.sha256()
+    for frame in capture.frames:
+        camera = frame.camera
+        description = {
+            "name": frame.name,
+            "split": frame.split,
+            "camera": camera_to_json(camera.world_from_camera.double().numpy()),
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near],
+            "state": state_to_json(frame.state),
+            "background": frame.background,
+        }
+        digest.update(json.dumps(description).encode())
+        for path in (frame.image_path, frame.mask_path):
+            digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
+    instruments = [[item.name, dict(item.joints)] for item in capture.instruments]
+    digest.update(json.dumps([instruments, capture.registered, capture.timed]).encode())
+    for numbers in (capture.points.positions, capture.points.colors):
+        digest.update(numbers.tobytes())
+    return digest.hexdigest()
 
 
 def _names(capture: Capture) -> list[str]:
@@ -62,42 +115,66 @@ def _names(capture: Capture) -> list[str]:
     return names
 
 
-def _write_frame(frame: Frame, name: str, path: Path) -> dict[str, Any]:
-    """Copy a frame's files and return its JSON."""
-    image_name = _write_image(frame, name, path)
+def _write_frame(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None) -> dict[str, Any]:
+    """Write a frame's files and return its JSON."""
     camera = frame.camera
-    pose = swap_camera_axes(camera.world_from_camera.detach().cpu().to(torch.float64).numpy())
+    world_from_camera = _rigid(camera.world_from_camera, f"{frame.image_path}: world_from_camera")
+    instruments = [
+        {
+            "name": instrument,
+            "pose": _rigid(state.pose, f"{frame.image_path}: {instrument}: pose").tolist(),
+            "joints": {joint: _number(value) for joint, value in state.joints.items()},
+        }
+        for instrument, state in frame.state.instruments.items()
+    ]
     entry: dict[str, Any] = {
-        "file_path": image_name,
-        "transform_matrix": pose.tolist(),
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
-        "time": frame.state.time,
+        "file_path": _write_image(frame, name, path, image),
+        "transform_matrix": swap_camera_axes(world_from_camera).tolist(),
+        "fl_x": _number(camera.fx),
+        "fl_y": _number(camera.fy),
+        "cx": _number(camera.cx),
+        "cy": _number(camera.cy),
+        "w": _number(camera.width),
+        "h": _number(camera.height),
+        "time": _number(frame.state.time),
         "split": frame.split,
     }
     if frame.mask_path is not None:
         entry["mask_path"] = f"masks/{name}{frame.mask_path.suffix}"
         _copy(frame.mask_path, path / entry["mask_path"])
-    entry["instruments"] = [
-        {"name": instrument, "pose": state.pose.detach().cpu().double().tolist(), "joints": dict(state.joints)}
-        for instrument, state in frame.state.instruments.items()
-    ]
-    return entry
+    return entry | {"instruments": instruments}
 
 
-def _write_image(frame: Frame, name: str, path: Path) -> str:
-    """Copy or flatten a frame's image; its path in the new capture."""
-    if has_alpha(frame.image_path):
-        target = f"images/{name}.png"
-        write_image(path / target, frame.load_image())
-    else:
+def _number(value: Any) -> Any:
+    """A number as JSON takes it: those of arrays become Python's."""
+    return value.item() if isinstance(value, np.generic | np.ndarray | Tensor) else value
+
+
+def _rigid(pose: Tensor, field: str) -> np.ndarray:
+    matrix = pose.detach().cpu().to(torch.float64).numpy()
+    if (fault := rigid_fault(matrix)) is not None:
+        raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
+    return matrix
+
+
+def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None) -> str:
+    """Write, copy or flatten a frame's image; its path in the new capture."""
+    if image is None and not has_alpha(frame.image_path):
         target = f"images/{name}{frame.image_path.suffix}"
         _copy(frame.image_path, path / target)
+        return target
+    target = f"images/{name}.png"
+    write_image(path / target, frame.load_image() if image is None else _checked(image, frame))
     return target
+
+
+def _checked(image: Tensor | np.ndarray, frame: Frame) -> Tensor:
+    """Given pixels as floats in [0, 1]. Raises NeecoError when they are not of the camera's size."""
+    pixels = torch.as_tensor(image)
+    wanted = (frame.camera.height, frame.camera.width, 3)
+    if tuple(pixels.shape) != wanted:
+        raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
+    return pixels / 255 if pixels.dtype == torch.uint8 else pixels
 
 
 def _copy(source: Path, target: Path) -> None:

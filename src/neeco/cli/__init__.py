@@ -116,11 +116,11 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
-    from neeco.raster.devices import failures_told
-    from neeco.raster.threads import keep_freed_memory
+    from neeco.raster.devices import readable_failures
+    from neeco.raster.native import keep_freed_memory
 
     keep_freed_memory()
-    with failures_told():
+    with readable_failures():
         return run(parsed)
 
 

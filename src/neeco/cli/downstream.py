@@ -13,7 +13,7 @@ from neeco.cli._output import fitted, print_outcome
 from neeco.settings import Device, name_and_value
 
 if TYPE_CHECKING:
-    from neeco.experiments.downstream.plan import DownstreamSpec
+    from neeco.experiments.downstream.job import DownstreamSettings
     from neeco.experiments.downstream.samples import DataSet
 
 
@@ -65,15 +65,14 @@ class Downstream:
 
 
 def run(args: Downstream) -> int:
-    """Teach and test with progress bars; print tables, answers and where the files lie; 1 when a training failed."""
+    """Train and test with progress bars; print tables, findings and where the files are; 1 when a training failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
-    from neeco.experiments.downstream.plan import plan_downstream
-    from neeco.experiments.downstream.tables import tables_of, write_tables
+    from neeco.experiments.downstream.experiment import plan_downstream, run_downstream
+    from neeco.experiments.downstream.results import failed_jobs, tables_of, write_tables
     from neeco.report.downstream_page import write_downstream_report
 
     with Bars() as bars:
-        plan = plan_downstream(_spec(args))
+        plan = plan_downstream(_settings(args))
         experiment = run_downstream(plan, bars.job)
         write_tables(args.output, experiment)
         bars.stage("report", 0, 1)
@@ -91,35 +90,19 @@ def run(args: Downstream) -> int:
     )
 
 
-def _spec(args: Downstream) -> DownstreamSpec:
-    """What the words mean. Raises NeecoError for sets and weights that cannot be understood."""
-    from neeco.experiments.downstream.job import Teaching
-    from neeco.experiments.downstream.plan import DownstreamSpec
+def _settings(args: Downstream) -> DownstreamSettings:
+    """The study that these words describe. Raises NeecoError for sets and weights that cannot be understood."""
+    from neeco.experiments.downstream.job import DownstreamSettings
 
-    teaching = Teaching(
-        capture=args.capture,
-        sets=tuple(_data_set(word) for word in args.sets),
-        classes=args.classes,
-        splits=args.splits,
-        labels=args.labels,
-        transforms=args.transforms,
-        pick=args.frame_selection,
-        steps=args.steps,
-        side=args.size,
-        batch=args.batch,
-        device=args.device,
-    )
     weights = dict(name_and_value("--weights", word, "unet=unet.safetensors") for word in args.weights)
-    return DownstreamSpec(
-        teaching,
-        args.output,
-        tuple(dict.fromkeys(args.models)),
-        tuple(dict.fromkeys(args.num_real)),
-        args.folds,
-        args.conditions or None,
-        {name: Path(file) for name, file in weights.items()},
-        args.workers,
-    )
+    given = vars(args) | {
+        "sets": tuple(_data_set(word) for word in args.sets),
+        "models": tuple(dict.fromkeys(args.models)),
+        "num_real": tuple(dict.fromkeys(args.num_real)),
+        "conditions": args.conditions or None,
+        "weights": {name: Path(file) for name, file in weights.items()},
+    }
+    return DownstreamSettings(**given)
 
 
 def _data_set(word: str) -> DataSet:

@@ -27,9 +27,9 @@ import torch
 from neeco.capture import Capture
 from neeco.cluster import address, joined, require_ray
 from neeco.errors import NeecoError
-from neeco.experiments.machine import usable_cores
+from neeco.experiments.machine import threads_per_worker
 from neeco.files import is_vacant, read_json, require_inside, write_text
-from neeco.raster.devices import device_of, failures_told
+from neeco.raster.devices import device_of, readable_failures
 
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
@@ -153,7 +153,7 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
     """`job.run`; a failure becomes its result. One that no user can cause leaves its traceback beside the folder."""
     record = job.folder.with_name(job.folder.name + ".error.txt")
     try:
-        with failures_told():
+        with readable_failures():
             result = job.run(progress, capture)
     except NeecoError as error:
         return _failed(job, " ".join(str(error).split()))
@@ -163,11 +163,6 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
         return _failed(job, f"{type(error).__name__}: {reason}; see {record}")
     record.unlink(missing_ok=True)
     return result
-
-
-def threads_per_worker(workers: int, cores: int | None = None) -> int:
-    """Each of `workers` gets its share of the cores, at least one thread."""
-    return max(1, (cores or usable_cores()) // workers)
 
 
 def check_workers(workers: int, device: torch.device) -> None:
@@ -290,7 +285,7 @@ def _run_in_worker(job: Job, threads: int) -> Result:
     """Use no more than the worker's share of cores and GPUs, then run the job."""
     import ray
 
-    from neeco.raster.threads import keep_freed_memory, set_threads
+    from neeco.raster.native import keep_freed_memory, set_threads
 
     if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time

@@ -89,7 +89,7 @@ def draw_layers(
     gaussians = scene.at(state)
     learned_camera = scene.camera(camera)
     owners = labeller.owners(state, gaussians)
-    unobserved = scene.made_up(gaussians, learned_camera)
+    unobserved = scene.unobserved(gaussians, learned_camera)
     rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, unobserved)
     assert rendering.channels is not None
     parts, share = _drop_small_components(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, min_component)

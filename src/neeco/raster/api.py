@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.raster.devices import cuda_backend
-from neeco.raster.native import goes_native
+from neeco.raster.native import runs_native
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
 from neeco.raster.types import Camera, Gaussians, Rendering
@@ -55,11 +55,11 @@ def rasterize(
         background = gaussians.background
     _check(gaussians, camera, channels, background)
     if channels is not None and channels.shape[1] == 0:  # no kernel need know of none
-        drawn = rasterize(gaussians, camera, background=background, backend=backend)
-        return replace(drawn, channels=drawn.color.new_zeros((camera.height, camera.width, 0)))
+        rendering = rasterize(gaussians, camera, background=background, backend=backend)
+        return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
     gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
     if backend == "auto":
-        on_cpu = "cpu" if goes_native(gaussians.means) else "reference"
+        on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
         backend = cuda_backend() if gaussians.means.is_cuda else on_cpu
     if backend == "reference":
         from neeco.raster.reference import rasterize_reference

@@ -22,8 +22,8 @@ def rasterize_cpu(
     frames = None if gaussians.sh_frames is None else _prepared(gaussians.sh_frames.detach())
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=wanted)
-    color, alpha, depth, drawn, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
-    return Rendering(color, alpha, depth, drawn, radii, offsets)
+    color, alpha, depth, composited, radii = _Rasterize.apply(offsets, frames, camera, wanted, *tensors)
+    return Rendering(color, alpha, depth, composited, radii, offsets)
 
 
 def last_statistics() -> dict[str, float]:
@@ -56,8 +56,8 @@ class _Rasterize(torch.autograd.Function):
             alpha = torch.empty(height, width)
             depth = torch.empty(height, width)
             radii = torch.empty(means.shape[0])
-            drawn = None if channels is None else torch.empty(height, width, channels.shape[1])
-            drawing.forward(color, alpha, depth, drawn, radii, keep)
+            composited = None if channels is None else torch.empty(height, width, channels.shape[1])
+            drawing.forward(color, alpha, depth, composited, radii, keep)
         except (ValueError, RuntimeError) as error:
             raise NeecoError(f"rasterize: {error}") from error
         ctx.set_materialize_grads(False)
@@ -66,7 +66,7 @@ class _Rasterize(torch.autograd.Function):
             # Saved so that autograd notices when someone changes an input before the backward pass.
             ctx.save_for_backward(alpha, depth, *tensors)
             ctx.drawing = drawing
-        return color, alpha, depth, drawn, radii
+        return color, alpha, depth, composited, radii
 
     @staticmethod
     @once_differentiable

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
 from neeco.raster.reference import camera_from_world, usable_gaussians
 from neeco.raster.sh import headlight_factor, sh_colors
 from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
@@ -90,5 +90,5 @@ def _nothing(camera: Camera, channels: Tensor | None, background: Tensor | None,
     color = blank[..., None].expand(-1, -1, 3)
     if background is not None:
         color = color + background.to(color)
-    drawn = None if channels is None else blank[..., None].expand(-1, -1, channels.shape[1])
-    return Rendering(color, blank, blank, drawn, torch.zeros(len(offsets), device=offsets.device), offsets)
+    composited = None if channels is None else blank[..., None].expand(-1, -1, channels.shape[1])
+    return Rendering(color, blank, blank, composited, torch.zeros(len(offsets), device=offsets.device), offsets)

@@ -1,14 +1,16 @@
-"""Which device a word of the command line means, whether it can be drawn on, and what it says when it fails."""
+"""Which device a word of the command line means, what one says when it fails, and what is copied to it."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import torch
+from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.raster.triton.ready import missing, require_triton
@@ -52,25 +54,27 @@ def device_of(word: str, drawing: bool = True) -> torch.device:
 
 def device_failure(error: BaseException) -> str | None:
     """What a CUDA device ended the work with, and what to do, in one line; None: the error is of another kind."""
-    said = _first_line(error)
-    if isinstance(error, torch.cuda.OutOfMemoryError) or re.match("CUDA error: (out of memory|CUBLAS.*ALLOC)", said):
-        asked = re.search(r"Tried to allocate ([\d.]+ \w+)", said)
-        there = re.search(r"total capacity of ([\d.]+ \w+) of which ([\d.]+ \w+) is free", said)
+    message = _first_line(error)
+    if isinstance(error, torch.cuda.OutOfMemoryError) or re.match("CUDA error: (out of memory|CUBLAS.*ALLOC)", message):
+        asked = re.search(r"Tried to allocate ([\d.]+ \w+)", message)
+        there = re.search(r"total capacity of ([\d.]+ \w+) of which ([\d.]+ \w+) is free", message)
         numbers = [f"{asked[1]} more were asked for"] if asked else []
         numbers += [f"{there[2]} of {there[1]} are free"] if there else []
-        told = f" ({', '.join(numbers)})" if numbers else ""
+        details = f" ({', '.join(numbers)})" if numbers else ""
         return (
-            f"--device: the GPU's memory is full{told}: close what else uses it, take smaller budgets of Gaussians "
+            f"--device: the GPU's memory is full{details}: close what else uses it, take smaller budgets of Gaussians "
             "(--max-tissue-gaussians, --max-instrument-gaussians), smaller images or fewer frames, or --device cpu"
         )
-    lost = getattr(torch, "AcceleratorError", ())  # since PyTorch 2.8; before, a RuntimeError of the same words
-    if isinstance(error, lost) or said.startswith(("CUDA error:", "cuDNN error:", "Triton Error [CUDA]:")):
-        return f"--device: the GPU gave up ({said}): look at `nvidia-smi` and the system's log, then start again"
+    # since PyTorch 2.8; before, a RuntimeError of the same words
+    accelerator_error = getattr(torch, "AcceleratorError", ())
+    gpu_messages = ("CUDA error:", "cuDNN error:", "Triton Error [CUDA]:")
+    if isinstance(error, accelerator_error) or message.startswith(gpu_messages):
+        return f"--device: the GPU gave up ({message}): look at `nvidia-smi` and the system's log, then start again"
     return None
 
 
 @contextmanager
-def failures_told() -> Iterator[None]:
+def readable_failures() -> Iterator[None]:
     """Raises NeecoError, one line, where a CUDA device fails in the block (`device_failure`)."""
     try:
         yield
@@ -89,10 +93,10 @@ def _no_cuda() -> str:
         )
     try:
         torch.cuda.init()
-        said = "it says no more"
+        message = "it says no more"
     except (RuntimeError, AssertionError) as error:  # a driver that is missing, too old or without a card
-        said = _first_line(error).rstrip(".")
-    return f"{said}; check `nvidia-smi` and CUDA_VISIBLE_DEVICES, install or update NVIDIA's driver"
+        message = _first_line(error).rstrip(".")
+    return f"{message}; check `nvidia-smi` and CUDA_VISIBLE_DEVICES, install or update NVIDIA's driver"
 
 
 def _first_line(error: BaseException) -> str:
@@ -113,3 +117,44 @@ def _not_built_for(device: torch.device) -> str | None:
         f"{torch.__version__} is built for {', '.join(names)}; install one that is built for it (pytorch.org), or use "
         "--device cpu"
     )
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """`values` [n] float32 on `device`, copied there once and cached: a copy to a CUDA device waits for all that it has
+    yet to do. Not to be changed."""
+    return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+class CachedPredicate:
+    """A yes or no about a tensor that its device is asked for once, as long as nothing changes the tensor in place.
+
+    Of a tensor on the device "meta", which holds no numbers, the answer is no.
+    """
+
+    def __init__(self, question: Callable[[Tensor], Tensor]) -> None:
+        self.question = question
+        self._about: tuple[Tensor, int] | None = None
+        self._answer = False
+
+    def __call__(self, tensor: Tensor) -> bool:
+        known = self._about
+        if known is None or known[0] is not tensor or known[1] != tensor._version:
+            self._answer = not tensor.is_meta and bool(self.question(tensor.detach()))
+            self._about = tensor, tensor._version
+        return self._answer
+
+
+@contextmanager
+def tf32_products(device: torch.device) -> Iterator[None]:
+    """Until the end of the block, let a CUDA device multiply float32 matrices in TF32: ten bits of every factor, sums
+    in float32. For networks alone: a pose, or a place in mm, needs more. Elsewhere nothing changes. Not run on a GPU.
+    """
+    before = torch.get_float32_matmul_precision()
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        if device.type == "cuda":
+            torch.set_float32_matmul_precision(before)

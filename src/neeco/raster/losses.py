@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from neeco.errors import NeecoError
-from neeco.raster.native import all_native, native
-from neeco.raster.triton.ready import goes_triton
+from neeco.raster.native import all_run_native, native
+from neeco.raster.triton.ready import runs_triton
 
 # image, target, mask, weight of SSIM, whether the gradient is wanted: the loss [] and the gradient
 Kernel = Callable[[Tensor, Tensor, Tensor | None, float, bool], tuple[Tensor, Tensor | None]]
@@ -31,8 +31,8 @@ def photometric_loss(image: Tensor, target: Tensor, mask: Tensor | None = None, 
     that give the same bits every time (not run on a GPU), everything else the definition; all tensors are on one
     device. Raises NeecoError where shapes do not fit.
     """
-    native_kernel = all_native(image)
-    if not native_kernel and not goes_triton(image):
+    native_kernel = all_run_native(image)
+    if not native_kernel and not runs_triton(image):
         return photometric_loss_reference(image, target.detach(), mask, ssim_weight)
     _check(image, target, mask)
     kernel = _by_native if native_kernel else _by_triton

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from neeco.errors import NeecoError
-from neeco.raster.native import all_native, native
-from neeco.raster.triton.ready import goes_triton
+from neeco.raster.native import all_run_native, native
+from neeco.raster.triton.ready import runs_triton
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # as in 3DGS
@@ -61,8 +61,8 @@ def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, ep
     for update in updates:
         _check(update)
         parameter = update.parameter
-        by_triton = goes_triton(parameter)
-        if not by_triton and not all_native(parameter):
+        by_triton = runs_triton(parameter)
+        if not by_triton and not all_run_native(parameter):
             moved = adam_update(update.gradient, update.exp_avg, update.exp_avg_sq, update.step, betas, eps)
             parameter.sub_(update.lr * moved)
             continue

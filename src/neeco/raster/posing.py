@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
-from neeco.raster.native import all_native, native
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
+from neeco.raster.native import all_run_native, native
 from neeco.raster.rotations import axis_angle_quat, matrix_to_quat, quat_multiply, rotate_about
-from neeco.raster.triton.ready import goes_triton
+from neeco.raster.triton.ready import runs_triton
 
 LEAST_TURNING = 1e-6
 Rows = tuple[Tensor, Tensor, Tensor, Tensor]  # means [N, 3], quats [N, 4], scales [N, 3], sh_frames [N, 4]
@@ -144,10 +144,10 @@ def _pose_body(given: Rows, logits: Tensor | None, body: HingedBody) -> Rows:
 
 def _kernel(given: Sequence[Tensor]) -> Any:
     """What poses such tensors, a class; None: the definition."""
-    if all_native(*given):
+    if all_run_native(*given):
         return native().Posing
-    if all(goes_triton(t) for t in given):
-        from neeco.raster.triton.posed import Posing
+    if all(runs_triton(t) for t in given):
+        from neeco.raster.triton.posing import Posing
 
         return Posing
     return None

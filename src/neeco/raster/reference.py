@@ -53,8 +53,8 @@ def rasterize_reference(
     color = images[..., :3]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background
-    drawn = alpha > 0
-    depth = torch.where(drawn, images[..., 3] / torch.where(drawn, alpha, torch.ones_like(alpha)), 0.0)
+    covered = alpha > 0
+    depth = torch.where(covered, images[..., 3] / torch.where(covered, alpha, torch.ones_like(alpha)), 0.0)
     radii = _radii(projection, gaussians.opacities, camera)
     return Rendering(color, alpha, depth, None if channels is None else images[..., 4:], radii, offsets)
 

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
+
+from neeco.errors import NeecoError
+
+RIGID_TOLERANCE = 2e-3  # of R^T R - I; JSON with three decimals passes, a scale of 1.001 passes, a shear does not
+LARGEST = 1e9  # of any entry of a pose
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -108,3 +116,51 @@ def axis_angle_quat(axis: Tensor, angle: Tensor) -> Tensor:
     """Unit `axis` [3] and `angle` [M] rad to quaternions [M, 4]."""
     half = angle[:, None] / 2
     return torch.cat([half.cos(), half.sin() * axis], -1)
+
+
+def rotation_error(matrices: np.ndarray) -> np.ndarray:
+    """How far matrices [..., 3, 3] are from orthonormal: the largest entry of R^T R - I, [...]."""
+    return np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(-2, -1))
+
+
+def rigid_fault(matrix: np.ndarray) -> tuple[str, str] | None:
+    """Why a matrix [4, 4] float64 is no rigid transform, and what to do; None when it is one."""
+    if not np.isfinite(matrix).all():
+        return "contains NaN or infinity", "drop the frame or repair its pose"
+    if np.abs(matrix).max() > LARGEST:
+        return f"has entries beyond {LARGEST:g}", "repair the pose; lengths are millimetres"
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        transposed = np.abs(matrix[:, 3] - [0, 0, 0, 1]).max() <= 1e-6
+        remedy = "transpose it: the translation is the last column" if transposed else "repair the matrix"
+        return "is not rigid: the last row is not 0 0 0 1", remedy
+    rotation = matrix[:3, :3]
+    if rotation_error(rotation) > RIGID_TOLERANCE:
+        scale = float(np.cbrt(abs(np.linalg.det(rotation))))
+        if scale > 0 and rotation_error(rotation / scale) <= RIGID_TOLERANCE:
+            return f"is not rigid: its rotation is scaled by {scale:.4g}", "divide the 3x3 corner by that"
+        return "is not rigid: its 3x3 corner is not a rotation", "repair the matrix (unit quaternion?)"
+    if np.linalg.det(rotation) < 0:
+        return "is a reflection, not a rotation (determinant -1)", "repair the handedness of the axes"
+    return None
+
+
+def as_pose(value: Any, field: str, dtype: torch.dtype) -> Tensor:
+    """A rigid transform [4, 4] given as a tensor, an array or nested lists, as a tensor.
+
+    A tensor of floats is taken as it is: its type, device and gradients stay, only its shape is checked. All else is
+    copied to `dtype` on the CPU. Raises NeecoError naming `field` for another shape, and for numbers (of what is no
+    tensor) that are no rotation and translation.
+    """
+    if isinstance(value, Tensor) and value.is_floating_point():
+        if value.shape != (4, 4):
+            raise NeecoError(f"{field}: expected a 4x4 matrix, found shape {tuple(value.shape)}")
+        return value
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise NeecoError(f"{field}: expected a 4x4 matrix of numbers, found {type(value).__name__}") from None
+    if matrix.shape != (4, 4):
+        raise NeecoError(f"{field}: expected a 4x4 matrix, found shape {matrix.shape}")
+    if (fault := rigid_fault(matrix)) is not None:
+        raise NeecoError(f"{field}: {fault[0]}; {fault[1]}")
+    return torch.from_numpy(matrix).to(dtype)

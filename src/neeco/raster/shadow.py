@@ -16,9 +16,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import grid_sample
 
-from neeco.raster.blur import blur
-from neeco.raster.native import all_native, native
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
+from neeco.raster.native import all_run_native, native
 from neeco.raster.pinhole import project
 from neeco.raster.types import Camera, Gaussians, Rendering
 
@@ -73,7 +72,7 @@ def blocked(among: Casting, width: Tensor, offsets: Tensor, draw: Draw, shines: 
     each Gaussian; 0 for themselves, and for lamps that do not shine (`shines`; None: all do). float32 on the CPU takes
     the native kernels."""
     lamps = [index for index in range(len(offsets)) if shines is None or shines[index]]
-    if all_native(among.means, offsets):
+    if all_run_native(among.means, offsets):
         return _Blocked.apply(width, offsets, among, draw, lamps)
     none = torch.zeros_like(among.means[:, 0])
     rows = [_blocked_by(among, width, offsets[k], draw) if k in lamps else none for k in range(len(offsets))]
@@ -182,3 +181,22 @@ def _look_up(image: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
     size = constant((camera.width, camera.height), pixels.device)
     place = (2 * pixels / size - 1)[None, None]  # [1, 1, R, 2]
     return grid_sample(image.permute(2, 0, 1)[None], place, align_corners=False)[0, :, 0].T
+
+
+TAPS = 6  # pixels to each side of the window's middle, which is cut off there
+LEAST = 0.3  # px: a narrower window is drawn as wide as this
+
+
+def blur(image: Tensor, sigma: Tensor) -> Tensor:
+    """`image` [H, W] under a Gaussian window of standard deviation `sigma` [] px, cut off after TAPS pixels; nothing
+    comes from beyond the image. Any float type and device; gradients reach both."""
+    down, across = (_window_matrix(size, sigma) for size in image.shape)
+    return down @ image @ across
+
+
+def _window_matrix(size: int, sigma: Tensor) -> Tensor:
+    """[size, size] that blurs a line of pixels; its middle row sums to 1."""
+    places = torch.arange(size, dtype=sigma.dtype, device=sigma.device)
+    steps = (places[:, None] - places).abs()
+    weights = torch.exp(-0.5 * (steps / sigma.clamp_min(LEAST)).square()) * (steps <= TAPS)
+    return weights / weights[size // 2].sum()

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
+
+from neeco.raster.rotations import as_pose
 
 
 @dataclass(frozen=True)
@@ -94,16 +98,38 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose."""
+    """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose.
+
+    The pose may also be given as an array or nested lists, which become float32 (`as_pose`). Raises NeecoError when it
+    is not 4x4, or given so and no rotation and translation.
+    """
 
     world_from_camera: Tensor  # [4, 4] rigid, mm
-    fx: float
+    fx: float  # px
     fy: float
-    cx: float
-    cy: float
-    width: int
+    cx: float  # px from the image's left edge
+    cy: float  # px from its upper edge
+    width: int  # px
     height: int
     near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+
+    if TYPE_CHECKING:  # what may be given
+
+        def __init__(
+            self,
+            world_from_camera: ArrayLike | Tensor,
+            fx: float,
+            fy: float,
+            cx: float,
+            cy: float,
+            width: int,
+            height: int,
+            near: float = ...,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)
+        object.__setattr__(self, "world_from_camera", pose)
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera, its pose on `device`."""

@@ -10,9 +10,8 @@ from typing import Any
 from markupsafe import Markup
 
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.conditions import AUGMENT, REAL
-from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, verdict
-from neeco.experiments.downstream.tables import described
+from neeco.experiments.downstream.job import AUGMENT, REAL
+from neeco.experiments.downstream.results import HELPS, HURTS, MAIN, TITLES, title_of, verdict
 from neeco.report.charts import (
     PALETTE,
     Level,
@@ -194,8 +193,8 @@ def _span(rows: Sequence[Mapping[str, Any]]) -> float:
 def _difference(row: Mapping[str, Any], span: float) -> Difference:
     known = row["low"] is not None
     return Difference(
-        described(row["condition"], row["real"]),
-        described(row["against"], row["against_real"]),
+        title_of(row["condition"], row["real"]),
+        title_of(row["against"], row["against_real"]),
         signed(row["difference"]),
         f"{signed(row['low'])} to {signed(row['high'])}" if known else "–",
         row["folds"],

@@ -10,20 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from neeco.capture.model import Capture
-from neeco.evaluation.difference import PART_COLORS
+from neeco.evaluation.image_metrics import PART_COLORS
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.conditions import HELD_BACK_EVERY, default_conditions
-from neeco.experiments.downstream.experiment import failed_jobs
+from neeco.experiments.downstream.job import default_conditions
 from neeco.experiments.downstream.results import (
     CONFIDENCE,
+    KEYS,
     MAIN,
     VERDICTS,
-    by_fold,
+    budget_text,
+    data_files,
     equivalent,
+    failed_jobs,
     real_curve,
+    scores_by_fold,
+    summary_text,
+    tables_of,
     verdict,
 )
-from neeco.experiments.downstream.tables import KEYS, budget_words, data_files, summary_csv, tables_of
 from neeco.experiments.machine import hardware_words
 from neeco.experiments.tables import Table, csv_text
 from neeco.files import write_text
@@ -40,7 +44,6 @@ from neeco.report.downstream_shots import Gallery, galleries
 from neeco.report.page import REPORT_FILE, split_counts, write_page
 
 FAILED = "failed: "  # how notes on failed trainings begin; they are listed by themselves
-ALONE = " labelled frames alone"  # how `equivalent` ends
 CHANCE = round(1 / (1 - CONFIDENCE))  # of so many comparisons that differ in nothing, one is called a difference
 
 Experiment = Mapping[str, Any]
@@ -65,7 +68,7 @@ def write_downstream_report(output: Path, experiment: dict[str, Any], capture: C
     picture cannot be read or the page not be written.
     """
     shown = galleries(experiment, capture, output)
-    files = {"summary.csv": summary_csv(experiment), "shots.csv": _shots_csv(shown), **data_files(experiment)}
+    files = {"summary.csv": summary_text(experiment), "shots.csv": _shots_csv(shown), **data_files(experiment)}
     for name, text in files.items():
         write_text(output / "data" / name, text)
     charts = [score_chart(experiment, model, split) for model, split in _models_and_splits(experiment)]
@@ -98,8 +101,8 @@ def write_downstream_report(output: Path, experiment: dict[str, Any], capture: C
         tints=[(_color(k), name) for k, name in enumerate(experiment["classes"])],
         courses=[chart for model in experiment["models"] for chart in course_charts(experiment, model)],
         trainings=_trainings(experiment),
-        inputs=budget_words(experiment),
-        held_back=HELD_BACK_EVERY,
+        inputs=budget_text(experiment),
+        held_back=experiment["held_back_every"],
         notes=[note for note in experiment["notes"] if not note.startswith(FAILED)],
         failed=failed_jobs(experiment),
         files=files,
@@ -175,12 +178,12 @@ def _glance(experiment: Experiment) -> Glance:
 def _as_many(row: Mapping[str, Any], experiment: Experiment) -> str:
     """`as good as about 55`: how many labelled frames alone do as well as the first of a difference, over the folds
     that all of these finished; "" where that cannot be read: of one number of frames only, or scores all 0."""
-    scores = by_fold(experiment["jobs"], row["model"], row["split"], row["metric"])
+    scores = scores_by_fold(experiment["jobs"], row["model"], row["split"], row["metric"])
     key = row["condition"], row["real"]
     curve = real_curve(scores, key)
     if len(curve) < 2 or not any(score for _, score in curve):
         return ""
-    return equivalent(curve, mean_of(list(scores[key].values()))).removesuffix(ALONE)
+    return equivalent(curve, mean_of(list(scores[key].values())))
 
 
 def _answers(experiment: Experiment) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
@@ -264,7 +267,7 @@ def command_of(experiment: Experiment) -> str:
         words += ["--sets", *(f"{entry['name']}={entry['path']}{count}" for entry, count in pairs)]
     words += ["--models", *(model["name"] for model in experiment["models"])]
     counts = sorted({job["real"] for job in jobs})
-    words += ["--real", *("all" if count and count == experiment["labelled"] else str(count) for count in counts)]
+    words += ["--num-real", *("all" if count and count == experiment["labelled"] else str(count) for count in counts)]
     words += ["--folds", str(experiment["folds"])]
     conditions = list(dict.fromkeys(job["condition"] for job in jobs))
     defaults = default_conditions([entry["name"] for entry in teaching["sets"]])
@@ -272,7 +275,7 @@ def command_of(experiment: Experiment) -> str:
         words += ["--conditions", *conditions]
     if teaching["labels"] is not None:
         words += ["--labels", teaching["labels"]]
-    for option, key, usual in (("classes", "classes", "instrument"), ("pick", "pick", "spread")):
+    for option, key, usual in (("classes", "classes", "instrument"), ("frame-selection", "pick", "spread")):
         words += [f"--{option}", teaching[key]] if teaching[key] != usual else []
     words += ["--splits", *experiment["splits"]]
     for option, key in (("steps", "steps"), ("size", "side"), ("batch", "batch")):
@@ -299,7 +302,7 @@ def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
         ("labelled frames", told),
         *((f"set {entry['name']}", _set_words(entry)) for entry in experiment["sets"]),
         ("classes", ", ".join(experiment["classes"])),
-        ("budget", budget_words(experiment)),
+        ("budget", budget_text(experiment)),
         ("machine", machine_words(experiment)),
         ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
     ]

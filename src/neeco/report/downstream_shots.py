@@ -12,15 +12,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from neeco.capture.images import read_labels
 from neeco.capture.model import Capture
-from neeco.evaluation.difference import PART_COLORS, Pixels, overlay_outline, overlay_parts
+from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.evaluation.mask_metrics import box_ious
-from neeco.experiments.downstream.conditions import AUGMENT, REAL
-from neeco.experiments.downstream.job import PREDICTIONS
-from neeco.experiments.downstream.plan import job_folder
-from neeco.experiments.downstream.results import MAIN
+from neeco.experiments.downstream.job import AUGMENT, REAL, job_folder, predictions_folder
+from neeco.experiments.downstream.results import MAIN, title_of
 from neeco.experiments.downstream.samples import Example, RecordedSample, recorded_samples
-from neeco.experiments.downstream.scores import CONFIDENT
-from neeco.experiments.downstream.tables import described
+from neeco.experiments.downstream.scores import MIN_SCORE
 from neeco.files import read_json
 from neeco.report.downstream_figures import question, sets_in, signed, with_labelled
 from neeco.report.page import MAX_WIDTH, jpeg
@@ -184,9 +181,9 @@ class _Answers:
 
     def __init__(self, output: Path, job: Job, split: str, truth: Mapping[str, BoxesOf] | None) -> None:
         self.key, self.masks = _key(job), truth is None
-        self.name = described(*self.key)
+        self.name = title_of(*self.key)
         folder = job_folder(output, job["model"], job["condition"], job["real"], job["fold"])
-        self.folder = folder / PREDICTIONS / split
+        self.folder = predictions_folder(folder, split)
         self.boxes: Mapping[str, Any] = {}
         if truth is None:
             rows = job["splits"][split].get("per_frame", [])
@@ -232,7 +229,7 @@ def _worth_showing(found: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np
     """Boxes [n, 4], classes [n] and scores [n] that count as found, or the surest alone."""
     boxes = np.array(found["boxes"], np.float64).reshape(-1, 4)
     classes, scores = np.array(found["classes"], np.int64), np.array(found["scores"], np.float64)
-    kept = scores >= CONFIDENT
+    kept = scores >= MIN_SCORE
     if not kept.any() and len(scores):
         kept[scores.argmax()] = True
     return boxes[kept], classes[kept], scores[kept]

@@ -14,13 +14,12 @@ from torch import Tensor
 
 from neeco import __version__
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
-from neeco.capture.poses import rigid_fault
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
-from neeco.scene.drawable import Learned
+from neeco.raster.rotations import rigid_fault
+from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.method import Stored
 from neeco.scene.methods import method_class, method_settings
-from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.settings import plain
 

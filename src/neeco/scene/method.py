@@ -10,9 +10,8 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from neeco.capture.model import Capture, Instrument
-from neeco.raster.threads import torch_threads
-from neeco.scene.drawable import Learned
-from neeco.scene.recorded import Recorded
+from neeco.raster.native import torch_threads
+from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.training_session import RunLength, Session
 from neeco.scene.training_views import TrainingViews
 

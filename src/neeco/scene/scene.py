@@ -13,16 +13,14 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
-from neeco.raster.on_device import Answer
+from neeco.raster.devices import CachedPredicate
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
-from neeco.scene.drawable import Drawable, HingeMotion
+from neeco.scene.drawable import Drawable, HingeMotion, Recorded
 from neeco.scene.method import Stored
-from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP
-from neeco.scene.seen import SEEN, made_up_of, measure_seen
+from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
 LAMPS = 3  # at most: what a laparoscope's light guides come to
 SHADOW_WIDTH = 0.01  # slope, at the start
@@ -76,8 +74,8 @@ class Scene(nn.Module):
         self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
         self.shadow_strengths = nn.Parameter(torch.zeros(LAMPS))
         self.shadow_width = nn.Parameter(torch.full((), SHADOW_WIDTH))
-        self._shines = Answer(lambda strengths: (strengths > 0).any())
-        self._corrects = Answer(lambda registration: registration.any())
+        self._shines = CachedPredicate(lambda strengths: (strengths > 0).any())
+        self._corrects = CachedPredicate(lambda registration: registration.any())
 
     @property
     def settings(self) -> Any:
@@ -140,20 +138,18 @@ class Scene(nn.Module):
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
-    def seen(self) -> Tensor:
-        """[N, 12] how well the training frames saw each Gaussian (see `neeco.scene.seen`). Found out at the end of
-        training; of a scene that is still learned, or was before that was done, here and now."""
-        if SEEN not in self.canonical.extras:
-            seen = measure_seen(self.canonical, self.recorded, self.at)
-            if MADE_UP in self.canonical.extras:  # the rim of what is continued reaches into images
-                seen *= 1 - self.canonical.extras[MADE_UP][:, None]
-            self.canonical = self.canonical.with_extras(**{SEEN: seen})
-        return self.canonical.extras[SEEN]
+    def visibility(self) -> Tensor:
+        """[N, 12] how well the training frames observed each Gaussian (see `neeco.scene.visibility`). Measured at the
+        end of training; otherwise here, once."""
+        if VISIBILITY not in self.canonical.extras:
+            measured = measure_visibility(self.canonical, self.recorded, self.at)
+            self.canonical = self.canonical.with_extras(**{VISIBILITY: measured})
+        return self.canonical.extras[VISIBILITY]
 
-    def made_up(self, posed: Gaussians, camera: Camera) -> Tensor:
-        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is made up: seen by no training frame, or not
-        from about there."""
-        return made_up_of(self.seen(), posed, camera)
+    def unobserved(self, posed: Gaussians, camera: Camera) -> Tensor:
+        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is unobserved: seen by no training frame, or
+        not from about there."""
+        return unobserved_share(self.visibility(), posed, camera)
 
     @property
     def casts_shadow(self) -> bool:

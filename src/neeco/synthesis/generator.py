@@ -22,7 +22,7 @@ from neeco.errors import NeecoError
 from neeco.labels.annotation import InstrumentLabel, annotate, any_in_image, place_in_image, working_ends
 from neeco.labels.drawing import MOSTLY, LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels, DeltaThresholds, Labeller, ThresholdLabels
-from neeco.raster.threads import keep_freed_memory, set_threads
+from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.scene.io import load_scene
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import (
@@ -138,15 +138,19 @@ class SampleGenerator:
             groups = tuple(frozenset(item.name for item in given.instruments) for given in instrument_scenes)
         else:
             sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
-        labeller = make_labeller(scene, settings)
+        labeller: Labeller
+        if settings.labels == "composited":
+            labeller = CompositedLabels(scene, settings.label_threshold)
+        else:
+            deltas = settings.delta_thresholds
+            labeller = ThresholdLabels(scene, None if deltas is None else DeltaThresholds(*deltas))
         effects, motion = None, None
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
             motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
-        tolerance = None
-        if settings.tissue_check:
-            tolerance = settings.tissue_tolerance_mm
-            tolerance = find_tolerance(scene, labeller) if tolerance is None else tolerance
+        tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
+        if settings.tissue_check and tolerance is None:
+            tolerance = find_tolerance(scene, labeller)
         acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
         return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
 
@@ -219,15 +223,20 @@ class GeneratorSpec:
     device: str = "cpu"
     instrument_scenes: tuple[Path, ...] = ()
 
-    def open(self, threads: int) -> SampleGenerator:
-        """The generator, in a process of its own whose kernels may use `threads` threads. Raises NeecoError."""
-        set_threads(threads)
-        torch.set_num_threads(1)
-        keep_freed_memory()
+    def open(self) -> SampleGenerator:
+        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
         device = torch.device(self.device)
         paths = (self.scene, *self.instrument_scenes)
         scene, *others = (gaussian_scene(load_scene(path).to(device), VERB) for path in paths)
         return SampleGenerator.of(scene, self.settings, others)
+
+
+def limit_threads(threads: int) -> None:
+    """In a process of its own that draws: kernels use `threads` threads, torch one; freed memory is kept for the next
+    sample."""
+    set_threads(threads)
+    torch.set_num_threads(1)
+    keep_freed_memory()
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:
@@ -240,14 +249,6 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
             return write_skipped(output, index, error.refused)
         raise NeecoError(f"{output}: {error}") from None
     return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts)
-
-
-def make_labeller(scene: Scene, settings: Settings) -> Labeller:
-    """The way of labelling that the settings ask for."""
-    if settings.labels == "composited":
-        return CompositedLabels(scene, settings.label_threshold)
-    given = settings.delta_thresholds
-    return ThresholdLabels(scene, None if given is None else DeltaThresholds(*given))
 
 
 def find_tolerance(scene: Scene, labeller: Labeller) -> float:

@@ -16,8 +16,7 @@ import torch
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.model import State, evenly_spaced
-from neeco.capture.similarity import RecordedStates
+from neeco.capture.model import RecordedStates, State, evenly_spaced
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.files import read_bytes

@@ -25,8 +25,8 @@ from typing import Any
 from neeco.cluster import joined
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
-from neeco.raster.devices import failures_told
-from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder
+from neeco.raster.devices import readable_failures
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
 from neeco.synthesis.writers.folder import Record, files_of, load_record, record_path
@@ -147,8 +147,9 @@ def _work(spec: GeneratorSpec, output: Path, threads: int, connection: Connectio
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
-        with failures_told():
-            generator = spec.open(threads)
+        with readable_failures():
+            limit_threads(threads)
+            generator = spec.open()
             with contextlib.suppress(EOFError):
                 while True:
                     for index in connection.recv():
@@ -187,7 +188,12 @@ class PackedSpec:
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
         return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
 
-    def unpacked(self, folder: Path) -> GeneratorSpec:
+    def open(self) -> SampleGenerator:
+        """The generator, from the files' content."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self._unpacked(Path(folder)).open()
+
+    def _unpacked(self, folder: Path) -> GeneratorSpec:
         """The same spec, its files in `folder`."""
         for name, content in self.files.items():
             (folder / name).write_bytes(content)
@@ -248,7 +254,7 @@ def _result(ray: Any, reference: Any, task: tuple[int, ...]) -> list[tuple[Recor
 def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[Record, dict[str, bytes]]] | str:
     """In a cluster's worker: record and files of every image, or an error message."""
     try:
-        with failures_told(), tempfile.TemporaryDirectory() as folder:
+        with readable_failures(), tempfile.TemporaryDirectory() as folder:
             generator = _opened(packed)
             drawn = []
             for index in indices:
@@ -265,5 +271,5 @@ def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[R
 @lru_cache(maxsize=1)
 def _opened(packed: PackedSpec) -> SampleGenerator:
     """Opened once in a worker, whatever number of tasks it gets."""
-    with tempfile.TemporaryDirectory() as folder:
-        return packed.unpacked(Path(folder)).open(threads=1)
+    limit_threads(1)
+    return packed.open()

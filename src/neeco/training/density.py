@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neeco.raster.on_device import constant
+from neeco.raster.devices import constant
 from neeco.raster.optimizer import Adam
 from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import CanonicalGaussians
-
-MIN_OPACITY = 0.005
-SPLIT_SHRINK = 1.6
+from neeco.training.config import DensityConfig
 
 
 class GradientStatistics:
@@ -37,9 +35,9 @@ class GradientStatistics:
 
 @dataclass(frozen=True)
 class BodyLimit:
-    """How many Gaussians one body may have, and the size (mm) that divides cloning from splitting."""
+    """How many Gaussians one body may have, and the size (mm) below which they are cloned instead of split."""
 
-    most: int
+    max_gaussians: int
     dense_size: float
 
 
@@ -51,9 +49,10 @@ def control_density(
     limits: list[BodyLimit],
     threshold: float,
     generator: torch.Generator,
-    lost: Tensor | None = None,
+    config: DensityConfig,
+    unsupported: Tensor | None = None,
 ) -> CanonicalGaussians:
-    """Prune the transparent and those `lost` [N] bool, clone small and split large Gaussians whose gradient exceeds
+    """Prune transparent and `unsupported` [N] bool Gaussians, clone small and split large ones whose gradient exceeds
     `threshold`, strongest first.
 
     `threshold` = inf only prunes. Adam's moments follow their rows; new rows start at zero.
@@ -61,13 +60,13 @@ def control_density(
     gradients, bodies = statistics.mean(), canonical.bodies
     size = canonical.log_scales.max(1).values.exp()
     dense = size.new_tensor([limit.dense_size for limit in limits])[bodies]
-    keep = torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY
-    if lost is not None:
-        keep &= ~lost
+    keep = torch.sigmoid(canonical.opacity_logits) > config.min_opacity
+    if unsupported is not None:
+        keep &= ~unsupported
     grow = keep & (gradients > threshold)
     for body, limit in enumerate(limits):
         rows = bodies == body
-        room = max(0, limit.most - int((keep & rows).sum()))
+        room = max(0, limit.max_gaussians - int((keep & rows).sum()))
         wanted = torch.nonzero(grow & rows)[:, 0]
         if len(wanted) > room:
             strongest = gradients[wanted].argsort(descending=True, stable=True)
@@ -84,21 +83,21 @@ def control_density(
     counts = tuple(int((bodies[index] == body).sum()) for body in range(len(limits)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
-    _scatter_halves(changed, is_half, generator)
+    _scatter_halves(changed, is_half, config.split_shrink, generator)
     return changed
 
 
-def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, generator: torch.Generator) -> None:
-    """Move each half of a split Gaussian to a random place inside its parent and shrink it."""
+def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, shrink: float, generator: torch.Generator) -> None:
+    """Move each half of a split Gaussian to a random place inside its parent and divide its scales by `shrink`."""
     rotation = quat_to_matrix(torch.nn.functional.normalize(canonical.quats[is_half], dim=-1))
     scales = canonical.log_scales[is_half].exp()
     offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales
     canonical.means[is_half] += (rotation @ offset[..., None])[..., 0]
-    canonical.log_scales[is_half] -= math.log(SPLIT_SHRINK)
+    canonical.log_scales[is_half] -= math.log(shrink)
 
 
 @torch.no_grad()
-def reset_opacity(canonical: CanonicalGaussians, adam: Adam, ceiling: float = 0.01) -> None:
+def reset_opacity(canonical: CanonicalGaussians, adam: Adam, ceiling: float) -> None:
     """Clamp every opacity to `ceiling` and forget its momentum (3DGS)."""
     canonical.opacity_logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
     adam.forget("opacity_logits")

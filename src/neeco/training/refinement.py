@@ -16,12 +16,6 @@ from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
 from neeco.training.config import RefineConfig
 
-RATES = torch.tensor([6e-4] * 3 + [4e-2] * 3)  # rad, mm
-PRIOR_SIGMA = torch.tensor([4.4e-3] * 3 + [0.3] * 3)  # a tracker's 0.25 deg and 0.3 mm
-PRIOR_WEIGHT = 2e-5
-CAMERA_RATE = 0.2  # of the instruments' rates: SfM cameras are better than tracked instruments
-LATENCY_RATE = 2e-5  # s
-
 
 class Refinement:
     """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
@@ -38,9 +32,13 @@ class Refinement:
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
         self.velocities = _velocities(frames, instruments).to(device)  # [F, I, 6] per s, body frame
-        self.rates = {"poses": RATES, "cameras": RATES * CAMERA_RATE, "latency": torch.tensor(LATENCY_RATE)}
-        self.rates = {name: rate.to(device) for name, rate in self.rates.items()}
-        self.prior_sigma = PRIOR_SIGMA.to(device)
+        rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
+        self.rates = {
+            "poses": rates.to(device),
+            "cameras": (rates * config.camera_rate).to(device),
+            "latency": torch.tensor(config.latency_rate, device=device),
+        }
+        self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
         self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
         self.frame_steps = torch.zeros(len(frames))  # on the CPU: every step asks
         self._leaves: dict[str, Tensor] = {}
@@ -60,7 +58,7 @@ class Refinement:
             if self.config.frame_poses:
                 leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
                 offset = offset + leaf
-                penalty = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
+                penalty = self._prior(leaf)
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
                 offset = offset + self.velocities[index] * leaf
@@ -73,9 +71,12 @@ class Refinement:
             leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
             corrected = camera.world_from_camera.to(leaf) @ rigid_from_vector(leaf)
             camera = replace(camera, world_from_camera=corrected)
-            prior = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
-            penalty = prior if penalty is None else penalty + prior
+            penalty = self._prior(leaf) if penalty is None else penalty + self._prior(leaf)
         return state, camera, penalty
+
+    def _prior(self, correction: Tensor) -> Tensor:
+        """Penalty [] on a correction [..., 6]."""
+        return self.config.prior_weight * (correction / self.prior_sigma).square().mean()
 
     @torch.no_grad()
     def step(self, index: int, progress: float) -> None:

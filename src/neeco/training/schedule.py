@@ -18,18 +18,18 @@ Part = Literal["on", "off", "inverse"]
 
 @dataclass(frozen=True)
 class DensityPhase:
-    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC)."""
+    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC).
+    `opacity_reset`: iterations between opacity resets; 0: none."""
 
     interval: int
     opacity_reset: int
     threshold: float
 
 
-NEECO_PHASES = {1: DensityPhase(500, 10_000, 4e-4), 2: DensityPhase(200, 3_000, 2e-4)}
-GAUSSIAN_SPLATTING = DensityPhase(100, 3_000, 2e-4)
-# Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's length, so
-# neither does that: with resets closer than twice this, the scene would stay transparent and never show the instrument.
-CLOSEST_RESETS = 300
+# Iterations. Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's
+# length, so neither does that: with resets closer than twice this, the scene would stay transparent and never show the
+# instrument.
+MIN_RESET_INTERVAL = 300
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,11 @@ class ScheduleConfig:
     latest_fraction: float = 0.4  # of the run; then phase 2 is forced
     sh_interval: int = 1_000  # iterations between SH orders in phase 2
     max_sh_degree: int = 3
-    plain_density: DensityPhase = GAUSSIAN_SPLATTING  # what the three parts of density control are when off
-    # Numbers of iterations here, in NEECO_PHASES and in TrainConfig.density_start are stated for a run of so many
-    # steps and scale with the run's length; None: they stand as they are, however short the run.
+    plain_density: DensityPhase = DensityPhase(100, 3_000, 2e-4)  # 3DGS's: the parts of density control that are off
+    phase_1: DensityPhase = DensityPhase(500, 10_000, 4e-4)
+    phase_2: DensityPhase = DensityPhase(200, 3_000, 2e-4)
+    # Numbers of iterations here and in TrainConfig.density_start are stated for a run of so many steps and scale with
+    # the run's length; None: they stand as they are, however short the run.
     published_steps: int | None = None
 
 
@@ -106,11 +108,13 @@ class Schedule:
         )
 
     def _reset_interval(self, published: int) -> int:
-        """Scaled, but not below CLOSEST_RESETS, or what was published where that is less."""
-        return max(self.scaled(published), min(published, CLOSEST_RESETS))
+        """Scaled, but not below MIN_RESET_INTERVAL, or what was published where that is less."""
+        return max(self.scaled(published), min(published, MIN_RESET_INTERVAL))
 
     def _density_of(self, part: Part) -> DensityPhase:
-        return self.config.plain_density if part == "off" else NEECO_PHASES[self._acting_phase(part)]
+        if part == "off":
+            return self.config.plain_density
+        return self.config.phase_1 if self._acting_phase(part) == 1 else self.config.phase_2
 
     def sh_degree(self, iteration: int) -> int:
         """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start

@@ -20,16 +20,14 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.image_metrics import psnr
+from neeco.evaluation.image_metrics import psnr, resize_camera
+from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
-from neeco.evaluation.resize import resize_camera
-from neeco.evaluation.truth import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
+from neeco.scene.drawable import Recorded
 from neeco.scene.io import load_scene
-from neeco.scene.recorded import Recorded
-from neeco.training.checkpoint import checkpoint_path, read_checkpoint
-from neeco.training.run import read_config
+from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
 
 if TYPE_CHECKING:

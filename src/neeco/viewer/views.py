@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.difference import Pixels, difference_map, overlay_parts
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
-from neeco.raster.devices import failures_told
+from neeco.raster.devices import readable_failures
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.scene import gaussian_scene
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
@@ -147,7 +147,7 @@ def render_run(
     frame = controls.recorded_frame
     as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
     note = ""
-    with scene.torch_threads(), failures_told():
+    with scene.torch_threads(), readable_failures():
         if view == DIFFERENCE and frame is not None and as_recorded and loaded.frames:
             image = runs.recorded_image(number, loaded, frame)
             shown = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
@@ -194,7 +194,7 @@ def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels:
         return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
     gaussians, camera = posing.at(state), posing.camera(camera)
-    channels = labels if view in LABELLED else posing.made_up(gaussians, camera)[:, None]
+    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.model import evenly_spaced
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
-from neeco.scene.seen import spread_frames
 from neeco.synthesis.samplers import moved_camera
 from neeco.synthesis.states import rigid
 from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
@@ -173,7 +173,7 @@ class Overlays:
         if loaded.capture is None or not len(loaded.capture.points.positions):
             return None
         points = loaded.capture.points
-        chosen = spread_frames(len(points.positions), MAX_POINTS)
+        chosen = evenly_spaced(len(points.positions), MAX_POINTS)
         return self._scene.add_point_cloud(
             "/points",
             (points.positions[chosen] * self._unit).astype(np.float32),
@@ -192,7 +192,7 @@ def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
 def _frustum_frames(loaded: LoadedRun) -> list[int]:
     """Frames whose cameras are shown: some from everywhere, none twice in one place."""
     chosen: dict[bytes, int] = {}
-    for frame in spread_frames(len(loaded.recorded.cameras), MAX_FRUSTA):
+    for frame in evenly_spaced(len(loaded.recorded.cameras), MAX_FRUSTA):
         pose = to_numpy(loaded.recorded.cameras[frame].world_from_camera)
         chosen.setdefault(pose.round(3).tobytes(), frame)
     return list(chosen.values())

@@ -11,11 +11,9 @@ import torch
 from PIL import Image
 from torch import nn
 
-from neeco.experiments.downstream.feed import Feed
-from neeco.experiments.downstream.model import Task
+from neeco.experiments.downstream.model import TorchModel, TrainingTask
 from neeco.experiments.downstream.models.unet import UNet
-from neeco.experiments.downstream.samples import Example
-from neeco.experiments.downstream.torch_training import TorchModel
+from neeco.experiments.downstream.samples import BatchSampler, Example
 
 PARTS = (("bar", "shaft"), ("bar", "wrist"), ("bar", "jaw_left"), ("bar", "jaw_right"))
 
@@ -104,11 +102,11 @@ def squares(count: int, first: int = 0, side: int = 64) -> tuple[Held, ...]:
     return tuple(Held(square(first + k, side), str(first + k)) for k in range(count))
 
 
-def task_of(folder: Path, **changes) -> Task:
+def task_of(folder: Path, **changes) -> TrainingTask:
     """To find bright rectangles, in a few steps."""
     given = {
         "classes": ("instrument",),
-        "feed": Feed([squares(12)], 0),
+        "batches": BatchSampler([squares(12)], 0),
         "validation": squares(4, 100),
         "size": (64, 64),
         "steps": 4,
@@ -117,22 +115,22 @@ def task_of(folder: Path, **changes) -> Task:
         "device": torch.device("cpu"),
         "folder": folder,
     }
-    return Task(**given | changes)
+    return TrainingTask(**given | changes)
 
 
 class Pixels(TorchModel):
     """A class for each pixel from its colour alone: taught in a blink."""
 
     model = "pixels"
-    answers = "masks"
-    side, multiple, steps, batch, learning_rate = 48, 8, 6, 2, 0.1
+    predicts = "masks"
+    image_size, multiple, steps, batch, learning_rate = 48, 8, 6, 2, 0.1
 
     @classmethod
-    def unmet(cls) -> None:
+    def missing_requirement(cls) -> None:
         return None
 
     def build(self, classes: int) -> nn.Module:
         return nn.Conv2d(3, classes + 1, 1)
 
     loss = UNet.loss
-    answer = UNet.answer
+    predictions = UNet.predictions

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neeco.errors import NeecoError
-from neeco.experiments.downstream.conditions import (
-    HELD_BACK_EVERY,
-    HELD_BACK_FROM,
+from neeco.experiments.downstream.job import (
     Condition,
+    DownstreamSettings,
     default_conditions,
-    held_back,
     labelled_count,
     labelled_frames,
     parse_condition,
 )
 
 SETS = ("kin", "other")
+SETTINGS = DownstreamSettings(Path("capture"), Path("out"))
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_usual_conditions_are_each_set_alone_and_beside_labelled_frames() -> Non
 def test_counts_of_labelled_frames_are_numbers_or_all() -> None:
     assert [labelled_count(word, 30) for word in ("0", "7", "30", "all")] == [0, 7, 30, 30]
     for word in ("-1", "half", "1.5", ""):
-        with pytest.raises(NeecoError, match=r"--real: .* neither a number of labelled frames nor all"):
+        with pytest.raises(NeecoError, match=r"--num-real: .* neither a number of labelled frames nor all"):
             labelled_count(word, 30)
     with pytest.raises(NeecoError, match="31 labelled frames are asked for, the capture has 30; use all"):
         labelled_count("31", 30)
@@ -107,14 +107,14 @@ def test_whole_stretches_are_drawn_from() -> None:
 
 @given(st.integers(0, 60), st.integers(0, 12))
 def test_what_is_held_back_is_not_learned_and_nothing_is_lost(count: int, fold: int) -> None:
-    learned, kept = held_back(range(count), fold)
+    learned, kept = SETTINGS.hold_out(range(count), fold)
     assert sorted([*learned, *kept]) == list(range(count))
-    assert bool(kept) == (count >= HELD_BACK_FROM)
-    assert len(kept) <= -(-count // HELD_BACK_EVERY)
+    assert bool(kept) == (count >= SETTINGS.min_validated)
+    assert len(kept) <= -(-count // SETTINGS.validation_every)
     assert learned or not count
 
 
 def test_each_fold_holds_back_other_images() -> None:
-    kept = [held_back(range(40), fold)[1] for fold in range(5)]
+    kept = [SETTINGS.hold_out(range(40), fold)[1] for fold in range(5)]
     assert sorted(frame for fold in kept for frame in fold) == list(range(40))
-    assert held_back(range(40), 5) == held_back(range(40), 0)
+    assert SETTINGS.hold_out(range(40), 5) == SETTINGS.hold_out(range(40), 0)

@@ -21,16 +21,12 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
-from neeco.experiments.downstream import conditions as conditions_module
-from neeco.experiments.downstream import job as job_module
 from neeco.experiments.downstream import model as models_module
-from neeco.experiments.downstream import plan as plan_module
-from neeco.experiments.downstream.experiment import failed_jobs, run_downstream
-from neeco.experiments.downstream.job import Teaching
-from neeco.experiments.downstream.model import Boxes
-from neeco.experiments.downstream.plan import DownstreamSpec, job_folder, plan_downstream
+from neeco.experiments.downstream.experiment import plan_downstream, run_downstream
+from neeco.experiments.downstream.job import DownstreamSettings, job_folder
+from neeco.experiments.downstream.results import failed_jobs, tables_of, write_tables
 from neeco.experiments.downstream.samples import DataSet
-from neeco.experiments.downstream.tables import tables_of, write_tables
+from neeco.experiments.downstream.scores import Detections
 
 TIMES = ("seconds", "processor_seconds", "machine")
 
@@ -39,10 +35,10 @@ class Corners(Pixels):
     """Always answers with one box, learned or not."""
 
     model = "corners"
-    answers = "boxes"
+    predicts = "boxes"
 
-    def answer(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Boxes]:
-        return [Boxes(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
+    def predictions(self, module, images: Tensor, sizes: Sequence[tuple[int, int]]) -> list[Detections]:
+        return [Detections(np.array([[0.0, 0, w / 2, h / 2]]), np.array([1]), np.array([0.9])) for h, w in sizes]
 
 
 @pytest.fixture(autouse=True)
@@ -50,24 +46,26 @@ def small_models(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.set_num_threads(1)
     known = models_module.find_models() | {"pixels": Pixels, "corners": Corners}
     monkeypatch.setattr(models_module, "find_models", lambda: known)
-    for module in (conditions_module, plan_module):
-        monkeypatch.setattr(module, "HELD_BACK_FROM", 5)
 
 
 @pytest.fixture
-def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSpec:
+def spec(recorded: Path, drawn: Path, tmp_path: Path) -> DownstreamSettings:
     """Eight jobs of a fraction of a second: two folds of real, set and both."""
-    teaching = Teaching(recorded, (DataSet("kin", drawn),), "instrument", (), device="cpu")
-    conditions = ("real", "kin", "kin+real")
-    return DownstreamSpec(teaching, tmp_path / "out", ("pixels",), ("0", "6", "all"), 2, conditions)
+    return DownstreamSettings(
+        recorded,
+        tmp_path / "out",
+        (DataSet("kin", drawn),),
+        models=("pixels",),
+        num_real=("0", "6", "all"),
+        folds=2,
+        conditions=("real", "kin", "kin+real"),
+        device="cpu",
+        min_validated=5,
+    )
 
 
-def taught(spec: DownstreamSpec, news=None) -> dict:
-    return run_downstream(plan_downstream(spec), news)
-
-
-def changed(spec: DownstreamSpec, **teaching) -> DownstreamSpec:
-    return replace(spec, teaching=replace(spec.teaching, **teaching))
+def trained(settings: DownstreamSettings, progress=None) -> dict:
+    return run_downstream(plan_downstream(settings), progress)
 
 
 def without_times(value):
@@ -84,9 +82,9 @@ def refused(*words: str):
     return pytest.raises(NeecoError, match=".*".join(map(re.escape, words)))
 
 
-def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSpec) -> None:
+def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSettings) -> None:
     stages = []
-    result = taught(spec, lambda news: stages.append((news.index, news.stage)))
+    result = trained(spec, lambda news: stages.append((news.index, news.stage)))
     assert result == json.loads((spec.output / "downstream.json").read_text())
     assert result["schema"] == "neeco-downstream/1"
     assert result["complete"]
@@ -114,8 +112,8 @@ def test_an_experiment_holds_what_its_jobs_hold(spec: DownstreamSpec) -> None:
     assert any("fewer than three folds" in note for note in result["notes"])
 
 
-def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSpec, recorded: Path) -> None:
-    job = taught(replace(spec, conditions=("real",), real=("all",), folds=1))["jobs"][0]
+def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSettings, recorded: Path) -> None:
+    job = trained(replace(spec, conditions=("real",), num_real=("all",), folds=1))["jobs"][0]
     folder = job_folder(spec.output, "pixels", "real", 10, 0) / "predictions" / "test"
     values = []
     for row in job["splits"]["test"]["per_frame"]:
@@ -127,79 +125,79 @@ def test_a_jobs_scores_are_of_what_it_answered(spec: DownstreamSpec, recorded: P
     assert [row["frame"] for row in job["splits"]["test"]["per_frame"]] == ["006", "007"]
 
 
-def test_the_same_words_give_the_same_bits(spec: DownstreamSpec, tmp_path: Path) -> None:
-    small = replace(spec, conditions=("kin+real+augment",), real=("6",), folds=1)
+def test_the_same_words_give_the_same_bits(spec: DownstreamSettings, tmp_path: Path) -> None:
+    small = replace(spec, conditions=("kin+real+augment",), num_real=("6",), folds=1)
     pytest.importorskip("monai")
-    first, second = (taught(replace(small, output=tmp_path / name)) for name in ("one", "two"))
+    first, second = (trained(replace(small, output=tmp_path / name)) for name in ("one", "two"))
     assert without_times(first) == without_times(second)
     folders = [job_folder(tmp_path / name, "pixels", "kin+real+augment", 6, 0) for name in ("one", "two")]
     assert len({(folder / "weights.safetensors").read_bytes() for folder in folders}) == 1
 
 
-def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: DownstreamSpec) -> None:
+def test_every_condition_and_model_of_a_fold_has_the_same_labelled_frames(spec: DownstreamSettings) -> None:
     plan = plan_downstream(
-        replace(spec, models=("pixels", "corners"), conditions=("real", "kin+real"), real=("6",), folds=3)
+        replace(spec, models=("pixels", "corners"), conditions=("real", "kin+real"), num_real=("6",), folds=3)
     )
     chosen: dict[int, set] = {}
     for job in plan.jobs:
-        task = job._task(plan.capture)
-        learned = tuple(sample.name for sample in task.feed.sources[0])
+        task = job.task(plan.capture)
+        learned = tuple(sample.name for sample in task.batches.sources[0])
         kept = tuple(sample.name for sample in task.validation)
         assert len(learned) + len(kept) == 6
         assert not set(learned) & set(kept)
         assert {"006", "007", "012"}.isdisjoint({*learned, *kept})
-        assert len(task.feed.sources) == 1 + len(job.condition.sets)
+        assert len(task.batches.sources) == 1 + len(job.condition.sets)
         chosen.setdefault(job.fold, set()).add((learned, kept))
     assert [len(chosen[fold]) for fold in range(3)] == [1, 1, 1]
     assert len(set.union(*chosen.values())) == 3
 
 
-def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSpec) -> None:
-    plan = plan_downstream(replace(spec, real=("3",), conditions=("real", "kin+real")))
-    alone, beside = (job._task(plan.capture) for job in plan.jobs[:2])
-    assert len(alone.feed.sources[0]) == 3
+def test_of_few_labelled_frames_none_is_held_back(spec: DownstreamSettings) -> None:
+    plan = plan_downstream(replace(spec, num_real=("3",), conditions=("real", "kin+real")))
+    alone, beside = (job.task(plan.capture) for job in plan.jobs[:2])
+    assert len(alone.batches.sources[0]) == 3
     assert alone.validation == ()
     assert [sample.name for sample in beside.validation] == ["000004"]  # a drawn image, then
-    assert any("3 labelled frames: too few to hold some back" in note for note in plan.notes)
+    assert any("3 labelled frames: too few to hold some out" in note for note in plan.notes)
 
 
-def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_last_steps_see_recorded_frames_alone(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     conditions = ("real", "kin", "kin+real")
 
-    def finish() -> list[tuple[int | None, bool]]:
+    def finish(**changes) -> list[tuple[int | None, bool]]:
         """Of each job: how many images are mixed, and whether its identity speaks of it."""
-        plan = plan_downstream(replace(spec, real=("0", "6"), folds=1, conditions=conditions))
-        return [(job._task(plan.capture).feed.mixed, job.identity()["finish"] is not None) for job in plan.jobs]
+        plan = plan_downstream(replace(spec, num_real=("0", "6"), folds=1, conditions=conditions, **changes))
+        return [(job.task(plan.capture).batches.mixed, job.identity()["finish"] is not None) for job in plan.jobs]
 
     assert finish() == [(None, False), (None, False), ((6 - 2) * 2, True)]  # of six steps of two
-    monkeypatch.setattr(job_module, "FINISH_ROUNDS", 0.4)  # of five frames: two images
-    assert finish()[2] == ((6 - 1) * 2, True)
-    monkeypatch.setattr(Pixels, "orders_images", False)
+    assert finish(finetune_share=0.2)[2] == ((6 - 1) * 2, True)
+    assert finish(finetune_epochs=0)[2] == (6 * 2, True)
+    monkeypatch.setattr(Pixels, "keeps_order", False)
     assert finish() == [(None, False)] * 3
 
 
 # going on and growing
 
 
-def test_what_is_finished_is_not_done_again(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = taught(spec)
+def test_what_is_finished_is_not_done_again(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = trained(spec)
     before = job_files(spec.output)
     monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught again"))
-    assert taught(spec) == first
+    assert trained(spec) == first
     assert job_files(spec.output) == before
-    assert taught(changed(spec, splits=("unseen",)))["splits"] == ["unseen"]
+    assert trained(replace(spec, splits=("unseen",)))["splits"] == ["unseen"]
 
 
-def test_more_folds_sets_conditions_models_and_frames_are_added(spec: DownstreamSpec, tmp_path: Path) -> None:
-    small = replace(spec, conditions=("real", "kin"), real=("0", "6"), folds=1)
-    taught(small)
+def test_more_folds_sets_conditions_models_and_frames_are_added(spec: DownstreamSettings, tmp_path: Path) -> None:
+    small = replace(spec, conditions=("real", "kin"), num_real=("0", "6"), folds=1)
+    trained(small)
     before = job_files(spec.output)
     assert len(before) == 2
-    sets = (*spec.teaching.sets, DataSet("other", write_set(tmp_path / "other"), 3))
+    sets = (*spec.sets, DataSet("other", write_set(tmp_path / "other"), 3))
     conditions = ("real", "kin", "other", "kin+real")
-    more = replace(small, models=("pixels", "corners"), conditions=conditions, real=("0", "6", "7"), folds=2)
-    wide = changed(more, sets=sets)
-    result = taught(wide)
+    more = replace(small, models=("pixels", "corners"), conditions=conditions, num_real=("0", "6", "7"), folds=2)
+    wide = replace(more, sets=sets)
+    result = trained(wide)
     assert len(result["jobs"]) == 2 * 2 * (2 + 2 + 2)
     after = job_files(spec.output)
     assert len(after) == len(result["jobs"])
@@ -207,10 +205,10 @@ def test_more_folds_sets_conditions_models_and_frames_are_added(spec: Downstream
     assert [entry["images"] for entry in result["sets"]] == [6, 3]
 
 
-def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSpec) -> None:
+def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSettings) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
-    one = taught(changed(small, splits=("unseen",)))["jobs"][0]
-    both = taught(small)["jobs"][0]
+    one = trained(replace(small, splits=("unseen",)))["jobs"][0]
+    both = trained(small)["jobs"][0]
     assert list(one["splits"]) == ["unseen"]
     assert without_times(both["splits"]["unseen"]) == without_times(one["splits"]["unseen"])
     assert set(both["splits"]) == {"test", "unseen"}
@@ -218,9 +216,9 @@ def test_more_splits_are_tested_after_teaching_again(spec: DownstreamSpec) -> No
 
 @pytest.mark.parametrize("stopped", [0, 3])
 def test_interrupted_it_goes_on_to_the_same_numbers(
-    stopped: int, spec: DownstreamSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stopped: int, spec: DownstreamSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = taught(replace(spec, output=tmp_path / "whole"))
+    expected = trained(replace(spec, output=tmp_path / "whole"))
     loss, fits = Pixels.loss, [-1]
     fit = Pixels.fit
 
@@ -237,20 +235,20 @@ def test_interrupted_it_goes_on_to_the_same_numbers(
         patched.setattr(Pixels, "fit", counting)
         patched.setattr(Pixels, "loss", interrupted)
         with pytest.raises(KeyboardInterrupt, match=rf"job {stopped + 1} of 10 \(pixels, .*run the same command again"):
-            taught(spec)
+            trained(spec)
     if stopped:
         half = json.loads((spec.output / "downstream.json").read_text())
         assert not half["complete"]
         assert len(half["jobs"]) == stopped
     else:
         assert not spec.output.exists()
-    result = taught(spec)
+    result = trained(spec)
     for key in ("jobs", "summary", "paired", "answers", "notes", "sets", "models"):
         assert without_times(result[key]) == without_times(expected[key])
 
 
 @pytest.mark.parametrize("failing", [0, 2, "all"])
-def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     fit, fits = Pixels.fit, [-1]
 
     def sometimes(self, task):
@@ -261,7 +259,7 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSpec, monke
 
     with monkeypatch.context() as patched:
         patched.setattr(Pixels, "fit", sometimes)
-        result = taught(replace(spec, real=("0", "6")))
+        result = trained(replace(spec, num_real=("0", "6")))
     failed = [index for index, job in enumerate(result["jobs"]) if "error" in job]
     assert failed == (list(range(6)) if failing == "all" else [failing])
     job = result["jobs"][failed[0]]
@@ -273,14 +271,14 @@ def test_a_failing_job_is_told_in_its_place(failing, spec: DownstreamSpec, monke
     assert "not finite" in (spec.output / "data" / "jobs.csv").read_text()
     if failing == "all":
         assert "failed: pixels" in (spec.output / "downstream.md").read_text()
-    again = taught(replace(spec, real=("0", "6")))
+    again = trained(replace(spec, num_real=("0", "6")))
     assert not failed_jobs(again)
     assert again["complete"]
 
 
-def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSpec, monkeypatch) -> None:
+def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSettings, monkeypatch) -> None:
     monkeypatch.setattr(Pixels, "loss", lambda *_: 1 // 0)
-    result = taught(replace(spec, conditions=("kin",), folds=1))
+    result = trained(replace(spec, conditions=("kin",), folds=1))
     record = spec.output / "jobs" / "pixels-kin-real0-fold0.error.txt"
     assert result["jobs"][0]["error"].startswith("ZeroDivisionError")
     assert str(record) in result["jobs"][0]["error"]
@@ -292,28 +290,28 @@ def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSpec
     [
         ({"steps": 7}, "steps: is 6, not 7"),
         ({"batch": 3}, "batch: is 2, not 3"),
-        ({"side": 24}, "side: is 48, not 24"),
-        ({"pick": "first"}, "pick: is 'spread', not 'first'"),
+        ({"size": 24}, "side: is 48, not 24"),
+        ({"frame_selection": "first"}, "pick: is 'spread', not 'first'"),
         ({"classes": "parts"}, "classes: is 'instrument', not 'parts'"),
     ],
 )
 def test_a_folder_of_other_jobs_is_refused_before_the_work(spec, change, told: str, monkeypatch) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
-    taught(small)
+    trained(small)
     monkeypatch.setattr(Pixels, "fit", lambda *_: pytest.fail("taught"))
     with refused("job.json: ", told, "give another --output"):
-        taught(changed(replace(small, folds=2), **change))
+        trained(replace(replace(small, folds=2), **change))
 
 
-def test_another_set_under_the_same_name_is_refused(spec: DownstreamSpec, tmp_path: Path) -> None:
+def test_another_set_under_the_same_name_is_refused(spec: DownstreamSettings, tmp_path: Path) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
-    taught(small)
-    for data in (DataSet("kin", write_set(tmp_path / "else")), replace(spec.teaching.sets[0], count=3)):
+    trained(small)
+    for data in (DataSet("kin", write_set(tmp_path / "else")), replace(spec.sets[0], count=3)):
         with refused("job.json: sets: is", "give another --output"):
-            plan_downstream(changed(small, sets=(data,)))
+            plan_downstream(replace(small, sets=(data,)))
 
 
-def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSpec, capture: Path) -> None:
+def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSettings, capture: Path) -> None:
     small = replace(spec, conditions=("kin",), folds=1)
     spec.output.write_text("a file")
     with refused(str(spec.output), "is a file; give another --output"):
@@ -325,9 +323,9 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSpec, capture: Pat
     with refused("not empty, and no downstream experiment; give another --output"):
         plan_downstream(small)
     (spec.output / "precious.txt").unlink()
-    taught(small)
+    trained(small)
     with refused("downstream.json: capture: is about", "give another --output"):
-        plan_downstream(changed(small, capture=capture))
+        plan_downstream(replace(small, capture=capture))
     for text in ('{"schema": "else"}', "[]"):
         (spec.output / "downstream.json").write_text(text)
         with refused("downstream.json: schema", "give another --output"):
@@ -347,17 +345,17 @@ def test_a_folder_that_is_anothers_is_refused(spec: DownstreamSpec, capture: Pat
         ({"workers": 0}, "--workers: 0 is none at all; give at least 1"),
         ({"models": ()}, "--models: none is given"),
         ({"models": ("segformer",)}, "--models: 'segformer' is unknown; choose of"),
-        ({"real": ("some",)}, "--real: 'some' is neither a number of labelled frames nor all"),
-        ({"real": ("11",)}, "--real: 11 labelled frames are asked for, the capture has 10; use all"),
-        ({"real": ()}, "--real: leaves nothing to teach"),
-        ({"real": ("6",), "conditions": ("kin",)}, "--real: leaves nothing to teach; add 0"),
-        ({"real": ("0",), "conditions": ("real",)}, "--real: leaves nothing to teach"),
+        ({"num_real": ("some",)}, "--num-real: 'some' is neither a number of labelled frames nor all"),
+        ({"num_real": ("11",)}, "--num-real: 11 labelled frames are asked for, the capture has 10; use all"),
+        ({"num_real": ()}, "--num-real: leaves nothing to train"),
+        ({"num_real": ("6",), "conditions": ("kin",)}, "--num-real: leaves nothing to train; add 0"),
+        ({"num_real": ("0",), "conditions": ("real",)}, "--num-real: leaves nothing to train"),
         ({"conditions": ("kim",)}, "--conditions kim: 'kim' is neither"),
         ({"weights": {"unet": Path("x")}}, "--weights: 'unet' is not among --models pixels"),
         ({"weights": {"pixels": Path("/nowhere/w")}}, "--weights pixels: /nowhere/w: no such file"),
     ],
 )
-def test_what_cannot_be_done_is_refused(spec: DownstreamSpec, change, told: str) -> None:
+def test_what_cannot_be_done_is_refused(spec: DownstreamSettings, change, told: str) -> None:
     with refused(told):
         plan_downstream(replace(spec, **change))
     assert not spec.output.exists()
@@ -367,48 +365,48 @@ def test_what_cannot_be_done_is_refused(spec: DownstreamSpec, change, told: str)
     ("change", "told"),
     [
         ({"steps": 0}, "--steps: 0 is none at all; give at least 1"),
-        ({"side": -1}, "--size: -1 is none at all"),
+        ({"size": -1}, "--size: -1 is none at all"),
         ({"batch": 0}, "--batch: 0 is none at all"),
         ({"device": "tpu"}, "--device: 'tpu' is unknown"),
         ({"splits": ("tset",)}, "has no split 'tset'; it has train, test, unseen"),
-        ({"splits": ("train",)}, "--splits: train: what is taught is not tested"),
+        ({"splits": ("train",)}, "--splits: train: what is learned from is not tested"),
         ({"capture": Path("/nowhere")}, "/nowhere"),
     ],
 )
-def test_what_cannot_be_taught_is_refused(spec: DownstreamSpec, change, told: str) -> None:
+def test_what_cannot_be_taught_is_refused(spec: DownstreamSettings, change, told: str) -> None:
     with refused(told):
-        plan_downstream(changed(spec, **change))
+        plan_downstream(replace(spec, **change))
 
 
 @pytest.mark.parametrize("name", ["real", "augment", "soft", "a+b", "", "../up", "a/b"])
-def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSpec, name: str) -> None:
-    data = replace(spec.teaching.sets[0], name=name)
+def test_names_of_sets_that_mean_something_are_refused(spec: DownstreamSettings, name: str) -> None:
+    data = replace(spec.sets[0], name=name)
     with refused(f"--sets {name}: ", "call the set"):
-        plan_downstream(changed(replace(spec, conditions=None), sets=(data,)))
+        plan_downstream(replace(replace(spec, conditions=None), sets=(data,)))
 
 
-def test_names_of_sets_stand_once(spec: DownstreamSpec) -> None:
+def test_names_of_sets_stand_once(spec: DownstreamSettings) -> None:
     with refused("--sets: a name stands twice in kin kin"):
-        plan_downstream(changed(spec, sets=spec.teaching.sets * 2))
+        plan_downstream(replace(spec, sets=spec.sets * 2))
 
 
-def test_captures_without_truth_to_test_on_are_refused(spec: DownstreamSpec, capture: Path) -> None:
-    there = changed(spec, capture=capture)
+def test_captures_without_truth_to_test_on_are_refused(spec: DownstreamSettings, capture: Path) -> None:
+    there = replace(spec, capture=capture)
     (capture / "truth" / "masks" / "012.png").unlink()
-    assert plan_downstream(there).teaching.splits == ("test",)
+    assert plan_downstream(there).settings.splits == ("test",)
     with refused("--splits: unseen: no frame of it has a true mask"):
-        plan_downstream(changed(there, splits=("unseen",)))
+        plan_downstream(replace(there, splits=("unseen",)))
     for name in ("006", "007"):
         (capture / "truth" / "masks" / f"{name}.png").unlink()
     with refused(str(capture), "no frame outside of split train has a true mask"):
         plan_downstream(there)
 
 
-def test_sets_alone_need_no_labelled_frame(spec: DownstreamSpec, capture: Path) -> None:
+def test_sets_alone_need_no_labelled_frame(spec: DownstreamSettings, capture: Path) -> None:
     for frame in (0, 1, 2, 3, 4, 5, 8, 9, 10, 11):
         (capture / "truth" / "masks" / f"{frame:03d}.png").unlink()
-    alone = changed(replace(spec, conditions=("kin",), folds=1), capture=capture)
-    result = taught(alone)
+    alone = replace(replace(spec, conditions=("kin",), folds=1), capture=capture)
+    result = trained(alone)
     assert result["labelled"] == 0
     assert "error" not in result["jobs"][0]
     with refused("split train: no frame has a label; give --labels FOLDER"):
@@ -416,24 +414,24 @@ def test_sets_alone_need_no_labelled_frame(spec: DownstreamSpec, capture: Path) 
 
 
 def test_labels_of_ones_own_are_taught_and_the_truth_is_tested(
-    spec: DownstreamSpec, tmp_path: Path, recorded: Path
+    spec: DownstreamSettings, tmp_path: Path, recorded: Path
 ) -> None:
     labels = tmp_path / "labels"
     for name in ("001", "004"):
         save_grey(labels / f"{name}.png", 255 - (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255)
-    result = taught(changed(replace(spec, conditions=("real",), real=("all",), folds=1), labels=labels, steps=40))
+    result = trained(replace(replace(spec, conditions=("real",), num_real=("all",), folds=1), labels=labels, steps=40))
     assert result["labelled"] == 2
     assert result["jobs"][0]["splits"]["test"]["iou"] < 0.3  # it learned the tissue, as it was told
     assert any(str(labels) in note for note in result["notes"])
 
 
-def test_soft_targets_of_parts_are_refused(spec: DownstreamSpec) -> None:
+def test_soft_targets_of_parts_are_refused(spec: DownstreamSettings) -> None:
     with refused("--conditions kin+soft: ", "use --classes instrument"):
-        plan_downstream(changed(replace(spec, conditions=("kin+soft",)), classes="parts"))
-    assert plan_downstream(changed(replace(spec, conditions=("kin+ignore",)), classes="parts"))
+        plan_downstream(replace(replace(spec, conditions=("kin+soft",)), classes="parts"))
+    assert plan_downstream(replace(replace(spec, conditions=("kin+ignore",)), classes="parts"))
 
 
-def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSpec, drawn: Path) -> None:
+def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSettings, drawn: Path) -> None:
     shutil.rmtree(drawn / "soft")
     plan_downstream(spec)
     with refused("--sets kin", "soft", "kin+hard"):
@@ -441,36 +439,38 @@ def test_edges_that_a_set_lacks_are_refused_before_the_work(spec: DownstreamSpec
 
 
 def test_a_model_that_lacks_something_is_refused_with_the_remedy(spec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pixels, "unmet", classmethod(lambda cls: "needs patience; pip install patience"))
+    monkeypatch.setattr(Pixels, "missing_requirement", classmethod(lambda cls: "needs patience; pip install patience"))
     with refused("--models pixels: needs patience; pip install patience"):
         plan_downstream(spec)
 
 
-def test_images_too_small_for_a_model_are_refused(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Pixels, "sees_too_little", classmethod(lambda cls, size: size[0] < 48))
+def test_images_too_small_for_a_model_are_refused(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Pixels, "is_too_small", classmethod(lambda cls, size: size[0] < 48))
     plan_downstream(spec)
     with refused("--models pixels: it would see images of 24x16 px, too small for it; give a larger --size"):
-        plan_downstream(changed(spec, side=24))
+        plan_downstream(replace(spec, size=24))
 
 
-def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(spec: DownstreamSpec, capture: Path) -> None:
+def test_boxes_of_instruments_that_labels_do_not_tell_apart_are_refused(
+    spec: DownstreamSettings, capture: Path
+) -> None:
     file = capture / "transforms.json"
     stated = json.loads(file.read_text())
     stated["instruments"].append({"name": "second"})
     for frame in stated["frames"]:
         frame["instruments"].append({**frame["instruments"][0], "name": "second"})
     file.write_text(json.dumps(stated))
-    two = changed(spec, capture=capture)
+    two = replace(spec, capture=capture)
     plan_downstream(two)
-    with refused("--models corners", "labels do not tell the 2 instruments apart", "a model that answers with masks"):
+    with refused("--models corners", "labels do not tell the 2 instruments apart", "a model that predicts masks"):
         plan_downstream(replace(two, models=("corners",)))
 
 
 # boxes, parts, notes
 
 
-def test_boxes_are_scored_and_kept(spec: DownstreamSpec) -> None:
-    job = taught(replace(spec, models=("corners",), conditions=("kin",), folds=1))["jobs"][0]
+def test_boxes_are_scored_and_kept(spec: DownstreamSettings) -> None:
+    job = trained(replace(spec, models=("corners",), conditions=("kin",), folds=1))["jobs"][0]
     scores = job["splits"]["test"]
     assert {"ap", "ap50", "ap75", "box_precision", "box_recall", "frames"} == set(scores)
     file = job_folder(spec.output, "corners", "kin", 0, 0) / "predictions" / "test" / "boxes.json"
@@ -479,8 +479,8 @@ def test_boxes_are_scored_and_kept(spec: DownstreamSpec) -> None:
     assert kept["006"] == {"boxes": [[0, 0, 24, 20]], "classes": [1], "scores": [0.9]}
 
 
-def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSpec) -> None:
-    result = taught(changed(replace(spec, conditions=("kin+real",), folds=1), classes="parts"))
+def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSettings) -> None:
+    result = trained(replace(replace(spec, conditions=("kin+real",), folds=1), classes="parts"))
     assert {job["iterations"] for job in result["jobs"]} == {15}  # not six
     assert result["classes"] == ["shaft", "wrist", "jaws"]
     scores = result["jobs"][0]["splits"]["test"]
@@ -489,18 +489,18 @@ def test_parts_are_scored_apart_and_take_more_steps(spec: DownstreamSpec) -> Non
     assert "jaws IoU" in titles
 
 
-def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSpec, drawn: Path) -> None:
+def test_a_wrong_file_in_a_set_fails_its_jobs_alone(spec: DownstreamSettings, drawn: Path) -> None:
     parts = bar_parts(3)
     parts[0, 0] = 77
     save_grey(drawn / "parts" / "000003.png", parts)
-    result = taught(replace(spec, folds=1, real=("0", "6")))
+    result = trained(replace(spec, folds=1, num_real=("0", "6")))
     failed = [job["condition"] for job in result["jobs"] if "error" in job]
     assert failed == ["kin", "kin+real"]
-    assert "000003.png: id 77 means nothing" in result["jobs"][1]["error"]
+    assert "000003.png: id 77 has no class" in result["jobs"][1]["error"]
 
 
-def test_a_course_that_still_rises_is_noted(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    from neeco.experiments.downstream import torch_training
+def test_a_course_that_still_rises_is_noted(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.experiments.downstream import model as torch_training
 
     score = [0.0]
 
@@ -509,7 +509,7 @@ def test_a_course_that_still_rises_is_noted(spec: DownstreamSpec, monkeypatch: p
         return score[0]
 
     monkeypatch.setattr(torch_training, "validation_score", rising)
-    result = taught(replace(spec, conditions=("kin",), folds=1))
+    result = trained(replace(spec, conditions=("kin",), folds=1))
     assert result["jobs"][0]["still_learning"]
     assert "still getting better at the last step: pixels, kin; give more --steps" in result["notes"]
 
@@ -517,8 +517,8 @@ def test_a_course_that_still_rises_is_noted(spec: DownstreamSpec, monkeypatch: p
 # files
 
 
-def test_tables_hold_the_numbers(spec: DownstreamSpec) -> None:
-    result = taught(spec)
+def test_tables_hold_the_numbers(spec: DownstreamSettings) -> None:
+    result = trained(spec)
     write_tables(spec.output, result)
     rows = {(row["condition"], row["real"], row["split"]): row for row in result["summary"]}
     with (spec.output / "downstream.csv").open(newline="") as stream:
@@ -547,23 +547,23 @@ def test_tables_hold_the_numbers(spec: DownstreamSpec) -> None:
     assert counts["validation.csv"] == sum(len(job["validation"]) for job in result["jobs"]) > 0
 
 
-def test_jobs_are_handed_the_capture(spec: DownstreamSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_are_handed_the_capture(spec: DownstreamSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     from neeco.experiments.downstream import job
 
     monkeypatch.setattr(job, "read_capture", lambda *_: pytest.fail("read again"))
-    assert taught(replace(spec, conditions=("kin",), folds=1))["complete"]
+    assert trained(replace(spec, conditions=("kin",), folds=1))["complete"]
 
 
-def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSpec, tmp_path: Path) -> None:
+def test_a_set_of_others_is_no_less_a_set(spec: DownstreamSettings, tmp_path: Path) -> None:
     root = write_set(tmp_path / "others", info=False)
-    result = taught(changed(replace(spec, conditions=("kin",), folds=1), sets=(DataSet("kin", root),)))
+    result = trained(replace(replace(spec, conditions=("kin",), folds=1), sets=(DataSet("kin", root),)))
     assert result["sets"][0]["made_by"] is None
     assert "error" not in result["jobs"][0]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
-def test_two_workers_give_the_same_numbers(spec: DownstreamSpec, tmp_path: Path, monkeypatch) -> None:
+def test_two_workers_give_the_same_numbers(spec: DownstreamSettings, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
-    small = changed(replace(spec, models=("unet",), conditions=("kin", "real"), real=("0", "6"), folds=1), steps=3)
-    here, there = (taught(replace(small, output=tmp_path / str(workers), workers=workers)) for workers in (1, 2))
+    small = replace(replace(spec, models=("unet",), conditions=("kin", "real"), num_real=("0", "6"), folds=1), steps=3)
+    here, there = (trained(replace(small, output=tmp_path / str(workers), workers=workers)) for workers in (1, 2))
     assert without_times(here["jobs"]) == without_times(there["jobs"])

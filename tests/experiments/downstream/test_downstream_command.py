@@ -29,7 +29,7 @@ PAGE = "neeco.report.downstream_page"
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """One thread, a small model, and a page even where there is none to write."""
     torch.set_num_threads(1)
-    monkeypatch.setattr("neeco.experiments.downstream.models.unet.CHANNELS", (4, 4, 8, 8, 8))
+    monkeypatch.setattr("neeco.experiments.downstream.models.unet.UNet.channels", (4, 4, 8, 8, 8))
     monkeypatch.setenv("COLUMNS", "160")
     if importlib.util.find_spec(PAGE) is None:
         page = ModuleType(PAGE)
@@ -39,7 +39,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def words(recorded: Path, drawn: Path, tmp_path: Path) -> list[str]:
-    named = [str(recorded), "--output", str(tmp_path / "out"), "--sets", f"kin={drawn}", "--real", "0", "6"]
+    named = [str(recorded), "--output", str(tmp_path / "out"), "--sets", f"kin={drawn}", "--num-real", "0", "6"]
     return ["downstream", *named, *SHORT]
 
 
@@ -126,8 +126,8 @@ def test_weights_of_one_experiment_begin_another(words, recorded: Path, tmp_path
         (["--sets", "kin=nowhere"], "--sets kin: nowhere: no folder images/; give what `neeco synthesize` wrote"),
         (["--sets", "kin=nowhere:many"], "--sets kin: nowhere:many: no folder images/"),
         (["--models", "yolov9"], "--models: 'yolov9' is unknown; choose of dfine, unet, yolo"),
-        (["--real", "few"], "--real: 'few' is neither a number of labelled frames nor all"),
-        (["--real", "99"], "--real: 99 labelled frames are asked for, the capture has 10; use all"),
+        (["--num-real", "few"], "--num-real: 'few' is neither a number of labelled frames nor all"),
+        (["--num-real", "99"], "--num-real: 99 labelled frames are asked for, the capture has 10; use all"),
         (["--conditions", "kin+reel"], "--conditions kin+reel: 'reel' is neither"),
         (["--conditions", "kin+soft+ignore"], "one of hard, soft, ignore at most"),
         (["--folds", "0"], "--folds: 0 is none at all; give at least 1"),
@@ -161,5 +161,5 @@ def test_parts_are_asked_of_labels_that_tell_them(words, recorded: Path, tmp_pat
     for name in ("000", "001"):
         mask = (read_grey(recorded / "truth" / "masks" / f"{name}.png") > 0) * 255
         save_grey(tmp_path / "labels" / f"{name}.png", mask)
-    more = ["--classes", "parts", "--labels", str(tmp_path / "labels"), "--real", "2"]
+    more = ["--classes", "parts", "--labels", str(tmp_path / "labels"), "--num-real", "2"]
     assert "--classes parts: the labels in" in stopped_by([*words, *more], capsys)

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-import pytest
 from downstream_world import Held, squares
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neeco.experiments.downstream import feed as module
-from neeco.experiments.downstream.feed import Feed
+from neeco.experiments.downstream.samples import BatchSampler
 
 SOURCES = [squares(3, 0, 16), squares(11, 10, 16), squares(1, 50, 16)]
 NAMES = {id(sample.example): sample.name for source in SOURCES for sample in source}
 
 
-def names(feed: Feed, count: int) -> list[str]:
+def names(feed: BatchSampler, count: int) -> list[str]:
     return [NAMES[id(example)] for example in feed.batch(count)]
 
 
@@ -28,7 +26,7 @@ def source_of(name: str) -> int:
 @settings(deadline=None, max_examples=50)
 @given(st.integers(0, 99), st.lists(st.integers(1, 9), min_size=1, max_size=8))
 def test_sources_have_equal_shares_of_all_batches_and_each(seed: int, sizes: list[int]) -> None:
-    feed, total = Feed(SOURCES, seed), Counter()
+    feed, total = BatchSampler(SOURCES, seed), Counter()
     for size in sizes:
         batch = Counter(source_of(name) for name in names(feed, size))
         total += batch
@@ -37,7 +35,7 @@ def test_sources_have_equal_shares_of_all_batches_and_each(seed: int, sizes: lis
 
 
 def test_every_image_is_seen_once_a_round() -> None:
-    seen = names(Feed(SOURCES, 4), 3 * 22)
+    seen = names(BatchSampler(SOURCES, 4), 3 * 22)
     for k, source in enumerate(SOURCES):
         own = [name for name in seen if source_of(name) == k]
         everything = sorted(sample.name for sample in source)
@@ -48,22 +46,22 @@ def test_every_image_is_seen_once_a_round() -> None:
 
 
 def test_the_seed_decides_the_order_whatever_the_batches() -> None:
-    feed = Feed(SOURCES, 1)
-    assert names(Feed(SOURCES, 1), 30) == [name for _ in range(10) for name in names(feed, 3)]
-    assert names(Feed(SOURCES, 1), 30) != names(Feed(SOURCES, 2), 30)
+    feed = BatchSampler(SOURCES, 1)
+    assert names(BatchSampler(SOURCES, 1), 30) == [name for _ in range(10) for name in names(feed, 3)]
+    assert names(BatchSampler(SOURCES, 1), 30) != names(BatchSampler(SOURCES, 2), 30)
 
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 40), st.lists(st.integers(1, 9), min_size=1, max_size=8))
 def test_after_the_mixed_ones_only_the_first_source_is_seen(mixed: int, sizes: list[int]) -> None:
-    feed = Feed(SOURCES, 2, mixed=mixed)
+    feed = BatchSampler(SOURCES, 2, mixed=mixed)
     seen = [name for size in sizes for name in names(feed, size)]
-    assert seen[:mixed] == names(Feed(SOURCES, 2), len(seen))[:mixed]
+    assert seen[:mixed] == names(BatchSampler(SOURCES, 2), len(seen))[:mixed]
     assert {source_of(name) for name in seen[mixed:]} <= {0}
 
 
 def test_empty_sources_take_no_share() -> None:
-    assert {source_of(name) for name in names(Feed([(), SOURCES[0]], 0), 12)} == {0}
+    assert {source_of(name) for name in names(BatchSampler([(), SOURCES[0]], 0), 12)} == {0}
 
 
 def test_augmentation_sees_every_example_and_repeats_with_the_seed() -> None:
@@ -72,21 +70,21 @@ def test_augmentation_sees_every_example_and_repeats_with_the_seed() -> None:
         return example
 
     drawn: list[float] = []
-    Feed(SOURCES, 3, noisy).batch(9)
+    BatchSampler(SOURCES, 3, noisy).batch(9)
     first, drawn = drawn, []
-    Feed(SOURCES, 3, noisy).batch(9)
+    BatchSampler(SOURCES, 3, noisy).batch(9)
     assert first == drawn
     assert len(set(first)) == 9
 
 
-def test_images_are_read_once_unless_they_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def read_twice() -> list[int]:
+def test_images_are_read_once_unless_they_do_not_fit() -> None:
+    def read_twice(**limit: int) -> list[int]:
         source = [Held(sample.example, sample.name, []) for sample in squares(4, 0, 16)]
-        feed = Feed([source], 0)
+        feed = BatchSampler([source], 0, **limit)
         again = [feed.batch(4) for _ in range(3)]
         assert all(any(np.array_equal(example.image, s.example.image) for s in source) for b in again for example in b)
         return sorted(len(sample.loads) for sample in source)
 
     assert read_twice() == [1, 1, 1, 1]
-    monkeypatch.setattr(module, "CACHE_BYTES", 2 * (3 + 1 + 1) * 16**2)  # image, classes, instruments of two
-    assert read_twice() == [1, 1, 3, 3]
+    two = 2 * (3 + 1 + 1) * 16**2  # image, classes and instruments of two
+    assert read_twice(cache_bytes=two) == [1, 1, 3, 3]

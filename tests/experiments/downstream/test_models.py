@@ -17,17 +17,16 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
-from neeco.experiments.downstream.feed import Feed
-from neeco.experiments.downstream.model import Boxes, find_models, input_size, model_class
+from neeco.experiments.downstream.model import WEIGHTS_FILE, find_models, input_size, load_weights, model_class
 from neeco.experiments.downstream.models import dfine
 from neeco.experiments.downstream.models.dfine import DFine
 from neeco.experiments.downstream.models.unet import UNet, targets
-from neeco.experiments.downstream.samples import Example
-from neeco.experiments.downstream.torch_training import WEIGHTS_FILE, load_weights
+from neeco.experiments.downstream.samples import BatchSampler, Example
+from neeco.experiments.downstream.scores import Detections
 
 
 def needs(model: str) -> None:
-    if lack := model_class(model).unmet():
+    if lack := model_class(model).missing_requirement():
         pytest.skip(lack)
 
 
@@ -39,7 +38,7 @@ def test_a_unet_learns_bright_rectangles_and_repeats_bit_for_bit(tmp_path: Path)
     tested, told = [square(200 + k) for k in range(3)], []
     folders = [tmp_path / "one", tmp_path / "two"]
     for folder in folders:
-        task = task_of(folder, steps=25, batch=3, tell=lambda share, text: told.append((share, text)))
+        task = task_of(folder, steps=25, batch=3, progress=lambda share, text: told.append((share, text)))
         fitted = UNet().fit(task)
     answers = fitted.predict([example.image for example in tested])
     assert all(answer.dtype == np.uint8 and answer.shape == (64, 64) for answer in answers)
@@ -67,9 +66,9 @@ def test_another_seed_or_other_threads_of_random_numbers_give_other_or_the_same_
 @pytest.fixture
 def small_dfine(monkeypatch: pytest.MonkeyPatch) -> None:
     needs("dfine")
-    monkeypatch.setattr(dfine, "STAGES", (16, 32, 64, 64))
-    monkeypatch.setattr(dfine, "WIDTH", 32)
-    monkeypatch.setattr(dfine, "QUERIES", 6)
+    monkeypatch.setattr(DFine, "stages", (16, 32, 64, 64))
+    monkeypatch.setattr(DFine, "width", 32)
+    monkeypatch.setattr(DFine, "queries", 6)
     monkeypatch.setattr(DFine, "learning_rate", 2e-3)
 
 
@@ -82,11 +81,11 @@ def test_a_dfine_learns_where_rectangles_are(small_dfine, tmp_path: Path, monkey
         return value
 
     monkeypatch.setattr(DFine, "loss", watched)
-    fitted = DFine().fit(task_of(tmp_path, feed=Feed([squares(2)], 0), validation=(), steps=40))
+    fitted = DFine().fit(task_of(tmp_path, batches=BatchSampler([squares(2)], 0), validation=(), steps=40))
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
     assert (fitted.best_step, fitted.validation) == (40, [])
     (answer,) = fitted.predict([square(0).image])
-    assert isinstance(answer, Boxes)
+    assert isinstance(answer, Detections)
     assert answer.boxes.shape == (6, 4)
 
 
@@ -94,8 +93,8 @@ def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
     logits = torch.tensor([[[-1.0, 2.0], [0.5, -3.0]]])  # two queries of two classes
     boxes = torch.tensor([[[0.5, 0.5, 0.5, 0.25], [0.9, 0.1, 0.4, 0.2]]])
     output = SimpleNamespace(logits=logits, pred_boxes=boxes)
-    (answer,) = DFine().answer(lambda pixel_values: output, torch.zeros(1, 3, 32, 32), [(40, 80)])
-    assert isinstance(answer, Boxes)
+    (answer,) = DFine().predictions(lambda pixel_values: output, torch.zeros(1, 3, 32, 32), [(40, 80)])
+    assert isinstance(answer, Detections)
     assert answer.classes.tolist() == [2, 1, 1, 2]
     assert answer.scores == pytest.approx(torch.tensor([2.0, 0.5, -1, -3]).sigmoid().numpy())
     assert answer.boxes == pytest.approx(
@@ -106,8 +105,8 @@ def test_dfines_answers_are_boxes_of_each_image_best_first() -> None:
 def test_a_dfine_repeats_bit_for_bit_and_bears_images_without_an_instrument(small_dfine, tmp_path: Path) -> None:
     empty = replace(square(0), classes=np.zeros((64, 64), np.uint8), instruments=np.zeros((64, 64), np.uint8))
     for name in ("one", "two"):
-        feed = Feed([[Held(empty), Held(empty), *squares(1)]], 0)
-        DFine().fit(task_of(tmp_path / name, feed=feed, validation=(Held(empty),), steps=3))
+        feed = BatchSampler([[Held(empty), Held(empty), *squares(1)]], 0)
+        DFine().fit(task_of(tmp_path / name, batches=feed, validation=(Held(empty),), steps=3))
     first, second = ((tmp_path / name / WEIGHTS_FILE).read_bytes() for name in ("one", "two"))
     assert first == second
 
@@ -134,17 +133,17 @@ def test_what_dfine_is_told_of_an_image() -> None:
 
 
 def test_a_dfine_needs_as_many_places_as_boxes(small_dfine, tmp_path: Path) -> None:
-    assert not DFine.sees_too_little((64, 32))
+    assert not DFine.is_too_small((64, 32))
     DFine().fit(task_of(tmp_path, size=(64, 32), steps=1))
-    assert DFine.sees_too_little((32, 32))
-    assert not UNet.sees_too_little((16, 16))
+    assert DFine.is_too_small((32, 32))
+    assert not UNet.is_too_small((16, 16))
 
 
 # what every model's training does
 
 
 def test_the_weights_that_did_best_on_what_is_held_back_are_kept(tmp_path: Path, monkeypatch) -> None:
-    from neeco.experiments.downstream import torch_training as training
+    from neeco.experiments.downstream import model as training
 
     scores, states = iter([0.1, 0.4, 0.9, 0.2, 0.9, 0.3, 0.3, 0.2, 0.1, 0.5]), []
     monkeypatch.setattr(training, "validation_score", lambda *_: next(scores))
@@ -224,7 +223,7 @@ def test_weights_of_other_models_or_none_are_refused(tmp_path: Path) -> None:
 
 
 def half_counted(seed: int, side: int = 64) -> Example:
-    return replace(square(seed, side), counted=np.random.default_rng(seed).random((side, side)) > 0.4)
+    return replace(square(seed, side), valid=np.random.default_rng(seed).random((side, side)) > 0.4)
 
 
 @pytest.mark.parametrize("side", [64, 48, 20, 96])
@@ -232,20 +231,20 @@ def test_labels_of_pixels_that_do_not_count_change_no_loss(side: int) -> None:
     torch.manual_seed(0)
     module, images = Pixels().build(1), torch.rand(3, 3, side, side)
     examples = [half_counted(seed) for seed in range(3)]
-    other = [replace(e, classes=np.where(e.counted, e.classes, 1 - e.classes).astype(np.uint8)) for e in examples]
-    soft = [replace(e, share=(0.7 * e.classes).astype(np.float32)) for e in examples]
-    dull = [replace(e, share=np.where(e.counted, e.share, 0.2).astype(np.float32)) for e in soft]
+    other = [replace(e, classes=np.where(e.valid, e.classes, 1 - e.classes).astype(np.uint8)) for e in examples]
+    soft = [replace(e, coverage=(0.7 * e.classes).astype(np.float32)) for e in examples]
+    dull = [replace(e, coverage=np.where(e.valid, e.coverage, 0.2).astype(np.float32)) for e in soft]
     for these, those in ((examples, other), (soft, dull)):
         losses = [Pixels().loss(module, images, some).item() for some in (these, those)]
         assert losses[0] == pytest.approx(losses[1], abs=1e-6)
-    whole = [replace(example, counted=None) for example in examples]
+    whole = [replace(example, valid=None) for example in examples]
     assert Pixels().loss(module, images, whole).item() != pytest.approx(
         Pixels().loss(module, images, examples).item(), abs=1e-4
     )
 
 
 def test_where_nothing_counts_the_loss_is_finite() -> None:
-    none = replace(square(0), counted=np.zeros((64, 64), bool))
+    none = replace(square(0), valid=np.zeros((64, 64), bool))
     loss = Pixels().loss(Pixels().build(1), torch.rand(1, 3, 32, 32), [none])
     assert torch.isfinite(loss)
 
@@ -264,7 +263,7 @@ def test_targets_are_shares_of_area() -> None:
 
 
 def test_soft_targets_are_the_share_of_instrument() -> None:
-    example = replace(square(0), share=np.full((64, 64), 0.3, np.float32))
+    example = replace(square(0), coverage=np.full((64, 64), 0.3, np.float32))
     shares, weights = targets([example, square(0)], 2, (16, 16))
     assert shares[0, 1].numpy() == pytest.approx(np.full((16, 16), 0.3), abs=1e-6)
     assert shares[0, 0].numpy() == pytest.approx(np.full((16, 16), 0.7), abs=1e-6)

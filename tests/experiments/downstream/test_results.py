@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neeco.experiments.downstream.results import (
-    answers_of,
+    Arm,
     comparisons,
     equivalent,
+    findings,
     metrics_of,
     paired,
     summarise_folds,
@@ -48,7 +49,7 @@ def documented(results: list[dict], sets=("kin", "other"), models=MASKS) -> dict
         "summary": summarise_folds(results, models, ["test"]),
         "paired": comparisons([one for one in results if "error" not in one], models, ["test"], sets),
     }
-    return made | {"answers": answers_of(made)}
+    return made | {"answers": findings(made)}
 
 
 def pairs(results: list[dict], sets=("kin", "other")) -> set[tuple]:
@@ -58,7 +59,9 @@ def pairs(results: list[dict], sets=("kin", "other")) -> set[tuple]:
 
 def test_a_paired_difference_and_its_interval_are_a_t_tests() -> None:
     first, second = (0.71, 0.74, 0.69, 0.77), (0.65, 0.7, 0.68, 0.7)
-    row = paired(jobs(kin_real_20=first, real_20=second), ("unet", "kin+real", 20), ("unet", "real", 20), "test", "iou")
+    row = paired(
+        jobs(kin_real_20=first, real_20=second), Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou"
+    )
     assert row is not None
     test = stats.ttest_rel(first, second)
     interval = test.confidence_interval(0.95)
@@ -70,15 +73,15 @@ def test_a_paired_difference_and_its_interval_are_a_t_tests() -> None:
 def test_folds_are_paired_by_their_number_and_missing_ones_left_out() -> None:
     results = [job("kin+real", 20, fold, value) for fold, value in ((2, 0.9), (0, 0.5), (1, None))]
     results += [job("real", 20, fold, value) for fold, value in ((0, 0.4), (1, 0.1), (2, 0.7))]
-    row = paired(results, ("unet", "kin+real", 20), ("unet", "real", 20), "test", "iou")
+    row = paired(results, Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou")
     assert row is not None
     assert row["folds"] == 2
     assert row["difference"] == pytest.approx(0.15)
-    lone = paired(results[1:], ("unet", "kin+real", 20), ("unet", "real", 20), "test", "iou")
+    lone = paired(results[1:], Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "iou")
     assert lone is not None
     assert (lone["folds"], lone["low"], lone["high"]) == (1, None, None)
-    assert paired(results, ("unet", "kin", 0), ("unet", "real", 20), "test", "iou") is None
-    assert paired(results, ("unet", "kin+real", 20), ("unet", "real", 20), "test", "nothing") is None
+    assert paired(results, Arm("unet", "kin", 0), Arm("unet", "real", 20), "test", "iou") is None
+    assert paired(results, Arm("unet", "kin+real", 20), Arm("unet", "real", 20), "test", "nothing") is None
 
 
 def test_what_is_compared_with_what() -> None:
@@ -174,7 +177,7 @@ def sentence(*starts: str, of: list[dict]) -> str:
 )
 def test_a_verdict_is_as_sure_as_its_interval(with_set, verdict: str) -> None:
     results = jobs(real_20=(0.60, 0.61, 0.59), kin_real_20=with_set)
-    told = sentence("unet, test: 20 labelled frames and 1,200 drawn (kin)", of=results)
+    told = sentence("unet, test: 20 labelled frames and 1,200 synthetic (kin)", of=results)
     assert verdict in told
     assert f"IoU {statistics.fmean(with_set):.3f}" in told
 
@@ -188,8 +191,8 @@ def test_one_fold_gives_no_verdict() -> None:
 def test_sets_alone_are_a_share_of_the_most_labelled_frames() -> None:
     told = sentence("no manual label", of=jobs(real_20=(0.5, 0.5), real_80=(0.8, 0.8), kin=(0.6, 0.6)))
     assert told == (
-        "unet, test: 1,200 drawn (kin) and no manual label: IoU 0.600, 75.0 % of what 80 labelled frames alone "
-        "teach (0.800)"
+        "unet, test: 1,200 synthetic (kin) and no manual label: IoU 0.600, 75.0 % of what 80 labelled frames alone "
+        "reach (0.800)"
     )
 
 
@@ -197,14 +200,14 @@ def test_sentences_are_of_drawn_images_with_something_to_compare() -> None:
     assert documented(jobs(kin=(0.6,)))["answers"] == []
     assert documented(jobs(real_20=(0.6,), real_augment_20=(0.7,)))["answers"] == []
     (told,) = documented(jobs(real_20=(0.6,), real_augment_20=(0.7,), kin_soft=(0.5,)))["answers"]
-    assert "1,200 drawn (kin, soft) and no manual label: IoU 0.500" in told
-    several = sentence("drawn (kin) and 1,200 drawn (other)", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
-    assert "20 labelled frames and 1,200 drawn (kin) and 1,200 drawn (other)" in several
+    assert "1,200 synthetic (kin, soft) and no manual label: IoU 0.500" in told
+    several = sentence("synthetic (kin) and 1,200 synthetic (other)", of=jobs(real_20=(0.6,), kin_other_real_20=(0.6,)))
+    assert "20 labelled frames and 1,200 synthetic (kin) and 1,200 synthetic (other)" in several
 
 
 def test_drawn_images_are_judged_against_augmentation_too() -> None:
     results = jobs(real_20=(0.6, 0.61, 0.6), real_augment_20=(0.9, 0.91, 0.9), kin_real_20=(0.7, 0.71, 0.71))
-    told = sentence("20 labelled frames and 1,200 drawn (kin)", of=results)
+    told = sentence("20 labelled frames and 1,200 synthetic (kin)", of=results)
     assert "; helps against them alone (+0.103, " in told
     assert "; hurts against them augmented (-0.197, " in told
 
@@ -217,7 +220,7 @@ def test_as_good_as_is_over_the_folds_that_both_finished() -> None:
         job("real", 20, 0, 0.6),
         job("real", 20, 1, None),
     ]
-    told = sentence("20 labelled frames and 1,200 drawn (kin)", of=results)
+    told = sentence("20 labelled frames and 1,200 synthetic (kin)", of=results)
     assert "IoU 0.500, as good as about 32 labelled frames alone" in told  # halfway from 20 to 50 along log frames
 
 
@@ -259,13 +262,13 @@ def as_many(value: float, curve=CURVE) -> float:
 
 
 def test_a_score_is_as_good_as_frames_between_those_tried() -> None:
-    assert equivalent(CURVE, 0.8) == "at least as good as 80 labelled frames alone"
-    assert equivalent(CURVE, 0.49) == "not as good as 10 labelled frames alone"
-    assert equivalent(CURVE, 0.5) == "as good as about 10 labelled frames alone"
-    assert equivalent(CURVE, 0.55) == "as good as about 14 labelled frames alone"  # 10 * sqrt(2)
-    assert equivalent(CURVE, 0.7) == "as good as about 40 labelled frames alone"
-    assert equivalent([(30, 0.7)], 0.71) == "at least as good as 30 labelled frames alone"
-    assert equivalent([(30, 0.7)], 0.69) == "not as good as 30 labelled frames alone"
+    assert equivalent(CURVE, 0.8) == "at least as good as 80"
+    assert equivalent(CURVE, 0.49) == "not as good as 10"
+    assert equivalent(CURVE, 0.5) == "as good as about 10"
+    assert equivalent(CURVE, 0.55) == "as good as about 14"  # 10 * sqrt(2)
+    assert equivalent(CURVE, 0.7) == "as good as about 40"
+    assert equivalent([(30, 0.7)], 0.71) == "at least as good as 30"
+    assert equivalent([(30, 0.7)], 0.69) == "not as good as 30"
 
 
 @given(

@@ -16,17 +16,17 @@ from neeco.errors import NeecoError
 from neeco.experiments.downstream.samples import (
     DataSet,
     Example,
-    drawn_samples,
     frame_size,
     has_labels,
     recorded_samples,
+    synthetic_samples,
 )
 
 SIZE = (48, 40)
 
 
 def loaded(root: Path, classes="instrument", edges="hard", count=None) -> list[Example]:
-    return [sample.load() for sample in drawn_samples(DataSet("set", root, count), classes, edges, SIZE)]
+    return [sample.load() for sample in synthetic_samples(DataSet("set", root, count), classes, edges, SIZE)]
 
 
 def refused(*words: str):
@@ -43,8 +43,8 @@ def test_one_class_is_every_part(drawn: Path) -> None:
     assert np.array_equal(example.instruments, example.classes)
     assert example.image.dtype == example.classes.dtype == np.uint8
     assert np.array_equal(example.image, picture_of(bar_parts(1), 1))
-    assert example.counted is None
-    assert example.share is None
+    assert example.valid is None
+    assert example.coverage is None
 
 
 def test_of_parts_both_jaws_are_one_class(drawn: Path) -> None:
@@ -86,21 +86,21 @@ def test_edges_are_read_where_they_are_asked_for(drawn: Path) -> None:
     parts = bar_parts(0)
     top = int(np.argwhere(parts)[0][0])
     soft, ignore = loaded(drawn, edges="soft")[0], loaded(drawn, edges="ignore")[0]
-    assert soft.counted is None
-    assert soft.share is not None
-    assert soft.share.dtype == np.float32
-    assert np.allclose(soft.share, (parts > 0) * 200 / 255)
-    assert ignore.share is None
-    assert ignore.counted is not None
-    assert not ignore.counted[top : top + 2].any()
-    assert ignore.counted.sum() == (40 - 2) * 48
+    assert soft.valid is None
+    assert soft.coverage is not None
+    assert soft.coverage.dtype == np.float32
+    assert np.allclose(soft.coverage, (parts > 0) * 200 / 255)
+    assert ignore.coverage is None
+    assert ignore.valid is not None
+    assert not ignore.valid[top : top + 2].any()
+    assert ignore.valid.sum() == (40 - 2) * 48
     assert np.array_equal(ignore.classes, loaded(drawn)[0].classes)
 
 
 def test_a_count_takes_the_first_images(drawn: Path) -> None:
-    samples = drawn_samples(DataSet("set", drawn, 4), "instrument", "hard", SIZE)
+    samples = synthetic_samples(DataSet("set", drawn, 4), "instrument", "hard", SIZE)
     assert [sample.name for sample in samples] == ["000000", "000001", "000002", "000003"]
-    assert len(drawn_samples(DataSet("set", drawn), "instrument", "hard", SIZE)) == 6
+    assert len(synthetic_samples(DataSet("set", drawn), "instrument", "hard", SIZE)) == 6
 
 
 def annotated(drawn: Path, splits: list[str]) -> Path:
@@ -114,7 +114,7 @@ def annotated(drawn: Path, splits: list[str]) -> Path:
 
 def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
     splits = ["test", "train", "train", "unseen", "train", "test"]
-    samples = drawn_samples(DataSet("set", annotated(drawn, splits)), "instrument", "hard", SIZE)
+    samples = synthetic_samples(DataSet("set", annotated(drawn, splits)), "instrument", "hard", SIZE)
     assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
 
 
@@ -152,10 +152,10 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     (tmp_path / "empty" / "images").mkdir(parents=True)
     with refused("--sets set", "has no image", "neeco synthesize"):
         loaded(tmp_path / "empty")
-    with refused("--sets set", "has 6 images, not 7; draw more"):
+    with refused("--sets set", "has 6 images, not 7; synthesize more"):
         loaded(drawn, count=7)
     with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
-        drawn_samples(DataSet("set", drawn), "instrument", "hard", (60, 50))
+        synthetic_samples(DataSet("set", drawn), "instrument", "hard", (60, 50))
     (drawn / "parts" / "000005.png").unlink()
     assert len(loaded(drawn, count=5)) == 5
     with refused("--sets set", "000005.png", "every image needs its labels"):
@@ -192,22 +192,22 @@ def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
     parts = bar_parts(0)
     parts[0, 0] = 9
     save_grey(drawn / "parts" / "000000.png", parts)
-    with refused("000000.png: id 9 means nothing", "dataset.json"):
-        drawn_samples(DataSet("set", drawn), "instrument", "hard", SIZE)  # known before the work
+    with refused("000000.png: id 9 has no class", "dataset.json"):
+        synthetic_samples(DataSet("set", drawn), "instrument", "hard", SIZE)  # known before the work
 
 
 def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:
     """It would go into downstream.json, which could not be written."""
     stated = json.loads((drawn / "dataset.json").read_text())
     (drawn / "dataset.json").write_text(json.dumps(stated | {"settings": {"count": float("nan")}}))
-    with refused("--sets set", "dataset.json: holds NaN or an infinite number; draw the set again"):
+    with refused("--sets set", "dataset.json: holds NaN or an infinite number; synthesize the set again"):
         loaded(drawn)
 
 
 def test_parts_are_refused_where_labels_tell_none(drawn: Path) -> None:
     write_ids(drawn, tuple((name, "instrument") for name in "abcd"))
     assert loaded(drawn)[0].instruments.max() == 4
-    with refused("--sets set", "tell no parts; use --classes instrument"):
+    with refused("--sets set", "have no parts; use --classes instrument"):
         loaded(drawn, "parts")
 
 
@@ -247,7 +247,7 @@ def test_recorded_frames_are_as_their_truth(capture: Path) -> None:
     example, truth = samples[2].load(), read_grey(capture / "truth" / "masks" / "002.png")
     assert set(np.unique(truth)) == {0, 1, 3}
     assert np.array_equal(example.classes, truth)  # jaw_left is 3 there, jaws here
-    assert example.counted is None
+    assert example.valid is None
     one = recorded_samples(read_capture(capture), "train", "instrument")[2].load()
     assert np.array_equal(one.classes, truth > 0)
     assert frame_size(samples) == SIZE
@@ -262,9 +262,9 @@ def test_ignored_pixels_of_a_frame_do_not_count(capture: Path) -> None:
     stated["frames"][0]["mask_path"] = "ignored/000.png"
     file.write_text(json.dumps(stated))
     first, second = (sample.load() for sample in recorded_samples(read_capture(capture), "train", "instrument")[:2])
-    assert first.counted is not None
-    assert np.array_equal(first.counted, mask > 0)
-    assert second.counted is None
+    assert first.valid is not None
+    assert np.array_equal(first.valid, mask > 0)
+    assert second.valid is None
 
 
 def test_frames_without_labels_are_left_out(capture: Path) -> None:
@@ -317,7 +317,7 @@ def test_labels_that_name_no_part_are_not_taken_for_tissue(capture: Path, tmp_pa
 def test_an_id_of_the_truth_that_means_nothing_is_not_taken_for_tissue(capture: Path) -> None:
     save_grey(capture / "truth" / "masks" / "002.png", np.full((40, 48), 7))
     samples = recorded_samples(read_capture(capture), "train", "instrument")
-    with refused("002.png: id 7 means nothing"):
+    with refused("002.png: id 7 has no class"):
         samples[2].load()
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from downstream_world import square
 
-from neeco.experiments.downstream.model import Boxes
 from neeco.experiments.downstream.samples import Example
 from neeco.experiments.downstream.scores import (
     BOX_SCORES,
     MASK_SCORES,
+    Detections,
     box_scores,
     mask_scores,
     mean_scores,
@@ -110,10 +110,10 @@ def test_near_reaches_as_far_as_told() -> None:
 # boxes
 
 
-def boxes_of(*boxes: tuple[float, ...], classes: tuple[int, ...] = ()) -> Boxes:
+def boxes_of(*boxes: tuple[float, ...], classes: tuple[int, ...] = ()) -> Detections:
     """Each x0, y0, x1, y1, score; best first."""
     table = np.array(sorted(boxes, key=lambda box: -box[4]), np.float64).reshape(-1, 5)
-    return Boxes(table[:, :4], np.array(classes or (1,) * len(table), np.int64), table[:, 4])
+    return Detections(table[:, :4], np.array(classes or (1,) * len(table), np.int64), table[:, 4])
 
 
 def boxed(*boxes: tuple[int, int, int, int], side: int = 64) -> Example:

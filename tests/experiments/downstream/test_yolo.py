@@ -14,9 +14,9 @@ import yaml
 from downstream_world import Held, square, squares, task_of
 
 from neeco.errors import NeecoError
-from neeco.experiments.downstream.feed import Feed
-from neeco.experiments.downstream.model import Boxes
 from neeco.experiments.downstream.models.yolo import NO_AUGMENTATION, Yolo
+from neeco.experiments.downstream.samples import BatchSampler
+from neeco.experiments.downstream.scores import Detections
 
 PROGRAM = f"""#!{sys.executable}
 import json, os, sys
@@ -76,7 +76,7 @@ def test_it_is_given_a_folder_in_its_own_format(install, tmp_path: Path) -> None
     example = square(0)
     task = task_of(
         tmp_path / "a job: #1",
-        feed=Feed([[Held(example)], squares(3, 1)], 0),
+        batches=BatchSampler([[Held(example)], squares(3, 1)], 0),
         steps=30,
         batch=4,
         seed=2,
@@ -108,8 +108,8 @@ def test_it_is_given_a_folder_in_its_own_format(install, tmp_path: Path) -> None
 @pytest.mark.parametrize("augmented", [False, True])
 def test_its_own_augmentation_is_on_only_where_asked_for(augmented: bool, install, tmp_path: Path) -> None:
     told = install()
-    feed = Feed([squares(2)], 0, (lambda example, rng: example) if augmented else None)
-    Yolo().fit(task_of(tmp_path / "job", feed=feed, validation=()))
+    feed = BatchSampler([squares(2)], 0, (lambda example, rng: example) if augmented else None)
+    Yolo().fit(task_of(tmp_path / "job", batches=feed, validation=()))
     settings = told_to(told)[0][1]
     for word in NO_AUGMENTATION:
         name, _, value = word.partition("=")
@@ -124,8 +124,8 @@ def test_its_answers_are_read_best_first_in_pixels(install, tmp_path: Path) -> N
     images = [np.zeros((40, 80, 3), np.uint8)] * 2
     for _ in range(2):  # asked twice it answers twice
         first, second = fitted.predict(images)
-        assert isinstance(first, Boxes)
-        assert isinstance(second, Boxes)
+        assert isinstance(first, Detections)
+        assert isinstance(second, Detections)
         assert first.scores.tolist() == [0.9, 0.3]
         assert first.boxes == pytest.approx(np.array([[16, 16, 24, 24], [20, 5, 60, 15]]))
         assert first.classes.tolist() == [1, 1]
@@ -144,7 +144,7 @@ def test_answers_in_another_format_are_refused(line: str, times: int, install, t
 
 def test_without_the_program_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    told = Yolo.unmet()
+    told = Yolo.missing_requirement()
     assert told is not None
     assert "`yolo`" in told
     assert "\n" not in told
@@ -154,9 +154,9 @@ def test_with_the_program_what_scores_its_boxes_must_be_there(install, monkeypat
     from neeco.experiments.downstream import model
 
     install()
-    assert Yolo.unmet() is None
+    assert Yolo.missing_requirement() is None
     monkeypatch.setattr(model.importlib.util, "find_spec", lambda name: None)
-    assert Yolo.unmet() == "needs pycocotools; pip install 'neeco[downstream]'"
+    assert Yolo.missing_requirement() == "needs pycocotools; pip install 'neeco[downstream]'"
 
 
 def test_a_failing_program_is_told_in_one_line_with_its_last_words(install, tmp_path: Path) -> None:

@@ -1,32 +1,29 @@
-"""Labelled images to learn from and to be tested on: recorded frames, and data sets of drawn images."""
+"""Labelled images to train on and to test on: recorded frames, and data sets of synthetic images; batches of both."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth
+from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
-from neeco.evaluation.truth import truth_file
 from neeco.files import read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
 CLASSES: Mapping[str, tuple[str, ...]] = {"instrument": ("instrument",), "parts": ("shaft", "wrist", "jaws")}
-JAWS = ("jaw_left", "jaw_right")  # one class: which of them is left is a name that images do not show
-INFO = "dataset.json"
-STATES = "states.jsonl"
-DRAWN_IN = "images"
-MASK = 255  # an id that means instrument and nothing more, as in black and white masks
+JAWS = ("jaw_left", "jaw_right")  # one class: an image does not show which jaw is called left
+DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
 
 
 @dataclass(frozen=True)
@@ -34,10 +31,10 @@ class Example:
     """One image with its labels, in pixels."""
 
     image: np.ndarray  # uint8 [H, W, 3]
-    classes: np.ndarray  # uint8 [H, W], 0 tissue, else number of the class, from 1
-    instruments: np.ndarray  # uint8 [H, W], 0 tissue, else number of the instrument, from 1
-    counted: np.ndarray | None = None  # bool [H, W], False where nothing may be learned or judged; None: all count
-    share: np.ndarray | None = None  # float32 [H, W], how much of a pixel is instrument; None: all or nothing
+    classes: np.ndarray  # uint8 [H, W], 0 tissue, else the class, from 1
+    instruments: np.ndarray  # uint8 [H, W], 0 tissue, else the instrument, from 1
+    valid: np.ndarray | None = None  # bool [H, W], False where pixels are neither learned nor scored; None: all valid
+    coverage: np.ndarray | None = None  # float32 [H, W], instrument's share of each pixel; None: all or nothing
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """[n, 4] (x0, y0, x1, y1; px, x1 and y1 exclusive) about each class of each instrument, and the classes [n]."""
@@ -49,66 +46,59 @@ class Example:
             classes.append(code % 256)
         return np.array(boxes, np.float64).reshape(-1, 4), np.array(classes, np.int64)
 
-
-class Sample(Protocol):
-    """Where one example lies."""
-
-    @property
-    def name(self) -> str:
-        """What the image is called."""
-        ...
-
-    def load(self) -> Example:
-        """Read it. Raises NeecoError."""
-        ...
+    def relative_boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """`boxes` as [n, 4] centre x, y, width, height, shares of the image's sides; and the classes [n]."""
+        boxes, classes = self.boxes()
+        height, width = self.classes.shape
+        centres, sizes = (boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]
+        return np.concatenate([centres, sizes], 1) / np.array([width, height, width, height], np.float64), classes
 
 
-@dataclass(frozen=True)
-class Meaning:
-    """What the ids of label images mean: the number of the class and of the instrument, uint8 [256] each."""
+class LabelMap:
+    """Class and instrument of every id in label images, uint8 [256] each, from {id: (instrument, from 1; part)}."""
 
-    classes: np.ndarray
-    instruments: np.ndarray
+    def __init__(self, parts: Mapping[int, tuple[int, str]], classes: ClassNames) -> None:
+        self.classes, self.instruments = np.zeros((2, 256), np.uint8)
+        for number, (instrument, part) in parts.items():
+            name = "instrument" if classes == "instrument" else "jaws" if part in JAWS else part
+            self.classes[number] = CLASSES[classes].index(name) + 1 if name in CLASSES[classes] else 0
+            self.instruments[number] = instrument
 
     def check(self, ids: np.ndarray, file: Path, remedy: str) -> None:
-        """Raises NeecoError where one of `ids` (uint8) belongs to no class: it would be taught as tissue."""
-        strange = (self.classes[ids] == 0) & (ids > 0)
-        if strange.any():
-            raise NeecoError(f"{file}: id {ids[strange].min()} means nothing; {remedy}")
+        """Raises NeecoError where one of `ids` (uint8) has no class: it would be learned as tissue."""
+        unknown = (self.classes[ids] == 0) & (ids > 0)
+        if unknown.any():
+            raise NeecoError(f"{file}: id {ids[unknown].min()} has no class; {remedy}")
 
 
 @dataclass(frozen=True)
 class RecordedSample:
-    """A recorded frame; its labels are the truth's, or somebody's."""
+    """A recorded frame; its labels are the capture's truth or a folder of masks."""
 
     frame: Frame
     masks: Masks
-    meaning: Meaning
+    label_map: LabelMap
 
     @property
     def name(self) -> str:
         return self.frame.name
 
     def load(self) -> Example:
-        """Raises NeecoError where the labels are of another size than the image, or have an id that means nothing."""
-        ids = self.masks.load(self.name)
-        self.meaning.check(ids, self.masks.files[self.name], "mend the mask, or leave its frame out")
+        """Raises NeecoError where the labels differ from the image in size, or have an id without a class."""
+        ids, file = self.masks.load(self.name), self.masks.files[self.name]
+        self.label_map.check(ids, file, "correct the mask, or leave its frame out")
         pixels = (self.frame.load_image().numpy() * 255).round().astype(np.uint8)
-        counted = self.frame.load_mask()
+        valid = self.frame.load_mask()
         if ids.shape != pixels.shape[:2]:
             raise NeecoError(
-                f"{self.masks.files[self.name]}: is {ids.shape[1]}x{ids.shape[0]}, its frame is "
-                f"{pixels.shape[1]}x{pixels.shape[0]}; label the frames as recorded"
+                f"{file}: is {ids.shape[1]}x{ids.shape[0]}, its frame is {pixels.shape[1]}x{pixels.shape[0]}; "
+                "label the frames as recorded"
             )
-        return Example(
-            pixels,
-            self.meaning.classes[ids],
-            self.meaning.instruments[ids],
-            None if counted is None else counted.numpy(),
-        )
+        labels = self.label_map.classes[ids], self.label_map.instruments[ids]
+        return Example(pixels, *labels, None if valid is None else valid.numpy())
 
     def part_pixels(self, parts: Collection[str]) -> np.ndarray | None:
-        """bool [H, W]: the pixels of these parts; None where the labels tell no parts. Raises NeecoError."""
+        """bool [H, W]: the pixels of these parts; None where the labels have no parts. Raises NeecoError."""
         names = self.masks.names
         if names is None:
             return None
@@ -116,12 +106,12 @@ class RecordedSample:
 
 
 @dataclass(frozen=True)
-class DrawnSample:
-    """An image of a data set. `soft`, `ignore`: read where they are to be used."""
+class SyntheticSample:
+    """An image of a data set. `soft`, `ignore`: files of its edges, where they are used."""
 
     image: Path
     labels: Path
-    meaning: Meaning
+    label_map: LabelMap
     soft: Path | None = None
     ignore: Path | None = None
 
@@ -130,19 +120,22 @@ class DrawnSample:
         return self.image.stem
 
     def load(self) -> Example:
-        """Raises NeecoError where a file is of another size, or has an id that means nothing."""
+        """Raises NeecoError where a file is of another size, or has an id without a class."""
         size = image_size(self.image)
         ids = read_labels(self.labels, size).numpy()
-        self.meaning.check(ids, self.labels, f"name it in {INFO}, or draw the set again")
+        self.label_map.check(ids, self.labels, f"name it in {DATASET_FILE}, or synthesize the set again")
         pixels = (read_image(self.image).numpy() * 255).round().astype(np.uint8)
-        counted = None if self.ignore is None else _grey(self.ignore, size) < 128
-        share = None if self.soft is None else _grey(self.soft, size).astype(np.float32) / 255
-        return Example(pixels, self.meaning.classes[ids], self.meaning.instruments[ids], counted, share)
+        valid = None if self.ignore is None else _read_grey(self.ignore, size) < 128
+        coverage = None if self.soft is None else _read_grey(self.soft, size).astype(np.float32) / 255
+        return Example(pixels, self.label_map.classes[ids], self.label_map.instruments[ids], valid, coverage)
+
+
+Sample = RecordedSample | SyntheticSample
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A folder of drawn images to learn from. `count`: use so many of them, None for all."""
+    """A folder of synthetic images to train on. `count`: use so many of them, None for all."""
 
     name: str
     path: Path
@@ -153,25 +146,26 @@ class DataSet:
         return require_inside(self.path.joinpath(*names), self.path)
 
     def info(self) -> Any:
-        """What its dataset.json says, fit to be written into another file; None where there is none. Raises
-        NeecoError."""
-        file = self.file(INFO)
+        """What its dataset.json says, fit for another JSON file; None where there is none. Raises NeecoError."""
+        file = self.file(DATASET_FILE)
         if not file.is_file():
             return None
-        stated = read_json(file)
+        info = read_json(file)
         try:
-            json.dumps(stated, allow_nan=False)
+            json.dumps(info, allow_nan=False)
         except (ValueError, RecursionError):
-            raise NeecoError(
-                f"--sets {self.name}: {file}: holds NaN or an infinite number; draw the set again"
-            ) from None
-        return stated
+            raise self.error(f"{file}: holds NaN or an infinite number; synthesize the set again") from None
+        return info
 
     def described(self) -> dict[str, Any]:
-        """What tells it from others, for a file; `sha256` of its description changes when it is drawn anew."""
-        file = self.file(INFO)
+        """What tells it from others; `sha256` of its dataset.json changes when it is synthesized anew."""
+        file = self.file(DATASET_FILE)
         digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
         return {"name": self.name, "path": str(self.path.absolute()), "count": self.count, "sha256": digest}
+
+    def error(self, problem: str) -> NeecoError:
+        """The error that names this set."""
+        return NeecoError(f"--sets {self.name}: {problem}")
 
 
 def recorded_samples(
@@ -179,132 +173,30 @@ def recorded_samples(
 ) -> tuple[RecordedSample, ...]:
     """The labelled frames of a split: by the capture's truth, or by a folder of masks named as the frames.
 
-    Frames without a label are left out. Raises NeecoError where there is none at all, or parts are asked for and the
-    labels tell none.
+    Frames without a label are left out. Raises NeecoError where there is none at all, or where parts are asked for and
+    the labels have none.
     """
     masks = None if labels is None else open_masks(labels, option=f"{labels / PARTS_FILE}:")
     if masks is None and any(truth_file(capture.root, frame.name) for frame in capture.split(split)):
-        masks = _truth(capture, split)
+        masks = open_truth(capture, splits=[split])
     frames = [] if masks is None else [frame for frame in capture.split(split) if frame.name in masks.files]
     if masks is None or not frames:
         where = f"{capture.root}: split {split}" if labels is None else f"--labels {labels}"
         raise NeecoError(f"{where}: no frame has a label; give --labels FOLDER with masks named as the frames")
     if classes == "parts" and not set((masks.names or {}).values()) & set(TRUTH_PARTS):
-        raise NeecoError(f"--classes parts: the labels in {masks.path} tell no parts; use --classes instrument")
-    # where some frames' truth has parts and others' has none, every id is a piece of the instrument
-    named = dict.fromkeys(range(1, 256), "instrument") if masks.names is None else masks.names
-    meaning = _meaning({number: (1, part) for number, part in named.items()}, classes)
-    return tuple(RecordedSample(frame, masks, meaning) for frame in frames)
+        raise NeecoError(f"--classes parts: the labels in {masks.path} have no parts; use --classes instrument")
+    # where only some frames' truth has parts, every id is a piece of the instrument
+    names = dict.fromkeys(range(1, 256), "instrument") if masks.names is None else masks.names
+    label_map = LabelMap({number: (1, part) for number, part in names.items()}, classes)
+    return tuple(RecordedSample(frame, masks, label_map) for frame in frames)
 
 
 def has_labels(capture: Capture, split: str) -> bool:
     """Whether any frame of the split has a true mask."""
     try:
-        return bool(_truth(capture, split).files)
+        return bool(open_truth(capture, splits=[split]).files)
     except NeecoError:
         return False
-
-
-def drawn_samples(data: DataSet, classes: ClassNames, edges: Edges, size: tuple[int, int]) -> tuple[DrawnSample, ...]:
-    """The images of a data set in their order, each with its labels; the first `count` of them.
-
-    A set that `neeco synthesize` wrote says what its ids mean; of another's, masks/ tell instrument from tissue. Of one
-    that `neeco annotate` wrote only the frames of split train are learned from: models are tested on the others. size:
-    (width, height) that they must have. Raises NeecoError.
-    """
-    folder = data.file(DRAWN_IN)
-    if not folder.is_dir():
-        raise NeecoError(f"--sets {data.name}: {data.path}: no folder {DRAWN_IN}/; give what `neeco synthesize` wrote")
-    images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
-    if not images:
-        raise NeecoError(f"--sets {data.name}: {folder}: has no image; give what `neeco synthesize` wrote")
-    images = _not_tested_on(data, images)
-    if data.count is not None and data.count > len(images):
-        raise NeecoError(f"--sets {data.name}: {data.path}: has {len(images)} images, not {data.count}; draw more")
-    labels, meaning = _labels_of(data, classes)
-    samples = [DrawnSample(image, data.file(labels, f"{image.stem}.png"), meaning) for image in images[: data.count]]
-    for sample in samples:
-        require_inside(sample.image, data.path)
-        if not sample.labels.is_file():
-            raise NeecoError(f"--sets {data.name}: {sample.labels}: no such file; every image needs its labels")
-        found = image_size(sample.image)
-        if found != size:
-            raise NeecoError(
-                f"--sets {data.name}: {sample.image} is {found[0]}x{found[1]}, the capture's frames are "
-                f"{size[0]}x{size[1]}; draw it from a run of this capture"
-            )
-    samples[0].load()  # whether its ids mean anything is known before the work
-    return tuple(_with_edges(sample, data, edges) for sample in samples)
-
-
-def _not_tested_on(data: DataSet, images: list[Path]) -> list[Path]:
-    """The images that are drawn, or recorded frames of split train."""
-    stated, states = data.info(), data.file(STATES)
-    settings = stated.get("settings") if isinstance(stated, dict) else None
-    if not isinstance(settings, dict) or "annotates" not in settings:
-        return images
-    text = read_text(states, "what `neeco annotate` says of every frame")
-    try:
-        lines = [json.loads(line) for line in text.splitlines()]
-        splits = {Path(line["image"]).name: line["recorded_split"] for line in lines}
-        kept = [image for image in images if splits[image.name] == "train"]
-    except (ValueError, TypeError, LookupError, RecursionError):
-        raise NeecoError(f"--sets {data.name}: {states}: not as `neeco annotate` writes it") from None
-    if not kept:
-        raise NeecoError(f"--sets {data.name}: {data.path}: none of its frames is of split train; annotate more")
-    return kept
-
-
-def _with_edges(sample: DrawnSample, data: DataSet, edges: Edges) -> DrawnSample:
-    """The sample with the file that says how its edges are to be learned."""
-    if edges == "hard":
-        return sample
-    file = data.file(edges, f"{sample.name}.png")
-    if not file.is_file():
-        raise NeecoError(f"--sets {data.name}: {file}: no such file; draw the set again, or use {data.name}+hard")
-    return replace(sample, soft=file) if edges == "soft" else replace(sample, ignore=file)
-
-
-def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, Meaning]:
-    """In which folder of a data set its labels are, and what they mean."""
-    file, stated = data.file(INFO), data.info()
-    if stated is None:
-        if classes == "parts":
-            raise NeecoError(
-                f"--sets {data.name}: {file}: no such file, so no parts are known; use --classes instrument"
-            )
-        return "masks", _meaning({number: (1, "instrument") for number in (1, MASK)}, classes)
-    try:
-        entries = [(int(entry["id"]), str(entry["instrument"]), str(entry["part"])) for entry in stated["ids"][1:]]
-        if not all(0 < number < 256 for number, _, _ in entries):
-            raise ValueError
-    except (KeyError, TypeError, ValueError, IndexError):
-        raise NeecoError(f"--sets {data.name}: {file}: ids: not as `neeco synthesize` writes them") from None
-    instruments = list(dict.fromkeys(instrument for _, instrument, _ in entries))
-    parts = {number: (instruments.index(instrument) + 1, part) for number, instrument, part in entries}
-    if classes == "parts" and not {part for _, part in parts.values()} & set(TRUTH_PARTS):
-        raise NeecoError(f"--sets {data.name}: {data.path}: its labels tell no parts; use --classes instrument")
-    return "parts", _meaning(parts, classes)
-
-
-def _meaning(parts: Mapping[int, tuple[int, str]], classes: ClassNames) -> Meaning:
-    """From (number of the instrument, part) by id."""
-    class_of, instrument_of = np.zeros(256, np.uint8), np.zeros(256, np.uint8)
-    for number, (instrument, part) in parts.items():
-        name = "instrument" if classes == "instrument" else "jaws" if part in JAWS else part
-        names = CLASSES[classes]
-        class_of[number] = names.index(name) + 1 if name in names else 0
-        instrument_of[number] = instrument
-    return Meaning(class_of, instrument_of)
-
-
-def _truth(capture: Capture, split: str) -> Masks:
-    return open_truth(capture, splits=[split])
-
-
-def _grey(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """uint8 [H, W] of an 8-bit grey image."""
-    return np.asarray(open_image(file, size).convert("L"))
 
 
 def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
@@ -313,3 +205,192 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
     if len(sizes) > 1:
         raise NeecoError(f"{samples[0].frame.image_path.parent}: frames of several sizes; make captures of one size")
     return next(iter(sizes))
+
+
+def synthetic_samples(
+    data: DataSet, classes: ClassNames, edges: Edges, size: tuple[int, int]
+) -> tuple[SyntheticSample, ...]:
+    """The images of a data set in their order, each with its labels; the first `count` of them.
+
+    The dataset.json of `neeco synthesize` says what ids mean; without it, masks/ tell instrument from tissue. Of a set
+    that `neeco annotate` wrote only the frames of split train are used: models are tested on the others. size: (width,
+    height) that all must have. Raises NeecoError.
+    """
+    folder = data.file(IMAGE_FOLDER)
+    if not folder.is_dir():
+        raise data.error(f"{data.path}: no folder {IMAGE_FOLDER}/; give what `neeco synthesize` wrote")
+    images = [file for file in sorted(folder.iterdir()) if file.suffix in EXTENSIONS and not file.name.startswith(".")]
+    if not images:
+        raise data.error(f"{folder}: has no image; give what `neeco synthesize` wrote")
+    images = _training_images(data, images)
+    if data.count is not None and data.count > len(images):
+        raise data.error(f"{data.path}: has {len(images)} images, not {data.count}; synthesize more")
+    labels, label_map = _labels_of(data, classes)
+    samples = []
+    for image in images[: data.count]:
+        require_inside(image, data.path)
+        file = data.file(labels, f"{image.stem}.png")
+        edge_files = {} if edges == "hard" else {edges: data.file(edges, f"{image.stem}.png")}
+        if not file.is_file():
+            raise data.error(f"{file}: no such file; every image needs its labels")
+        found = image_size(image)
+        if found != size:
+            raise data.error(
+                f"{image} is {found[0]}x{found[1]}, the capture's frames are {size[0]}x{size[1]}; synthesize it from "
+                "a run of this capture"
+            )
+        for missing in (path for path in edge_files.values() if not path.is_file()):
+            raise data.error(f"{missing}: no such file; synthesize the set again, or use {data.name}+hard")
+        samples.append(SyntheticSample(image, file, label_map, **edge_files))
+    samples[0].load()  # raises before the work where its ids have no class
+    return tuple(samples)
+
+
+def _training_images(data: DataSet, images: list[Path]) -> list[Path]:
+    """The images that are synthetic, or recorded frames of split train."""
+    info, states = data.info(), data.file(STATES_FILE)
+    settings = info.get("settings") if isinstance(info, dict) else None
+    if not isinstance(settings, dict) or "annotates" not in settings:
+        return images
+    text = read_text(states, "what `neeco annotate` says of every frame")
+    try:
+        lines = [json.loads(line) for line in text.splitlines()]
+        splits = {Path(line["image"]).name: line["recorded_split"] for line in lines}
+        chosen = [image for image in images if splits[image.name] == "train"]
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise data.error(f"{states}: not as `neeco annotate` writes it") from None
+    if not chosen:
+        raise data.error(f"{data.path}: none of its frames is of split train; annotate more")
+    return chosen
+
+
+def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, LabelMap]:
+    """The folder of a data set that holds its labels, and what they mean."""
+    file, info = data.file(DATASET_FILE), data.info()
+    if info is None:
+        if classes == "parts":
+            raise data.error(f"{file}: no such file, so no parts are known; use --classes instrument")
+        return "masks", LabelMap(dict.fromkeys((1, 255), (1, "instrument")), classes)  # 255: black and white masks
+    try:
+        entries = [(int(entry["id"]), str(entry["instrument"]), str(entry["part"])) for entry in info["ids"][1:]]
+        if not all(0 < number < 256 for number, _, _ in entries):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise data.error(f"{file}: ids: not as `neeco synthesize` writes them") from None
+    instruments = list(dict.fromkeys(instrument for _, instrument, _ in entries))
+    if classes == "parts" and not {part for _, _, part in entries} & set(TRUTH_PARTS):
+        raise data.error(f"{data.path}: its labels have no parts; use --classes instrument")
+    parts = {number: (instruments.index(instrument) + 1, part) for number, instrument, part in entries}
+    return "parts", LabelMap(parts, classes)
+
+
+def _read_grey(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """uint8 [H, W] of an 8-bit grey image."""
+    return np.asarray(open_image(file, size).convert("L"))
+
+
+Augmentation = Callable[[Example, np.random.Generator], Example]
+
+
+class BatchSampler:
+    """Draws examples from sources without end. A source is shuffled anew when all of it has been seen.
+
+    sources: recorded frames, each data set. A batch takes as many from each, whatever their sizes: a few labelled
+    frames are not outnumbered by a thousand synthetic ones. mixed: how many examples are drawn so; those after them are
+    of the first source. The seed decides the order, whatever the batches and the augmentation. cache_bytes: of decoded
+    images that are kept; others are read again.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[Sequence[Sample]],
+        seed: int,
+        augment: Augmentation | None = None,
+        mixed: int | None = None,
+        cache_bytes: int = 1 << 30,
+    ) -> None:
+        self.sources = [source for source in sources if source]
+        self.mixed, self.augment, self.cache_bytes = mixed, augment, cache_bytes
+        self.rng, self.augment_rng = (np.random.default_rng(np.random.SeedSequence([seed, k])) for k in (1, 2))
+        self._orders = [self._shuffled(len(source)) for source in self.sources]
+        self._drawn = 0
+        self._cache: dict[tuple[int, int], Example] = {}
+        self._cached = 0
+
+    def batch(self, count: int) -> list[Example]:
+        """The next `count` examples, augmented where that was asked for."""
+        return [self._next() for _ in range(count)]
+
+    def _next(self) -> Example:
+        alone = self.mixed is not None and self._drawn >= self.mixed
+        source = 0 if alone else self._drawn % len(self.sources)
+        self._drawn += 1
+        example = self._load(source, next(self._orders[source]))
+        return example if self.augment is None else self.augment(example, self.augment_rng)
+
+    def _shuffled(self, count: int) -> Iterator[int]:
+        while True:
+            yield from self.rng.permutation(count).tolist()
+
+    def _load(self, source: int, index: int) -> Example:
+        key = source, index
+        if key not in self._cache:
+            example = self.sources[source][index].load()
+            size = sum(array.nbytes for array in vars(example).values() if array is not None)
+            if self._cached + size > self.cache_bytes:
+                return example
+            self._cache[key] = example
+            self._cached += size
+        return self._cache[key]
+
+
+def augment(example: Example, rng: np.random.Generator) -> Example:
+    """The example flipped, turned, scaled, shifted, and its colours, sharpness and noise changed at random (MONAI).
+
+    This is the classical augmentation of the condition `augment`. Labels move with the image; pixels from outside the
+    image are black and not valid.
+    """
+    shape = example.classes.shape
+    valid = np.ones(shape) if example.valid is None else example.valid
+    coverage = np.zeros(shape) if example.coverage is None else example.coverage
+    labels = np.stack([example.classes, example.instruments, valid, coverage]).astype(np.float32)  # [4, H, W]
+    transform = _augmentation(shape)
+    transform.set_random_state(int(rng.integers(2**31)))
+    image = np.moveaxis(example.image, 2, 0).astype(np.float32) / 255
+    made = {name: np.asarray(value) for name, value in transform({"image": image, "labels": labels}).items()}
+    gain = 1 + 0.1 * rng.uniform(-1, 1, (3, 1, 1))  # of each colour channel
+    pixels = np.moveaxis((made["image"] * gain).clip(0, 1) * 255, 0, 2).round().astype(np.uint8)
+    classes, instruments, valid, coverage = made["labels"]
+    return Example(
+        np.ascontiguousarray(pixels),
+        classes.round().astype(np.uint8),
+        instruments.round().astype(np.uint8),
+        valid > 0.5,
+        None if example.coverage is None else coverage,
+    )
+
+
+@cache
+def _augmentation(shape: tuple[int, int]) -> Any:
+    """The MONAI transform of images of this (height, width)."""
+    from monai import transforms
+
+    names = ["image", "labels"]
+    return transforms.Compose(
+        [
+            transforms.RandFlipd(names, prob=0.5, spatial_axis=1),
+            transforms.RandAffined(
+                names,
+                prob=1.0,
+                rotate_range=0.35,  # rad
+                scale_range=(0.2, 0.2),
+                translate_range=[0.1 * side for side in shape],  # px
+                mode=["bilinear", "nearest"],
+                padding_mode="zeros",
+            ),
+            transforms.RandScaleIntensityd(["image"], factors=0.25, prob=1.0),
+            transforms.RandAdjustContrastd(["image"], prob=0.3, gamma=(0.7, 1.4)),
+            transforms.RandGaussianSmoothd(["image"], sigma_x=(0.25, 1.5), sigma_y=(0.25, 1.5), prob=0.3),  # px
+            transforms.RandGaussianNoised(["image"], prob=0.3, std=0.04),
+        ]
+    )

@@ -12,8 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from neeco.errors import NeecoError
 from neeco.raster.triton.binning import Lists, Tiles, list_per_tile
-from neeco.raster.triton.composite import Images, composite
-from neeco.raster.triton.composite_backward import composite_backward
+from neeco.raster.triton.composite import Images, composite, composite_backward
 from neeco.raster.triton.project import Inputs, Projected, project
 from neeco.raster.triton.project_backward import project_backward
 from neeco.raster.types import Camera, Gaussians, Rendering, differentiable
@@ -51,8 +50,8 @@ def rasterize_triton(
     wanted = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     offsets = torch.zeros(len(gaussians), 2, device=device, requires_grad=wanted)
     with _working_on(device):
-        color, alpha, depth, drawn, radii = _Rasterize.apply(offsets, camera, wanted, *tensors)
-    return Rendering(color, alpha, depth, drawn, radii, offsets)
+        color, alpha, depth, composited, radii = _Rasterize.apply(offsets, camera, wanted, *tensors)
+    return Rendering(color, alpha, depth, composited, radii, offsets)
 
 
 def _working_on(device: torch.device) -> AbstractContextManager[Any]:
@@ -103,5 +102,5 @@ class _Rasterize(torch.autograd.Function):
             to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))
         grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.left]
         grads += [to.vignette, to.pose]
-        kept = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
-        return to.centers, None, None, *kept, to_background, None
+        gradients = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
+        return to.centers, None, None, *gradients, to_background, None

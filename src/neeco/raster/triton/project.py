@@ -17,8 +17,8 @@ from neeco.raster.triton.geometry import (
     projected,
     quadruple,
     rotation_matrix,
+    sh_color,
 )
-from neeco.raster.triton.harmonics import sh_color
 from neeco.raster.types import Camera
 
 BLOCK = 128  # Gaussians per program

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from neeco.raster.triton.composite_backward import HEAD
+from neeco.raster.triton.composite import HEAD
 from neeco.raster.triton.geometry import (
     LOG2_E,
     covariance,
@@ -16,10 +16,10 @@ from neeco.raster.triton.geometry import (
     projected,
     quadruple,
     quadruple_at,
+    sh_gradient,
     triple_at,
     view_rotation,
 )
-from neeco.raster.triton.harmonics import sh_gradient
 from neeco.raster.triton.project import RECORD, Inputs, Projected, turned
 from neeco.raster.types import Camera
 

@@ -55,9 +55,9 @@ def require_triton(device: torch.device) -> None:
     try:
         launch(device)
     except Exception as error:  # whatever driver, compiler or assembler say
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+        message = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise NeecoError(
-            f"backend: triton: cannot start a kernel on {device}: {said}; check `nvidia-smi` and that a C compiler "
+            f"backend: triton: cannot start a kernel on {device}: {message}; check `nvidia-smi` and that a C compiler "
             "and Python's headers are installed, or use --device cpu"
         ) from error
 
@@ -72,7 +72,7 @@ def starts_on(device: torch.device) -> bool:
     return True
 
 
-def goes_triton(tensor: Tensor) -> bool:
+def runs_triton(tensor: Tensor) -> bool:
     """Whether Triton's kernels work on `tensor`: float32 on a CUDA device on which they can be started."""
     return tensor.is_cuda and tensor.dtype == torch.float32 and starts_on(tensor.device)
 

@@ -18,7 +18,7 @@ Where it departs from its source:
 - 16 channels, the smaller of the source's settings, for speed on a processor.
 - With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
   xt yt zt at that time, one normal number per plane and channel.
-- The number of Gaussians has a ceiling (`tissue_budget`).
+- The number of Gaussians has a ceiling (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
@@ -32,34 +32,45 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.on_device import quick_products
+from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import LabelledByMotion
-from neeco.scene.deformations._times import RecordedTimes
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation, Posed, check_warm_up, log_linear, point_box
+from neeco.scene.deformations.base import (
+    UNPERTURBED,
+    LabelledByMotion,
+    Perturbation,
+    Posed,
+    RecordedTimes,
+    check_warm_up,
+    log_linear,
+    robust_bounds,
+)
 from neeco.scene.method import PLAIN_TRAINING
 
 MARGIN = 1.2  # the cube's side, in those of the points' longest
-SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_L1 = 1e-4, 1e-2, 1e-4  # weights of the regularisation
 
 
 @dataclass(frozen=True)
 class HexPlaneSettings:
-    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
-    resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests;
-    `rate_scale` multiplies the learning rates."""
+    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `time_resolution`;
+    `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the
+    learning rates; `space_smoothness`, `time_smoothness`, `time_l1`: weights of the regularisation."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"moments": "time_resolution"}
 
     channels: int = 16
     resolution: int = 64
     levels: int = 2
-    moments: int = 25
+    time_resolution: int = 25
     width: int = 64
     warm_up: float = 3 / 17
     rate_scale: float = 5.0
+    space_smoothness: float = 1e-4
+    time_smoothness: float = 1e-2
+    time_l1: float = 1e-4
 
     def __post_init__(self) -> None:
-        for name, least in (("resolution", 3), ("moments", 3), ("levels", 1)):
+        for name, least in (("resolution", 3), ("time_resolution", 3), ("levels", 1)):
             if getattr(self, name) < least:
                 raise NeecoError(f"deformation.{name}: {getattr(self, name)} is too small; give at least {least}")
         check_warm_up(self.warm_up)
@@ -80,7 +91,7 @@ class HexPlane(LabelledByMotion):
     def __init__(self, instruments: tuple[Instrument, ...], settings: HexPlaneSettings | None = None) -> None:
         super().__init__(instruments, settings)
         sizes: HexPlaneSettings = self.settings
-        channels, moments, width = sizes.channels, sizes.moments, sizes.width
+        channels, moments, width = sizes.channels, sizes.time_resolution, sizes.width
         self.warm_up = sizes.warm_up
         self.times = RecordedTimes()
         self.register_buffer("center", torch.zeros(3))
@@ -95,15 +106,15 @@ class HexPlane(LabelledByMotion):
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Time from 0 to 1 over the recording; the cube about the points [P, 3]."""
         self.times.fit(states)
-        self.center, self.half_extent = point_box(means)
+        self.center, self.half_extent = robust_bounds(means)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        if self.resting:
+        if self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         places = (canonical.means - self.center) / (MARGIN * self.half_extent)
         rows = self.rows_at(self.times.share(state), perturbation.state_noise)
         features = self.features(places, rows)
-        with quick_products(places.device):
+        with tf32_products(places.device):
             hidden = self.trunk(features)
             d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()
@@ -135,11 +146,17 @@ class HexPlane(LabelledByMotion):
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor:
         """Second differences squared, of the planes of space and along time, and the distance of time's from 1."""
+        weights: HexPlaneSettings = self.settings
         total = canonical.means.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
             smooth, steady = _curvature(space), _curvature(time)
             near_one = 3 * (1 - time).abs().mean()
-            total = total + SPACE_SMOOTHNESS * smooth + TIME_SMOOTHNESS * steady + TIME_L1 * near_one
+            total = (
+                total
+                + weights.space_smoothness * smooth
+                + weights.time_smoothness * steady
+                + weights.time_l1 * near_one
+            )
         return total
 
     def learning_rates(self, progress: float) -> dict[str, float]:

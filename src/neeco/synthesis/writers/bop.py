@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.poses import swap_camera_axes
+from neeco.capture.model import swap_camera_axes
 from neeco.files import write_json
 from neeco.labels.annotation import bounding_box
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
@@ -80,7 +80,8 @@ def _masks(
         visible = np.isin(parts, ids[k])
         whole = visible | (bits >> place & 1 > 0)
         for kind, mask in (("mask", whole), ("mask_visib", visible)):
-            write_labels(folder / kind / f"{name}_{place:06d}.png", _binary(mask))
+            pixels = torch.from_numpy(mask.astype(np.uint8) * 255)
+            write_labels(folder / kind / f"{name}_{place:06d}.png", pixels)
         infos.append(
             {
                 "bbox_obj": list(bounding_box(whole)) if whole.any() else NOWHERE,
@@ -92,7 +93,3 @@ def _masks(
             }
         )
     return infos
-
-
-def _binary(mask: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(mask.astype(np.uint8) * 255)

@@ -1,0 +1,300 @@
+"""Find everything that is wrong with a capture, at once, and what it holds in a few numbers.
+
+Here are checks of splits, times, image and mask files and instrument states; `check_geometry` has those of placement.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neeco.capture.check_geometry import check_geometry
+from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
+from neeco.capture.model import STILL, Capture, Frame, Instrument
+from neeco.capture.reader import capture_of, parse_capture
+from neeco.capture.statefile import passes_limits
+from neeco.errors import NeecoError
+
+FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
+FEW_TRAIN_FRAMES = 20  # below, expect little
+FULL_TURN = 2 * math.pi
+
+
+@dataclass(frozen=True)
+class CaptureSummary:
+    """Counts and ranges of what could be read."""
+
+    splits: dict[str, int]  # name -> frames
+    points: int  # measured points
+    registered: bool
+    joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
+    travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A capture that was read once and checked."""
+
+    problems: list[Problem]  # errors and warnings, in the order found
+    summary: CaptureSummary
+    capture: Capture | None  # None: it could not be read
+
+
+def check_capture(path: Path | str, transforms: str = "transforms.json") -> list[Problem]:
+    """Everything that is wrong with a capture, errors and warnings, in the order found. Bad data never raises.
+
+    Training refuses a capture with errors; a warning names what may be meant but often is not.
+    """
+    return inspect_capture(path, transforms).problems
+
+
+def read_checked(path: Path | str, transforms: str = "transforms.json") -> Capture:
+    """A capture that can be trained on. Raises NeecoError with the first error that `check_capture` finds."""
+    checked = inspect_capture(path, transforms)
+    ProblemReport(checked.problems).raise_first(path)
+    assert checked.capture is not None  # else there would be an error
+    return checked.capture
+
+
+def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> Checked:
+    """What is wrong with a capture, what it holds, and the capture itself."""
+    report = ProblemReport()
+    parsed = parse_capture(path, report, transforms)
+    if not parsed.frames and not errors_only(report.problems):
+        report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
+    capture = None if errors_only(report.problems) else capture_of(parsed)
+    if parsed.frames:
+        _check_splits(parsed)
+        _check_times(parsed)
+        _check_repeated_files(parsed)
+        _check_images(parsed)
+        _check_states(parsed)
+        check_geometry(parsed)
+    return Checked(report.problems, _summary(parsed), capture)
+
+
+def _summary(parsed: Parsed) -> CaptureSummary:
+    """Count frames and points, and find the range of each joint and each instrument's travel."""
+    joints: dict[str, tuple[float, float]] = {}
+    travel: dict[str, float] = {}
+    for instrument in parsed.instruments:
+        states = [state for _, state in parsed.states_of(instrument.name)]
+        if not states:
+            continue
+        origins = np.stack([state.pose[:3, 3].numpy() for state in states])
+        travel[instrument.name] = round(float(np.linalg.norm(np.ptp(origins, axis=0))), 3)
+        for joint in instrument.joints:
+            values = [state.joints[joint] for state in states if joint in state.joints]
+            if values:
+                joints[f"{instrument.name}.{key_name(joint)}"] = (min(values), max(values))
+    points = parsed.points
+    return CaptureSummary(
+        splits=dict(Counter(frame.split for frame in parsed.frames)),
+        points=len(points.positions) if points is not None and points.measured else 0,
+        registered=parsed.registered,
+        joints=joints,
+        travel_mm=travel,
+    )
+
+
+def _check_splits(parsed: Parsed) -> None:
+    frames = parsed.header("frames")
+    counts = Counter(frame.split for frame in parsed.frames)
+    if not counts["train"]:
+        found = ", ".join(f"{printable(name)} ({count})" for name, count in counts.items())
+        frames.error(f"split 'train' is empty; found {found}", "give most frames the split 'train'")
+    elif counts["train"] < FEWEST_TRAIN_FRAMES:
+        message = f"too few frames: {counts['train']} to train on, at least {FEWEST_TRAIN_FRAMES} are needed"
+        frames.error(message, "record more")
+    elif counts["train"] < FEW_TRAIN_FRAMES:
+        message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
+        frames.warning(message, "record more if you can")
+    if not counts["test"]:
+        frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
+
+
+def _check_times(parsed: Parsed) -> None:
+    if not parsed.timed:
+        message = "not every frame has a time; the order stands in"
+        parsed.header("frames").warning(message, "add `time` in seconds")
+        return
+    latest: dict[str, float] = {}
+    back = []
+    for frame, place in zip(parsed.frames, parsed.places, strict=True):
+        if frame.state.time < latest.get(place.file, frame.state.time):
+            back.append(place)
+        latest[place.file] = frame.state.time
+    if back:
+        more = f" (and {len(back) - 1} more times)" if len(back) > 1 else ""
+        remedy = "right if the capture joins recordings or cameras; else sort the frames"
+        back[0].child("time").warning(f"time goes backwards here{more}", remedy)
+
+
+def _check_repeated_files(parsed: Parsed) -> None:
+    first: dict[Path, Node] = {}
+    for frame, place in zip(parsed.frames, parsed.places, strict=True):
+        earlier = first.setdefault(frame.image_path, place)
+        if earlier is not place:
+            message = f"is the same image as {earlier.field}: {printable(frame.image_path.name)}"
+            place.child("file_path").error(message, "list every image once")
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """What decoding one frame's files found."""
+
+    digest: bytes | None  # of the pixels; None when not readable
+    uniform: bool  # one colour
+    image_error: str
+    mask_error: str
+
+
+def _check_images(parsed: Parsed) -> None:
+    """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        decoded = list(pool.map(_decode, parsed.frames))
+    # the reader may have reported an image whose size it wanted to know
+    reported = [place.child("file_path").reported for place in parsed.places]
+    first: dict[bytes, int] = {}
+    for index, (found, place) in enumerate(zip(decoded, parsed.places, strict=True)):
+        if found.image_error and not reported[index]:
+            place.child("file_path").error(*found.image_error.split("; ", 1))
+        if found.mask_error:
+            place.child("mask_path").error(*found.mask_error.split("; ", 1))
+        if found.uniform:
+            place.child("file_path").warning("every pixel of the image has one colour", "was the camera covered?")
+        elif found.digest is not None and first.setdefault(found.digest, index) != index:
+            _report_duplicate(parsed, first[found.digest], index)
+    without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
+    if without and len(without) < len(parsed.frames):
+        message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
+        without[0].child("mask_path").warning(message, "its whole image counts in the loss")
+
+
+def _decode(frame: Frame) -> _Decoded:
+    """Decode a frame's image and mask. Errors name the file within the message, without its folder."""
+    digest, uniform, image_error, mask_error = None, False, "", ""
+    try:
+        image = frame.load_image()
+        digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
+        uniform = bool((image == image[0, 0]).all())
+    except NeecoError as error:
+        image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
+    try:
+        mask = frame.load_mask()
+        if mask is not None and not torch.any(mask):
+            mask_error = "ignores every pixel (black is ignored); invert it, write 255 instead of 1, or drop the frame"
+    except NeecoError as error:
+        mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
+    return _Decoded(digest, uniform, image_error, mask_error)
+
+
+def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
+    """Two files with the same pixels: harmless only when everything else is the same as well."""
+    one, two, place = parsed.frames[first], parsed.frames[second], parsed.places[second].child("file_path")
+    if one.image_path == two.image_path:
+        return  # reported as one file listed twice
+    message = f"duplicate frame: same pixels as {parsed.places[first].field} ({one.image_path.name!r})"
+    if one.split == two.split and _same_state(one, two):
+        place.warning(message, "drop one of them")
+    else:
+        reason = "in another split" if _same_state(one, two) else "with another camera or state"
+        place.error(f"{message}, {reason}", "drop one of them (a stalled video does this)")
+
+
+def _same_state(one: Frame, two: Frame) -> bool:
+    """Whether two frames have one camera pose and one instrument state; time does not count."""
+    first, second = one.state.instruments, two.state.instruments
+    return (
+        torch.equal(one.camera.world_from_camera, two.camera.world_from_camera)
+        and first.keys() == second.keys()
+        and all(
+            torch.equal(first[name].pose, second[name].pose) and dict(first[name].joints) == dict(second[name].joints)
+            for name in first
+        )
+    )
+
+
+def _check_states(parsed: Parsed) -> None:
+    """Report missing instruments and joints, limits passed, degrees, and states that never change."""
+    for instrument in parsed.instruments:
+        _check_present(parsed, instrument)
+        for joint in instrument.joints:
+            _check_joint(parsed, instrument, joint)
+    _check_changes(parsed)
+
+
+def _check_present(parsed: Parsed, instrument: Instrument) -> None:
+    frames = zip(parsed.frames, parsed.places, strict=True)
+    without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
+    name = printable(instrument.name)
+    if without and len(without) == len(parsed.frames):
+        message = f"instrument {name} is declared but no frame has it"
+        parsed.header("instruments").error(message, "remove it or give its poses")
+        return
+    for place in without:
+        message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
+        place.child("instruments").error(message, "give its pose or drop the frame")
+
+
+def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
+    limits = instrument.joints[joint]
+    is_length = joint.endswith("_mm")  # a sliding joint
+    if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
+        message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
+        parsed.header("instruments").error(message, "give radians")
+    largest: tuple[float, Node] | None = None
+    for state_place, state in parsed.states_of(instrument.name):
+        place = state_place.child("joints").child(joint)
+        if joint not in state.joints:
+            place.error("is missing", "give its value in every frame, or drop the frame")
+            continue
+        value = state.joints[joint]
+        if limits is not None and passes_limits(value, limits):
+            message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
+            place.error(message, "repair the reading (radians?) or the limits")
+        if largest is None or abs(value) > abs(largest[0]):
+            largest = value, place
+    if largest is not None and limits is None and not is_length and abs(largest[0]) > FULL_TURN:
+        message = f"reaches {largest[0]:g} rad, more than a full turn: degrees?"
+        largest[1].error(message, "give radians; state the joint's limits in the header if it does turn that far")
+
+
+def _check_changes(parsed: Parsed) -> None:
+    """A state that is always the same teaches nothing about other states."""
+    frames, changing, still = parsed.header("frames"), False, []
+    for instrument in parsed.instruments:
+        states = [state for _, state in parsed.states_of(instrument.name)]
+        if len(states) < 2:
+            continue
+        name = printable(instrument.name)
+        moves = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > STILL
+        joints_move = False
+        for joint in instrument.joints:
+            values = [state.joints[joint] for state in states if joint in state.joints]
+            joint_moves = len(values) > 1 and max(values) - min(values) > STILL
+            joints_move = joints_move or joint_moves
+            if values and not joint_moves and moves:
+                message = f"joint {printable(joint)} of {name} is always {values[0]:g}"
+                frames.warning(message, "its other values cannot be learned")
+        changing = changing or moves or joints_move
+        if not (moves or joints_move):
+            still.append(name)
+        elif not moves:
+            frames.warning(f"the pose of {name} never changes", "is its tracker connected?")
+    for name in still:
+        message = f"the state of {name} never changes: pose and joints are the same in every frame"
+        remedy = "is its tracker connected? remove it from the capture if it is fixed"
+        (frames.warning if changing else frames.error)(message, remedy)

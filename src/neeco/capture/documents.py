@@ -1,0 +1,287 @@
+"""What all readers share: values that know their place in a file, the problems found in them, and what was read."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PureWindowsPath
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+
+from neeco.capture.model import Frame, Instrument, InstrumentState
+from neeco.capture.points import PointCloud
+from neeco.errors import NeecoError
+from neeco.raster.rotations import rigid_fault
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong: which file and field, what is wrong there, and what to do about it."""
+
+    severity: Literal["error", "warning"]
+    file: str
+    field: str
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}: {self.field}" if self.field else self.file
+        return f"{place}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+def errors_only(problems: list[Problem]) -> list[Problem]:
+    """The problems that make a capture unusable, in the order found."""
+    return [problem for problem in problems if problem.severity == "error"]
+
+
+@dataclass
+class ProblemReport:
+    """Collects problems while a capture is read, so that all of them can be reported at once."""
+
+    problems: list[Problem] = field(default_factory=list)
+
+    def error(self, file: str, field: str, message: str, remedy: str = "") -> None:
+        self.problems.append(Problem("error", file, field, message, remedy))
+
+    def warning(self, file: str, field: str, message: str, remedy: str = "") -> None:
+        self.problems.append(Problem("warning", file, field, message, remedy))
+
+    def raise_first(self, root: object) -> None:
+        """Raise NeecoError with the first error, if there is one. `root`: the capture, named in the message."""
+        errors = errors_only(self.problems)
+        if not errors:
+            return
+        more = f" ({len(errors) - 1} more: run `neeco check {root}`)" if len(errors) > 1 else ""
+        place = "" if errors[0].file == str(root) else f"{root}: "
+        raise NeecoError(f"{place}{errors[0]}{more}")
+
+
+class RaisingReport(ProblemReport):
+    """Raises the first error as NeecoError in one line: for files that are read as a whole or not at all."""
+
+    def error(self, file: str, field: str, message: str, remedy: str = "") -> NoReturn:
+        problem = Problem("error", file, field, message, remedy)
+        raise NeecoError(" ".join(str(problem).split()))
+
+
+def printable(value: Any, limit: int = 60) -> str:
+    """A value from a file, as one short printable piece of text."""
+    if isinstance(value, dict | list):
+        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return "a huge integer"
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def key_name(key: str) -> str:
+    """A JSON key as messages write it."""
+    return key if key.isidentifier() else f"[{printable(key)}]"
+
+
+def as_float(value: Any) -> float | None:
+    """A JSON number as float (may be NaN or infinite), None for anything else; true and false are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
+
+    Whether that ends the reading is the report's choice: `ProblemReport` collects, `RaisingReport` raises.
+    """
+
+    value: Any
+    file: str
+    field: str
+    report: ProblemReport
+
+    def error(self, message: str, remedy: str = "") -> None:
+        self.report.error(self.file, self.field, message, remedy)
+
+    def error_from(self, error: NeecoError) -> None:
+        """Report an exception of the form "what is wrong; what to do" that does not say where."""
+        message, _, remedy = str(error).partition("; ")
+        self.error(message, remedy)
+
+    def warning(self, message: str, remedy: str = "") -> None:
+        self.report.warning(self.file, self.field, message, remedy)
+
+    @property
+    def reported(self) -> bool:
+        """Whether a problem of this place is known already."""
+        return any((problem.file, problem.field) == (self.file, self.field) for problem in self.report.problems)
+
+    def has(self, key: str) -> bool:
+        """Whether the object has this key with a value other than null."""
+        return isinstance(self.value, dict) and self.value.get(key) is not None
+
+    def child(self, key: str) -> Node:
+        """The value under `key` (None when absent)."""
+        path = f"{self.field}.{key_name(key)}" if self.field else key_name(key)
+        value = self.value.get(key) if isinstance(self.value, dict) else None
+        return Node(value, self.file, path, self.report)
+
+    def item(self, index: int) -> Node:
+        """The element `index` of a list (None when this is not one)."""
+        value = self.value[index] if isinstance(self.value, list) else None
+        return Node(value, self.file, f"{self.field}[{index}]", self.report)
+
+    def items(self) -> Iterator[Node]:
+        """The elements of a list; reports an error and yields nothing when this is not a list."""
+        if not isinstance(self.value, list):
+            self.error(f"expected a list, found {printable(self.value)}")
+            return
+        for index in range(len(self.value)):
+            yield self.item(index)
+
+    def is_object(self) -> bool:
+        """Whether this is an object; reports an error otherwise."""
+        if isinstance(self.value, dict):
+            return True
+        self.error(f"expected an object, found {printable(self.value)}")
+        return False
+
+    def text(self, remedy: str = "") -> str | None:
+        """A non-empty string."""
+        if isinstance(self.value, str) and self.value.strip():
+            return self.value
+        self.error(f"expected text, found {printable(self.value)}" if self.value != "" else "is empty", remedy)
+        return None
+
+    def number(
+        self, above: float | None = None, least: float | None = None, below: float | None = None
+    ) -> float | None:
+        """A finite number, within the bounds given."""
+        value = as_float(self.value)
+        if value is None:
+            self.error(f"expected a number, found {printable(self.value)}", "correct it")
+            return None
+        if not math.isfinite(value):
+            self.error(f"is {printable(self.value)}, not a finite number", "correct it")
+            return None
+        wrong = []
+        wrong += [f"above {above:g}"] if above is not None and value <= above else []
+        wrong += [f"{least:g} or more"] if least is not None and value < least else []
+        wrong += [f"below {below:g}"] if below is not None and value >= below else []
+        if wrong:
+            self.error(f"{value:g} is out of range", f"give a number {wrong[0]}")
+            return None
+        return value
+
+    def integer(self, least: int) -> int | None:
+        """A whole number."""
+        value = self.number()
+        if value is not None and (value != int(value) or value < least):
+            self.error(f"{value:g} is out of range", f"give a whole number, {least} or more")
+            return None
+        return None if value is None else int(value)
+
+    def numbers(self, count: int, what: str) -> list[float] | None:
+        """A list of so many finite numbers."""
+        if not isinstance(self.value, list) or len(self.value) != count:
+            self.error(f"expected {count} numbers ({what}), found {printable(self.value)}", "correct it")
+            return None
+        found = [number for item in self.items() if (number := item.number()) is not None]
+        return found if len(found) == count else None
+
+    def range(self, unit: str) -> tuple[float, float] | None:
+        """Least and greatest of something."""
+        ends = self.numbers(2, f"least and greatest, {unit}")
+        if ends is None:
+            return None
+        low, high = ends
+        if low >= high:
+            self.error(f"{low:g} is not below {high:g}", f"give the least first, in {unit}")
+            return None
+        return low, high
+
+    def rigid(self) -> np.ndarray | None:
+        """A rigid transform [4, 4] float64: a rotation in its corner and the row 0 0 0 1, which may be left out."""
+        rows, wrong = self.value, ""
+        if rows is None:
+            wrong = "is missing"
+        elif not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
+            wrong = f"expected a 4x4 matrix, found {printable(rows)}"
+        elif any(len(row) != 4 for row in rows):
+            wrong = "expected a 4x4 matrix, found rows of another length"
+        elif any(as_float(entry) is None for row in rows for entry in row):
+            wrong = "expected a 4x4 matrix, found an entry that is not a number"
+        if wrong:
+            self.error(wrong, "give four rows of four numbers")
+            return None
+        numbers = [[as_float(entry) for entry in row] for row in rows]
+        matrix = np.array([*numbers, [0.0, 0.0, 0.0, 1.0]][:4], dtype=np.float64)
+        fault = rigid_fault(matrix)
+        if fault is not None:
+            self.error(*fault)
+        return matrix if fault is None else None
+
+
+@dataclass
+class Parsed:
+    """A capture as far as it could be read.
+
+    Frames without image, split, time or states that could be read are left out (and reported); where only the camera is
+    wrong they stay, so that the rest of them can be checked.
+    """
+
+    root: Path
+    frames: list[Frame] = field(default_factory=list)
+    places: list[Node] = field(default_factory=list)  # where each frame is described
+    instruments: tuple[Instrument, ...] = ()
+    points: PointCloud | None = None  # None: none named
+    points_place: Node | None = None
+    registered: bool = True
+    timed: bool = True  # the recording says when each frame was taken
+    says_units: bool = False  # the file names its unit of length
+    is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
+    without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
+
+    def header(self, field: str) -> Node:
+        """The place `field` of the file that describes the first frame."""
+        return Node(None, self.places[0].file, field, self.places[0].report)
+
+    def with_cameras(self) -> Parsed:
+        """The same without the frames whose camera is a placeholder."""
+        rows = [row for row in range(len(self.frames)) if row not in self.without_camera]
+        frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
+        return replace(self, frames=frames, places=places, without_camera=set())
+
+    def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
+        """(place of the state, state) of one instrument, over the frames that have it."""
+        return [
+            (place.child("instruments").item(list(frame.state.instruments).index(name)), frame.state.instruments[name])
+            for frame, place in zip(self.frames, self.places, strict=True)
+            if name in frame.state.instruments
+        ]
+
+
+def inside(root: Path, folder: Path, text: str) -> Path:
+    """The path `text`, taken relative to `folder`, which must lie inside `root` also after following symbolic links.
+
+    Raises NeecoError (without naming the field: the caller does) when it is absolute, leads out or is no path at all.
+    """
+    if os.path.isabs(text) or PureWindowsPath(text).is_absolute():
+        raise NeecoError(f"{printable(text)} is absolute; give a path relative to the capture's folder")
+    try:
+        path = Path(os.path.normpath(folder / text))
+        outside = not path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError):
+        raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
+    if outside:
+        raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
+    return path
+
+
+def relative_name(file: Path, root: Path) -> str:
+    """How messages call a file of the capture."""
+    return file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name

@@ -1,0 +1,193 @@
+"""Where the instrument is in the images, from motion and its tracked pose: its features must not hold up the cameras.
+
+Three steps: pixels whose optical flow is not what a still scene would show; the set of points in the instrument's
+tracked frame that such pixels cover in most frames (its rough shape); and that shape projected into every frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import binary_dilation
+from scipy.spatial import QhullError
+
+from neeco.ingest.lens import Lens
+from neeco.ingest.sfm import SfmResult
+from neeco.raster.pinhole import project, project_world
+from neeco.raster.types import Camera
+
+STEP = 4  # px between the places where flow is compared
+NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
+PATCH = 0.04  # of the image: about what an instrument's front takes
+CELLS = 48  # of the carving grid, per side
+REACH = 0.4  # of the distance to the camera: half a side of that grid
+COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
+MARGIN = 6  # px about its projection
+NEAREST = 1e-3  # mm; what is less deep is not in front of the camera
+TINY = 1e-9  # depth in SfM's unit that may be divided by
+
+
+@dataclass(frozen=True)
+class RoughShape:
+    """Points [K, 3] mm of an instrument in its tracked frame, the grid's spacing mm, and how often the images agree."""
+
+    points: np.ndarray
+    spacing: float
+    agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
+
+
+def moving_pixels(
+    load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens, rows: np.ndarray, moving_px: float
+) -> np.ndarray:
+    """[R, h, w] share of neighbours, at every STEP-th pixel, against which the pixel moved otherwise than tissue would.
+
+    load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted; moving_px: residual flow from which
+    a pixel counts as moving.
+    """
+    flow = _ResidualFlow(load, sfm, pinhole)
+    evidence = []
+    for row in rows.tolist():
+        others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(sfm.indices)]
+        moved = sum((motion > moving_px for motion in flow.residuals(row, others)), np.zeros(flow.u.shape))
+        evidence.append(moved / max(len(others), 1))
+    return np.stack(evidence)
+
+
+def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> np.ndarray:
+    """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
+    flow = _ResidualFlow(load, sfm, pinhole)
+    patch = max(1, round(PATCH * flow.u.size))
+    motion = np.zeros(len(sfm.indices) - 1)
+    for row in range(len(motion)):
+        (left,) = flow.residuals(row, [row + 1])
+        motion[row] = np.sort(left, axis=None)[-patch:].mean()
+    return motion
+
+
+class _ResidualFlow:
+    """Optical flow at every STEP-th pixel, and what of it a still scene does not explain."""
+
+    def __init__(self, load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> None:
+        self.sfm, self.pinhole = sfm, pinhole
+        self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
+        self.grey = lru_cache(maxsize=16)(lambda row: cv2.cvtColor(load(row), cv2.COLOR_RGB2GRAY))
+        height, width = self.grey(0).shape
+        self.v, self.u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+
+    def residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
+        """[h, w] px by which the flow from a row of `sfm` to each of the others differs from a still scene's."""
+        cameras = self.sfm.world_from_camera
+        depth = _still_depth(self.sfm, row, self.pinhole, self.u, self.v)
+        for other in others:
+            flow = self.estimator.calc(self.grey(row), self.grey(other), None)[self.v, self.u]  # [h, w, 2]
+            still = _still_flow(cameras[row], cameras[other], depth, self.pinhole, self.u, self.v)
+            yield np.linalg.norm(flow - still, axis=-1)
+
+
+def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
+    """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
+
+    evidence [R, h, w] from `moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
+    instrument hardly moves, or its poses do not fit the cameras.
+    """
+    distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
+    if distance <= 0:
+        return None
+    axis = np.linspace(-REACH, REACH, CELLS) * distance
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
+    total, seen = np.zeros(len(grid)), np.zeros(len(grid))
+    for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
+        x, y, inside = _raster_cells(grid, pose, pinhole.intrinsics, pixels.shape)
+        total[inside] += pixels[y[inside], x[inside]]
+        seen += inside
+    enough = seen > 0.3 * len(evidence)
+    share = np.where(enough, total / np.maximum(seen, 1), 0.0)
+    background = float(evidence.mean())
+    best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
+    if best < 2 * background or best < 0.3:
+        return None
+    belongs = share > max(COVERED * best, 2 * background)
+    return RoughShape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
+
+
+def project_mask(shape: RoughShape, camera_from_instrument: np.ndarray, camera: Camera) -> np.ndarray:
+    """[H, W] bool: pixels the shape may cover in the camera's image, with a margin."""
+    small = (camera.height // STEP + 1, camera.width // STEP + 1)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    x, y, inside = _raster_cells(shape.points, camera_from_instrument, intrinsics, small)
+    mask = np.zeros(small, dtype=bool)
+    mask[y[inside], x[inside]] = True
+    depth = float(camera_from_instrument[2, 3])
+    cell = shape.spacing * camera.fx / max(depth, 1.0)  # px between neighbouring points
+    mask = binary_dilation(mask, iterations=max(1, round((MARGIN + cell / 2) / STEP)))
+    return mask.repeat(STEP, axis=0).repeat(STEP, axis=1)[: camera.height, : camera.width]
+
+
+def observations_on(
+    shape: RoughShape, camera_from_instrument: np.ndarray, sfm: SfmResult, row: int, points: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """bool [Q]: observations of a row of `sfm` that lie on the shape. points [P, 3] mm: its points in the world."""
+    mask = project_mask(shape, camera_from_instrument, camera)
+    mine = np.flatnonzero(sfm.observations[:, 0] == row)
+    pixels, _ = project_world(points[sfm.observations[mine, 1].astype(int)], camera, nearest=camera.near)
+    x = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
+    y = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+    on = np.zeros(len(sfm.observations), dtype=bool)
+    on[mine] = mask[y, x]
+    return on
+
+
+def _raster_cells(
+    points: np.ndarray,
+    camera_from_instrument: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    shape: tuple[int, ...],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column, row and insideness [K] of points on the STEP-spaced raster of `shape` (rows, columns)."""
+    camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
+    x, y = (np.floor(place / STEP) for place in project(camera, *intrinsics, nearest=NEAREST))
+    inside = (camera[:, 2] > NEAREST) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
+
+
+def _still_depth(sfm: SfmResult, row: int, pinhole: Lens, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """[h, w] depth of the still scene at pixels u, v: between the points this frame sees, nearest beyond them."""
+    seen = sfm.observations[:, 0] == row
+    points = sfm.points[sfm.observations[seen, 1].astype(int)]
+    pixels, depth = project_world(points, pinhole.camera(sfm.world_from_camera[row]), nearest=TINY)
+    near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
+    keep = (depth > 0.3 * near) & (depth < 3 * near)
+    pixels, inverse = pixels[keep], 1 / depth[keep]
+    if len(pixels) == 0:
+        return np.full(u.shape, np.nan)  # nothing is known, so nothing is seen to move
+    places = np.stack([u + 0.5, v + 0.5], -1)
+    nearest = NearestNDInterpolator(pixels, inverse)(places)
+    try:
+        between = LinearNDInterpolator(pixels, inverse)(places)
+    except QhullError:  # fewer than three, or all on one line
+        return np.asarray(1 / nearest)
+    return np.asarray(1 / np.where(np.isnan(between), nearest, between))
+
+
+def _still_flow(
+    world_from_first: np.ndarray,
+    world_from_second: np.ndarray,
+    depth: np.ndarray,
+    pinhole: Lens,
+    u: np.ndarray,
+    v: np.ndarray,
+) -> np.ndarray:
+    """[h, w, 2] px by which a still point at that depth moves from the first frame to the second."""
+    rays = np.stack(
+        [(u + 0.5 - pinhole.cx) / pinhole.fl_x, (v + 0.5 - pinhole.cy) / pinhole.fl_y, np.ones(u.shape)], -1
+    )
+    relative = np.linalg.inv(world_from_second) @ world_from_first
+    moved = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
+    x, y = project(moved, *pinhole.intrinsics, nearest=TINY)
+    return np.stack([x - u - 0.5, y - v - 0.5], -1)
