@@ -127,11 +127,10 @@ class Kinematic(HingedInstruments, Deformation):
         column = 0
         for index in range(len(self.instruments)):
             hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-            if not hinges.joint_names:
-                labels[rows, column] = 1.0
-                column += 1
-                continue
-            parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            if hinges.joint_names:
+                parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            else:
+                parts = labels.new_ones(canonical.counts[index + 1], 1)
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
         return labels

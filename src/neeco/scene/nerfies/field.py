@@ -95,17 +95,11 @@ class NerfiesSettings:
     chunk: int = 512
 
     def __post_init__(self) -> None:
-        may_be_zero = {
-            "fine_samples",
-            "appearance",
-            "elastic_rays",
-            "elastic_weight",
-            "background_weight",
-            "point_noise",
-        }
+        may_be_zero = {"fine_samples", "appearance", "elastic_rays", "background_points", "window", "point_noise"}
+        may_be_zero |= {"elastic_weight", "background_weight"}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value < 0 or (value == 0 and field.name not in may_be_zero | {"background_points", "window"}):
+            if value < 0 or (value == 0 and field.name not in may_be_zero):
                 raise NeecoError(f"deformation.{field.name}: {value} is too small; give a larger number")
         if self.coarse_samples < 2:
             raise NeecoError("deformation.coarse_samples: a ray needs at least 2 samples")
@@ -181,7 +175,7 @@ class MLP(nn.Module):
 
 
 class WarpField(nn.Module):
-    """W: (point, code) to a screw (w, v), and by it to the point's place in the template (Nerfies eq. 7)."""
+    """W: (point, code) to a screw (w, v), which moves the point to its place in the template (Nerfies eq. 7)."""
 
     def __init__(self, frequencies: int, code: int, depth: int, width: int) -> None:
         super().__init__()
@@ -230,8 +224,8 @@ class Template(nn.Module):
         conditions = conditions[:, None].expand(-1, places.shape[1], -1)
         with tf32_products(places.device):
             features = self.trunk(encode_by_octave(places, self.frequencies))
-            seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
-            density, color = self.density(features)[..., 0], self.color(seen)
+            viewed = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
+            density, color = self.density(features)[..., 0], self.color(viewed)
         return nn.functional.softplus(density - 1), torch.sigmoid(color)
 
     def condition(self, directions: Tensor, appearance: Tensor) -> Tensor:
@@ -381,10 +375,6 @@ class NerfScene(nn.Module):
         self.warp = WarpField(settings.warp_frequencies, settings.code, settings.warp_depth, settings.warp_width)
         self.coarse = Template(settings)
         self.fine = Template(settings) if settings.fine_samples else None
-
-    def camera(self, camera: Camera) -> Camera:
-        """The recorded one."""
-        return camera
 
     def hinge_motion(self) -> None:
         """A field has no Gaussians that could move."""

@@ -25,7 +25,7 @@ def drop_hidden(scene: Scene) -> CanonicalGaussians:
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     left, whole = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
     for index in evenly_spaced(len(recorded.cameras), FRAMES):
-        camera = scene.camera(recorded.cameras[index])
+        camera = recorded.cameras[index]
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         left += visible_pixels(posed, camera)
