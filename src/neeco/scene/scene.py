@@ -226,7 +226,7 @@ def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
 
 
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
+    """The Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():
