@@ -199,8 +199,10 @@ def test_seeds_stand_at_the_middle_reading_where_offsets_are_nothing() -> None:
     before = hinges.bend(seeds, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0]
     moved = unbend_seeds(hinges, seeds, logits)
     assert not bool(hinges.offsets.any())
-    assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=1e-4)
-    assert torch.allclose(moved[:20], seeds[:20], atol=1e-5)
+    # two turns of at most ten roundings each of coordinates up to |seeds|
+    rounding = 20 * 2**-24 * float(seeds.abs().max())
+    assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=rounding)
+    assert torch.allclose(moved[:20], seeds[:20], atol=rounding)
     assert (moved[20:] - seeds[20:]).norm(dim=1).max() > 0.1
 
 
