@@ -111,7 +111,7 @@ class TrainConfig:
     }
 
     method: str = DEFAULT
-    iterations: int = 6000  # frames drawn and learned from
+    iterations: int = 6000  # frames rendered and learned from
     batch_size: int = 1  # frames between two optimiser steps
     minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0

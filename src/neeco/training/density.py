@@ -16,7 +16,7 @@ from neeco.training.config import DensityConfig
 
 
 class GradientStatistics:
-    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images in which it was drawn."""
+    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images that show it."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self.total = torch.zeros(count, device=device)

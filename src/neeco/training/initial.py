@@ -104,7 +104,7 @@ def moving_joints(
     poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
     distinct, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
     design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
-    kept = []
+    moving = []
     for joint in instrument.joints:
         reading = np.array([states[i].joints[joint] for i in first])
         spread = reading.var()
@@ -113,5 +113,5 @@ def moving_joints(
         if explained > config.search.max_pose_explained:
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:
-            kept.append(joint)
-    return tuple(kept)
+            moving.append(joint)
+    return tuple(moving)
