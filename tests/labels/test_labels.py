@@ -140,11 +140,11 @@ def test_the_pose_is_given_in_the_camera_frame(scene, state, camera):
 
 
 def test_visibility_counts_hidden_pixels():
-    layers, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
-    layers[:, :2] = True
+    alone, seen = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    alone[:, :2] = True
     seen[:, 0] = True
-    assert visibility(seen, layers) == 0.5
-    assert visibility(seen & False, layers & False) == 0.0
+    assert visibility(seen, alone) == 0.5
+    assert visibility(seen & False, alone & False) == 0.0
 
 
 def test_threshold_labels_separate_what_moved_from_what_did_not(scene, state, camera):
