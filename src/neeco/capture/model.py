@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
@@ -33,6 +35,10 @@ class InstrumentState:
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
+
+    if TYPE_CHECKING:  # what may be given
+
+        def __init__(self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ...) -> None: ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))
