@@ -16,8 +16,7 @@ from neeco.errors import NeecoError
 from neeco.scene import CanonicalGaussians, deformations, methods
 from neeco.scene.deformations.base import Posed
 from neeco.scene.io import load_scene
-from neeco.training.config import method_defaults
-from neeco.training.options import training_config
+from neeco.training.config import method_defaults, training_config
 from neeco.training.train import train
 
 FILE = '''

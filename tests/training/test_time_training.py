@@ -13,7 +13,7 @@ from neeco.errors import NeecoError
 from neeco.scene.deformations.base import UNPERTURBED
 from neeco.scene.deformations.hexplane import HexPlane
 from neeco.scene.deformations.time_mlp import TimeMLP
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 

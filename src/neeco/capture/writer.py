@@ -41,12 +41,13 @@ def write_capture(
     capture and `overwrite` is not set.
 
         frames = [
-            Frame(f"{k:04d}.png", Camera(world_from_camera[k], fx, fy, cx, cy, width, height),
+            Frame(Path(f"{k:04d}.png"), Camera(world_from_camera[k], fx, fy, cx, cy, width, height),
                   State({"grasper": InstrumentState(world_from_grasper[k], {"jaw_angle": jaw[k]})}, time=k / 25),
                   split="test" if k % 8 == 0 else "train")
             for k in range(len(pixels))
         ]
-        capture = Capture("mine", frames, (Instrument("grasper", {"jaw_angle": (0.0, 1.2)}),), PointCloud(xyz, rgb))
+        grasper = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
+        capture = Capture(Path("mine"), tuple(frames), (grasper,), PointCloud(xyz, rgb))
         write_capture(capture, "mine", images=pixels)
     """
     path = Path(path)

@@ -102,19 +102,20 @@ class Convolution:
     tap: bool
 
 
-_ALEXNET = (
-    Convolution(11, 4, 2, None, True),
-    Convolution(5, 1, 2, (3, 2), True),
-    Convolution(3, 1, 1, (3, 2), True),
-    Convolution(3, 1, 1, None, True),
-    Convolution(3, 1, 1, None, True),
-)
-_VGG16 = tuple(
-    Convolution(3, 1, 1, (2, 2) if block > 0 and index == 0 else None, index == depth - 1)
-    for block, depth in enumerate((2, 2, 3, 3, 3))
-    for index in range(depth)
-)
-NETWORKS: dict[str, tuple[Convolution, ...]] = {"alexnet": _ALEXNET, "vgg16": _VGG16}
+NETWORKS: dict[str, tuple[Convolution, ...]] = {
+    "alexnet": (
+        Convolution(11, 4, 2, None, True),
+        Convolution(5, 1, 2, (3, 2), True),
+        Convolution(3, 1, 1, (3, 2), True),
+        Convolution(3, 1, 1, None, True),
+        Convolution(3, 1, 1, None, True),
+    ),
+    "vgg16": tuple(
+        Convolution(3, 1, 1, (2, 2) if block > 0 and index == 0 else None, index == depth - 1)
+        for block, depth in enumerate((2, 2, 3, 3, 3))
+        for index in range(depth)
+    ),
+}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -56,8 +56,8 @@ def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tenso
 class PartTally:
     """Gathers per-part IoU over the frames of a split.
 
-    Which jaw is "left" is a name a scene learned from images cannot know, so both assignments of the two jaws are kept
-    and the better one over the whole split is reported (never the better one per frame).
+    A scene learned from images cannot know which jaw is called left: both assignments of the two jaws are counted, and
+    the better one over the whole split is reported (never the better one per frame).
     """
 
     frames: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"as named": [], "swapped": []})
@@ -94,6 +94,17 @@ def mean_of(values: Sequence[float | None]) -> float:
     """Mean of the values that are numbers; NaN when there are none."""
     numbers = [value for value in values if value is not None and not math.isnan(value)]
     return sum(numbers) / len(numbers) if numbers else math.nan
+
+
+def finite(value: Any) -> Any:
+    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def boundary_pixels(mask: np.ndarray) -> np.ndarray:

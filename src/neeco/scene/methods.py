@@ -26,6 +26,17 @@ def find_methods() -> dict[str, type[Method]]:
 METHODS: dict[str, type[Method]] = find_methods()
 
 
+def add_method(kind: type[Method]) -> type[Method]:
+    """Make a method that is defined outside this package known to this process; usable as a decorator.
+
+    Raises NeecoError when another class has its name.
+    """
+    if METHODS.get(kind.method, kind) is not kind:
+        raise NeecoError(f"method: {kind.method!r} is there already; give {kind.__name__} another name")
+    METHODS[kind.method] = kind
+    return kind
+
+
 def method_class(method: str) -> type[Method]:
     """What the method says of itself. Raises NeecoError for an unknown name."""
     if method not in METHODS:

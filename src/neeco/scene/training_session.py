@@ -73,6 +73,11 @@ def check_finite(total: float, iteration: int, where: str = "") -> None:
         )
 
 
+def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
+    """The tensors called GROUP/NAME, by NAME."""
+    return {key.removeprefix(f"{group}/"): t for key, t in tensors.items() if key.startswith(f"{group}/")}
+
+
 @dataclass
 class Session:
     """One training run in memory, of any method."""
