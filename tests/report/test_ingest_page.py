@@ -21,9 +21,8 @@ from neeco.ingest.motion import RoughShape
 from neeco.ingest.pipeline import IngestResult
 from neeco.ingest.registration import ClockOffset, Registration
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
-from neeco.report.ingest_figures import in_view, main_axes
+from neeco.report.ingest_figures import in_view, main_axes, read_tracks, round_length
 from neeco.report.ingest_page import write_ingest_page
-from neeco.report.tracks import read_tracks, round_length
 from neeco.report.verdict import give_verdict
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
