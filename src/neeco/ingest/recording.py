@@ -14,18 +14,8 @@ import yaml
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
-from neeco.ingest.columns import (
-    EULER,
-    FORMS,
-    MATRIX,
-    TRACKER_CLOCK,
-    UNITS,
-    JointColumns,
-    PoseColumns,
-    Units,
-    canonical_unit,
-    quaternion_form,
-)
+from neeco.ingest import columns as named
+from neeco.ingest.columns import FORMS, TRACKER_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 MIN_FRAMES = 10  # that cameras can be found from
@@ -374,16 +364,16 @@ def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
     if forms:
         rotation = columns.names(forms[0], FORMS.get(forms[0], (4,)))
         assert rotation is not None
-        form = forms[0] if forms[0] in FORMS else quaternion_form(rotation)
+        form = forms[0] if forms[0] in FORMS else named.quaternion_form(rotation)
         if form is None:
             raise columns.error("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
-    if form == MATRIX and columns.value.get("position") is not None:
+    if form == named.MATRIX and columns.value.get("position") is not None:
         raise columns.error("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
     convention = columns.text("euler_convention")
     if convention is not None and not _EULER.fullmatch(convention):
         problem = f"{printable(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
         raise columns.error("euler_convention", problem)
-    if form == EULER and convention is None:
+    if form == named.EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
     good = columns.value.get("good")
     goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
@@ -417,9 +407,9 @@ def _log(parent: Section, key: str, value: Any, more: tuple[str, ...] = ()) -> t
 def _units(section: Section) -> Units:
     given = section.section("units", ("length", "angle", "time"))
     found: dict[str, str | None] = {}
-    for kind, units in UNITS.items():
+    for kind, units in named.UNITS.items():
         text = given.text(kind)
-        found[kind] = None if text is None else canonical_unit(text)
+        found[kind] = None if text is None else named.canonical_unit(text)
         if found[kind] is not None and found[kind] not in units:
             raise given.error(kind, f"{printable(text)} is no unit of {kind}; use {', '.join(units)}")
     return Units(**found)
