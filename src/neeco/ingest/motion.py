@@ -110,8 +110,8 @@ class ResidualFlow:
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
     """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
 
-    evidence [R, h, w] from `ResidualFlow.moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
-    instrument hardly moves, or its poses do not fit the cameras.
+    evidence [R, h, w] from `ResidualFlow.moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands
+    out: the instrument hardly moves, or its poses do not fit the cameras.
     """
     distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:

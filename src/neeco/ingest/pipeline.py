@@ -112,13 +112,7 @@ class _Ingest:
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
-            folder / "sfm",
-            self.data.video.path,
-            folder / "raw",
-            self.names,
-            self.pinhole,
-            self.visible,
-            self.settings,
+            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.pinhole, self.visible, self.settings
         )
 
     def run(self, output: Path) -> IngestResult:
