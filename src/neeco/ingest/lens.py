@@ -192,9 +192,7 @@ def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], s
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
     if len(coefficients) not in COEFFICIENTS:
-        raise NeecoError(
-            f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV's models have 4, 5, 8, 12 or 14"
-        )
+        raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if not any(coefficients):
         coefficients = ()
     fl_x, fl_y, cx, cy = (float(value) for value in values)

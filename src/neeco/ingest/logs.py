@@ -115,9 +115,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     value, found = named.recognise_value(table.header)
     value = source.value or value
     if value is None:
-        raise NeecoError(
-            f"{table.path}: header: which column is the joint's reading? Name it in the recording: columns.value"
-        )
+        raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
     times = _times(rows, source, found)
     values = _cells(rows, (value,))[:, 0]
@@ -143,7 +141,7 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
-        raise NeecoError(f"{table.path}: header: {_unclear(table, found.unclear, 'position', 'x, y, z columns')}")
+        raise _unclear(table, found, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
     implied = found.length_unit if position == found.position else None
@@ -235,7 +233,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
     table, names = rows.table, source.time or found.time
     if names is None:
         raise NeecoError(
-            f"{table.path}: header: no column of times found; name it in the recording: columns.time (or add t_s)"
+            f"{table.path}: header: no column of times; name it in the recording: columns.time (or add t_s)"
         )
     cells = _cells(rows, names)
     known = named.recognise_time(names)
@@ -282,9 +280,7 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
     """Form and columns of the rotation."""
     rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
     if rotation is None or form is None:
-        raise NeecoError(
-            f"{table.path}: header: {_unclear(table, found.unclear, 'rotation', 'qw, qx, qy, qz columns')}"
-        )
+        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
     if len(rotation) not in named.FORMS[form]:
         wanted = " or ".join(map(str, named.FORMS[form]))
         raise NeecoError(f"{table.path}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
@@ -293,12 +289,12 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
     return form, rotation
 
 
-def _unclear(table: Table, unclear: dict[str, str], what: str, expected: str) -> str:
-    reason = unclear.get(what) or (unclear.get("quaternion") if what == "rotation" else None)
-    if reason:
-        return f"{what}: {reason}"
-    names = ", ".join(table.header[:12])
-    return f"no {expected} found among {names[:120]!r}; name them in the recording under columns"
+def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
+    reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
+    problem = (
+        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns"
+    )
+    return NeecoError(f"{table.path}: header: {f'{what}: {reason}' if reason else problem}")
 
 
 def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -309,9 +305,7 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     if cells.shape[1] == 16:
         last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
         if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(
-                f"{table.path}: matrix: is written by columns; list its columns in the recording row by row"
-            )
+            raise NeecoError(f"{table.path}: matrix: is written by columns; list them in the recording row by row")
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
@@ -364,9 +358,7 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     count_name = next(name for name in names if name != angle_name)
     unit = named.split_unit(angle_name, "angle")[1] or angle_unit
     if unit is None:
-        raise NeecoError(
-            f"{path}: column {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg"
-        )
+        raise NeecoError(f"{path}: {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg")
     values, missing, bad = numbers(table, (count_name, angle_name))
     wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
     if wrong:
@@ -379,9 +371,7 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndar
     same = np.flatnonzero(np.diff(counts) <= 0)
     if len(same):
         first, second = lines[same[0] : same[0] + 2]
-        raise NeecoError(
-            f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one of them"
-        )
+        raise NeecoError(f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one")
     turning = np.flatnonzero(np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
     if len(turning):
         first, second = lines[turning[0] : turning[0] + 2]

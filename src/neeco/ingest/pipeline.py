@@ -361,7 +361,7 @@ class _Ingest:
             owner = next((values for _, values in states.values() if by in values), None)
             if owner is None:
                 raise NeecoError(
-                    f"{where}: splits.unseen_by: {by!r} is the joint of an instrument without poses; name another"
+                    f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another"
                 )
             joints = owner
         rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))

@@ -308,7 +308,7 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
     solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
     if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL:
         raise NeecoError(
-            f"{log.path}: the laparoscope travelled too little for its scale to be found; move it by 20 mm or more"
+            f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
         )
     return float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:]
 

@@ -122,13 +122,11 @@ class StructureFromMotion:
             found = [str(name) for name in saved["names"]]
             if len(found) < MIN_FRAMES:
                 raise NeecoError(
-                    f"{self.source}: a camera was found for only {len(found)} of {len(self.names)} frames (at least {MIN_FRAMES} "
-                    "are needed); see docs/recording.md"
+                    f"{self.source}: a camera was found for only {len(found)} of {len(self.names)} frames (at least "
+                    f"{MIN_FRAMES} are needed); see docs/recording.md"
                 )
             if len(saved["points"]) == 0:
-                raise NeecoError(
-                    f"{self.source}: no tissue point could be found between the frames; see docs/recording.md"
-                )
+                raise NeecoError(f"{self.source}: no tissue point was found between the frames; see docs/recording.md")
             row = {name: index for index, name in enumerate(self.names)}
             arrays = ("world_from_camera", "points", "colors", "errors", "lengths", "observations", "camera_params")
             return SfmResult(
