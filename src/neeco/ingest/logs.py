@@ -232,9 +232,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
     """Times [R] in s; rows without one are dropped."""
     table, names = rows.table, source.time or found.time
     if names is None:
-        raise NeecoError(
-            f"{table.path}: header: no column of times; name it in the recording: columns.time (or add t_s)"
-        )
+        raise NeecoError(f"{table.path}: header: no column of times found; name it as columns.time (or add t_s)")
     cells = _cells(rows, names)
     known = named.recognise_time(names)
     if len(names) == 2:
