@@ -91,14 +91,14 @@ def axis_length(capture: Capture) -> float:
     return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
-def in_view(capture: Capture, name: str) -> tuple[int, int]:
-    """In how many frames an instrument's tracked origin lies inside the image, and how many have the instrument."""
+def in_view(capture: Capture, name: str) -> float:
+    """Share of an instrument's frames in which its tracked origin lies inside the image."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
     inside = 0
     for frame in frames:
         ((x, y),), (depth,) = _project(ORIGIN, frame.state.instruments[name].pose, frame.camera)
         inside += bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
-    return inside, len(frames)
+    return inside / max(len(frames), 1)
 
 
 def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:

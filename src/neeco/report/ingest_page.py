@@ -39,49 +39,34 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         capture=capture,
         verdict=give_verdict(result, capture),
         splits=split_counts(capture),
-        tiles=_tiles(result, capture),
-        residuals=_residuals(result),
+        in_view=[
+            (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
+        ],
+        **_residuals(result),
         clocks=_clocks(result, capture),
         **_frames(result, capture, axes),
         **_tracks(capture),
         **_coverage(capture, axes),
         dropped=_dropped(result),
-        facts=_facts(result, capture),
     )
 
 
-def _tiles(result: IngestResult, capture: Capture) -> list[tuple[str, str]]:
-    """(number, what it is) of the few that matter most."""
-    tiles = [(f"{len(result.kept)}", f"frames kept of {result.video_frames}")]
-    registration = result.registration
-    if registration is not None:
-        tiles.append((f"{rms(registration.position_residual):.2f} mm", "cameras against tracker, rms"))
-        tiles.append((f"{np.degrees(rms(registration.rotation_residual)):.2f}°", "cameras against tracker, rms"))
-        tiles.append((f"±{registration.scale_sd:.2%}", "scale of lengths"))
-    if result.reprojection_px is not None:
-        tiles.append((f"{result.reprojection_px:.2f} px", "reprojection of tissue points"))
-    tiles.append((f"{result.points:,}", "tissue points"))
-    for instrument in capture.instruments if capture.registered else ():
-        inside, count = figures.in_view(capture, instrument.name)
-        tiles.append(
-            (f"{inside / max(count, 1):.0%}", f"of frames have the tracked origin of {instrument.name} in view")
-        )
-    return tiles
-
-
-def _residuals(result: IngestResult) -> list[str]:
-    """Charts of how far each camera is from where the laparoscope's tracker puts it."""
+def _residuals(result: IngestResult) -> dict[str, Any]:
+    """How far each camera is from where the laparoscope's tracker puts it: root mean squares and charts."""
     registration = result.registration
     if registration is None:
-        return []
+        return {"residuals": []}
     rows = result.registered_frames.astype(int)
     shown = rows >= 0  # frames that helped to register but were left out of the capture afterwards have no row
     times = result.kept_times[rows[shown]] - result.kept_times.min()
     positions, turns = registration.position_residual, np.degrees(registration.rotation_residual)
-    return [
-        residual_chart(times, positions[shown], "position residual, mm", rms(positions)),
-        residual_chart(times, turns[shown], "rotation residual, deg", rms(turns)),
+    position, rotation = rms(positions), rms(turns)
+    charts = [
+        residual_chart(times, positions[shown], "position residual, mm", position),
+        residual_chart(times, turns[shown], "rotation residual, deg", rotation),
     ]
+    sensor = registration.camera_from_sensor[:3, 3]
+    return {"residuals": charts, "position_rms": position, "rotation_rms": rotation, "sensor_mm": sensor}
 
 
 def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
@@ -172,23 +157,3 @@ def _ranges(frames: np.ndarray) -> str:
     """`3, 7–12, 40` of increasing numbers."""
     runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
-
-
-def _facts(result: IngestResult, capture: Capture) -> list[tuple[str, str]]:
-    width, height = result.size
-    facts = [
-        ("recording", result.recording),
-        ("capture", str(result.capture)),
-        ("video", f"{result.video_frames} frames, {width} x {height} px, {result.video_fps:.4g} per second"),
-        ("cameras", "given" if result.reprojection_px is None else "found by structure from motion"),
-    ]
-    registration = result.registration
-    if registration is not None:
-        lever = ", ".join(f"{value:.1f}" for value in registration.camera_from_sensor[:3, 3])
-        facts.append(("scale", f"{registration.scale:.6g} mm per unit of the reconstruction"))
-        facts.append(("sensor on the scope", f"at {lever} mm in the camera's frame"))
-    for name, shape in result.shapes.items():
-        words = f"{len(shape.points):,} points {shape.spacing:.2g} mm apart, {shape.agreement:.0%} of frames agree"
-        facts.append((f"shape of {name}", words))
-    instruments = [f"{item.name} ({', '.join(item.joints) or 'no joints'})" for item in capture.instruments]
-    return [*facts, ("instruments", ", ".join(instruments) or "none")]
