@@ -106,7 +106,7 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     rows = []
     for name, clock in result.clocks.items():
         sure = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
-        moved = clock_cost_mm(name, clock.sd, result, capture)
+        moved = clock_cost_mm(name, clock.sd, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
         rows.append([name, offset, sure, cost, clock.source])
