@@ -47,7 +47,7 @@ from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.settings import plain
-from neeco.training.config import TrainConfig, variant_config
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
@@ -235,9 +235,9 @@ def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     if not spec.methods:
         raise NeecoError("--methods: none is given; name at least one")
     values = {"transforms": spec.transforms}
-    methods = {name: variant_config(name, values).method for name in spec.methods}
+    methods = {name: training_config(name, values).method for name in spec.methods}
     check_settings(spec.assignments, dict.fromkeys(methods.values()), "--seeds")
-    return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
+    return {name: training_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
 def _check_output(spec: ComparisonSpec) -> None:
