@@ -22,7 +22,7 @@ from neeco.raster.devices import device_of
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training import run as runs
-from neeco.training.config import variant_config
+from neeco.training.config import training_config
 from neeco.training.train import ProgressRow
 from neeco.training.train import train as train_run
 
@@ -182,7 +182,7 @@ def train(
     """
     given = {"iterations": iterations, "minutes": minutes, "seed": seed}
     texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in settings.items()}
-    config = variant_config(method, given, [f"{name.replace('__', '.')}={text}" for name, text in texts.items()])
+    config = training_config(method, given, [f"{name.replace('__', '.')}={text}" for name, text in texts.items()])
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 

@@ -36,7 +36,7 @@ def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
 
 
 def compared(spec: ComparisonSpec, **told):
-    return compare(plan_comparison(spec), **told)
+    return plain(compare(plan_comparison(spec), **told))
 
 
 def without_times(value):

@@ -104,7 +104,7 @@ class _Problem:
 
     def render(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
         """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
-        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
+        return rasterize(gaussians, self.moved_camera(level.camera, parameters)).color.cpu()
 
     def cost(self, level: _Level, image: Tensor, parameters: Tensor) -> float:
         """Huber cost of the residual plus the prior, in units of -log probability."""
@@ -180,7 +180,7 @@ def _normal_equations(
     residual = _smooth(image - level.target, level.weight)
     weight = problem.scale / (residual.abs() / problem.config.huber).clamp_min(1.0)
     # drawn a dozen times: the shadows, which move as little as what casts them, once
-    camera = problem.scene.camera(problem.moved_camera(level.camera, parameters))
+    camera = problem.moved_camera(level.camera, parameters)
     still = shadowed(gaussians, camera, rasterize)
     columns = []
     for index in range(len(parameters)):

@@ -21,6 +21,7 @@ from neeco.report.coverage import (
     histogram,
     unvisited,
 )
+from neeco.report.ingest_assessment import assess_ingest, clock_cost_mm, rms
 from neeco.report.ingest_figures import (
     AXIS_COLORS,
     MAIN_AXIS_COLOR,
@@ -33,7 +34,6 @@ from neeco.report.ingest_figures import (
 )
 from neeco.report.page import split_counts, write_page
 from neeco.report.tracks import LINE_COLORS, read_tracks, turning_data, view
-from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -55,7 +55,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         stamps=[result.capture],
         result=result,
         capture=capture,
-        verdict=give_verdict(result, capture),
+        verdict=assess_ingest(result, capture),
         splits=split_counts(capture),
         tiles=_tiles(result, capture),
         residuals=_residuals(result),
@@ -106,7 +106,7 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     rows = []
     for name, clock in result.clocks.items():
         sure = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
-        moved = clock_cost_mm(name, clock.sd, result, capture)
+        moved = clock_cost_mm(name, clock.sd, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
         rows.append([name, offset, sure, cost, clock.source])

@@ -111,7 +111,7 @@ class TrainConfig:
     }
 
     method: str = DEFAULT
-    iterations: int = 6000  # frames drawn and learned from
+    iterations: int = 6000  # frames rendered and learned from
     batch_size: int = 1  # frames between two optimiser steps
     minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0
@@ -164,27 +164,23 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     return with_fields(config, {"deformation": settings})
 
 
-def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
-    """`training_config` of a method or of a variant: METHOD+dta turns every part of the paper's dynamic training
-    adjustment on; `assignments` may turn single ones off again.
-
-    A part that does not apply to the method (noise, where nothing is encoded) has no effect. Raises NeecoError for an
-    unknown variant, and for one that is the method itself.
-    """
+def _variant_defaults(name: str) -> TrainConfig:
+    """The config that METHOD or METHOD+dta starts from: with +dta every part of the paper's dynamic training adjustment
+    is on. A part that does not apply to the method (noise, where nothing is encoded) has no effect."""
     method, plus, _ = name.partition("+")
+    base = method_defaults(method)
     if not plus:
-        return training_config(method, values, assignments)
+        return base
     if not name.endswith(ADJUSTED) or name.count("+") > 1:
         raise NeecoError(f"method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
     if not method_class(method).has_gaussians:
         raise NeecoError(
             f"method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
         )
-    base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
-    adjusted = with_fields(base, on)
+    adjusted: TrainConfig = with_fields(base, {f"schedule.{part}": "on" for part in schedule_parts()})
     if adjusted == base:
         raise NeecoError(f"method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
-    return _configured(adjusted, values, assignments)
+    return adjusted
 
 
 def schedule_parts() -> tuple[str, ...]:
@@ -192,17 +188,15 @@ def schedule_parts() -> tuple[str, ...]:
     return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
-def training_config(method: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
-    """The method's defaults with `values` that are not None, then NAME=VALUE `assignments` (dots reach nested fields).
+def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment), changed by
+    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
 
-    Raises NeecoError naming the option when a name is unknown or a value does not fit.
+    Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
+    variant, or one that is the method itself.
     """
-    return _configured(method_defaults(method), values, assignments)
-
-
-def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Sequence[str]) -> TrainConfig:
-    """`base` changed and checked as `training_config` says."""
-    config: TrainConfig = with_fields(base, {name: value for name, value in values.items() if value is not None})
+    given = {field: value for field, value in values.items() if value is not None}
+    config: TrainConfig = with_fields(_variant_defaults(name), given)
     _check_length(config)
     changed = config_to_dict(config)
     for assignment in assignments:

@@ -20,7 +20,7 @@ from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, r
 if TYPE_CHECKING:
     from neeco.scene import Drawable
 
-BEYOND = 0.2  # of the recorded range, by which a slider goes further where the capture states no limits
+MARGIN = 0.2  # of the recorded range, by which a slider goes further where the capture states no limits
 STILL = math.radians(1.0)  # half of the range of a joint that never moved
 
 
@@ -34,7 +34,7 @@ class Shaft:
 
 
 @dataclass(frozen=True)
-class Steered:
+class InstrumentControls:
     """How one instrument departs from the recording. The default does not."""
 
     joints: Mapping[str, float] = field(default_factory=dict)  # rad; those not named are as recorded
@@ -42,7 +42,7 @@ class Steered:
     roll: float = 0.0  # rad about the shaft
     yaw: float = 0.0  # rad about the shaft's end, to the side
     pitch: float = 0.0  # rad, about an axis at right angles to that of yaw
-    pose: np.ndarray | None = None  # [4, 4] world_from_instrument, mm: stands here, and slides and turns from here
+    pose: np.ndarray | None = None  # [4, 4] world_from_instrument, mm: slides and turns start here
 
     @property
     def departs(self) -> bool:
@@ -51,32 +51,32 @@ class Steered:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class Controls:
     """A place in the recording, and what is to be otherwise. frame: 1.5 is half way from the second to the third."""
 
     frame: float = 0.0
-    instruments: Mapping[str, Steered] = field(default_factory=dict)
+    instruments: Mapping[str, InstrumentControls] = field(default_factory=dict)
 
     @property
     def recorded_frame(self) -> int | None:
-        """The frame whose state is wished for just as it was recorded; None between frames and for steered states."""
-        steered = any(item.departs for item in self.instruments.values())
-        return int(self.frame) if self.frame == int(self.frame) and not steered else None
+        """The frame whose state this is, just as it was recorded; None between frames and for other states."""
+        departs = any(item.departs for item in self.instruments.values())
+        return int(self.frame) if self.frame == int(self.frame) and not departs else None
 
 
-def steered_state(states: Sequence[State], shafts: Mapping[str, Shaft], wishes: Wishes) -> State:
-    """The state that is wished for. `states`: the recording's, at least one; wishes for instruments that it lacks are
-    passed over. A frame outside the recording is its first or last."""
-    state = between(states, wishes.frame)
+def controlled_state(states: Sequence[State], shafts: Mapping[str, Shaft], controls: Controls) -> State:
+    """The state that the controls ask for. states: the recording's, at least one; controls of instruments that it lacks
+    are passed over. A frame outside the recording is its first or last."""
+    state = interpolated_state(states, controls.frame)
     moved = {
-        name: _steered(given, shafts[name], wishes.instruments[name]) if name in wishes.instruments else given
-        for name, given in state.instruments.items()
+        name: _moved(recorded, shafts[name], controls.instruments[name]) if name in controls.instruments else recorded
+        for name, recorded in state.instruments.items()
     }
     return State(moved, state.time)
 
 
-def between(states: Sequence[State], frame: float) -> State:
-    """The recording at a place between two frames: positions, joints and time on a line, rotations by slerp."""
+def interpolated_state(states: Sequence[State], frame: float) -> State:
+    """The recording at a place between two frames: positions, joints and time linearly, rotations by slerp."""
     frame = min(max(frame, 0.0), len(states) - 1.0)
     first, share = int(frame), frame - int(frame)
     if share == 0.0:
@@ -91,7 +91,7 @@ def between(states: Sequence[State], frame: float) -> State:
     return State(moved, (1 - share) * start.time + share * end.time)
 
 
-def counterpart(frame: float, frames: int, others: int) -> float:
+def corresponding_frame(frame: float, frames: int, others: int) -> float:
     """The place in a recording of `others` frames that belongs to `frame` of one of `frames`: the same where they are
     equally long, else at the same share of it; to a frame itself the nearest."""
     if frames == others:
@@ -119,38 +119,33 @@ def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) ->
     found = {}
     for (name, joint), recorded in joint_ranges(states).items():
         limits = next((item.joints.get(joint) for item in instruments if item.name == name), None)
-        if limits is not None and not (all(map(math.isfinite, limits)) and limits[0] < limits[1]):
-            limits = None
+        if limits is not None and all(map(math.isfinite, limits)) and limits[0] < limits[1]:
+            found[name, joint] = JointRange(*limits)
+            continue
         if recorded.upper - recorded.lower < 2 * STILL:
             middle = (recorded.upper + recorded.lower) / 2
             recorded = JointRange(middle - STILL, middle + STILL)
-        wide = recorded.widened(BEYOND, limits) if limits is None else JointRange(*limits)
-        found[name, joint] = wide
+        found[name, joint] = recorded.widened(MARGIN, None)
     return found
 
 
-def _steered(given: InstrumentState, shaft: Shaft, steered: Steered) -> InstrumentState:
-    if not steered.departs:
-        return given
-    pose = to_numpy(given.pose) if steered.pose is None else steered.pose
-    joints = {joint: steered.joints.get(joint, value) for joint, value in given.joints.items()}
-    return InstrumentState(torch.from_numpy(pose @ _offset(shaft, steered)), joints)
-
-
-def _offset(shaft: Shaft, steered: Steered) -> np.ndarray:
-    """instrument_from_instrument [4, 4] mm: roll about the shaft, then pitch and yaw about its end, then the slide,
-    along where it pointed before."""
-    side, up = across(shaft.along)
+def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls) -> InstrumentState:
+    """Roll about the shaft, then pitch and yaw about its end, then slide along where it pointed before."""
+    if not controls.departs:
+        return recorded
+    side, up = perpendicular_axes(shaft.along)
     turns = (
-        Rotation.from_rotvec(steered.yaw * up)
-        * Rotation.from_rotvec(steered.pitch * side)
-        * Rotation.from_rotvec(steered.roll * shaft.along)
+        Rotation.from_rotvec(controls.yaw * up)
+        * Rotation.from_rotvec(controls.pitch * side)
+        * Rotation.from_rotvec(controls.roll * shaft.along)
     )
-    slid = rigid(np.eye(3), steered.slide * shaft.along)
-    return slid @ turn_about(shaft.end, turns.as_rotvec())
+    offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
+    pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
+    joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
+    return InstrumentState(torch.from_numpy(pose @ offset), joints)
 
 
-def across(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def perpendicular_axes(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit directions [3] at right angles to `along` and each other; which two depends on `along` alone."""
     least = np.eye(3)[np.argmin(np.abs(along))]
     side = np.cross(along, least)

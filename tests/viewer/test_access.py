@@ -7,21 +7,23 @@ import hashlib
 import socket
 from pathlib import Path
 
+import numpy as np
 import pytest
 from viewer_world import grasper_scene, write_photographs, write_run
 
 from neeco.errors import NeecoError
-from neeco.viewer.guard import Guard, address_of, free_port, is_loopback, policy
-from neeco.viewer.source import Source
-from neeco.viewer.status import Shown, message_html, status_html
+from neeco.viewer.access import AccessControl, content_security_policy, free_port, is_loopback, url_of
+from neeco.viewer.panel import message_html, status_html
+from neeco.viewer.runs import WatchedRun
+from neeco.viewer.views import Picture, RunPicture
 
 TOKEN = "a-token"
-OPEN, LOCKED = Guard(None), Guard(TOKEN, "neeco_80")
+OPEN, LOCKED = AccessControl(None), AccessControl(TOKEN, "neeco_80")
 HOSTILE = '<img src=x onerror="alert(1)">{1+1}[a](javascript:alert(1))'
 
 
-def asked(guard: Guard, path: str = "/", **headers: str) -> str | None:
-    return guard.why_refused(path, {"host": ["127.0.0.1:80"]} | {name: [value] for name, value in headers.items()})
+def asked(guard: AccessControl, path: str = "/", **headers: str) -> str | None:
+    return guard.refusal(path, {"host": ["127.0.0.1:80"]} | {name: [value] for name, value in headers.items()})
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:80", "127.3.2.1:9"])
@@ -41,13 +43,13 @@ def test_a_name_that_was_made_to_lead_here_is_refused(host: str) -> None:
     "origin", ["http://evil.example", "null", "http://127.0.0.1:81", "http://localhost:80", "http://127.0.0.1:80.evil"]
 )
 @pytest.mark.parametrize("guard", [OPEN, LOCKED])
-def test_pages_of_other_sites_are_refused(guard: Guard, origin: str) -> None:
+def test_pages_of_other_sites_are_refused(guard: AccessControl, origin: str) -> None:
     assert "another site" in asked(guard, f"/?token={TOKEN}", origin=origin)
 
 
 def test_two_hosts_or_none_are_refused() -> None:
-    assert OPEN.why_refused("/", {"host": ["127.0.0.1", "evil.example"]}) is not None
-    assert OPEN.why_refused("/", {}) is not None
+    assert OPEN.refusal("/", {"host": ["127.0.0.1", "evil.example"]}) is not None
+    assert OPEN.refusal("/", {}) is not None
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,7 @@ def test_the_cookie_is_hidden_from_scripts_and_other_sites() -> None:
 
 
 def test_the_policy_lets_the_pages_own_script_run_and_connects_nowhere_else() -> None:
-    told = policy(b'<html><script data-p="x">let a = 1;</script>', "lab:80")
+    told = content_security_policy(b'<html><script data-p="x">let a = 1;</script>', "lab:80")
     digest = base64.b64encode(hashlib.sha256(b"let a = 1;").digest()).decode()
     directives = dict(part.split(" ", 1) for part in told.split("; "))
     assert f"'sha256-{digest}'" in directives["script-src"]
@@ -99,10 +101,10 @@ def test_only_loopback_goes_without_a_token(host: str, own: bool) -> None:
 
 
 def test_the_printed_address_carries_the_token() -> None:
-    assert address_of("127.0.0.1", 8080, None) == "http://127.0.0.1:8080/"
-    assert address_of("::1", 8080, None) == "http://[::1]:8080/"
-    assert address_of("lab", 8080, "t") == "http://lab:8080/?token=t"
-    assert address_of("0.0.0.0", 8080, "t") == f"http://{socket.gethostname()}:8080/?token=t"
+    assert url_of("127.0.0.1", 8080, None) == "http://127.0.0.1:8080/"
+    assert url_of("::1", 8080, None) == "http://[::1]:8080/"
+    assert url_of("lab", 8080, "t") == "http://lab:8080/?token=t"
+    assert url_of("0.0.0.0", 8080, "t") == f"http://{socket.gethostname()}:8080/?token=t"
 
 
 def test_a_port_that_is_taken_gives_the_next() -> None:
@@ -130,7 +132,9 @@ def test_a_host_or_port_that_cannot_be_is_named(host: str, port: int, named: str
 def test_names_of_a_run_stay_text(tmp_path: Path) -> None:
     scene = grasper_scene(frame_name="<b>{:06d}")
     run = write_run(scene, tmp_path / "<script>run", write_photographs(scene, tmp_path / "capture"))
-    html = status_html([Shown(Source(run).loaded, 2.0, True, trouble=HOSTILE)], 0.1, (6, 4), HOSTILE)
+    picture = Picture(np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6)))
+    part = RunPicture(0, WatchedRun(run).loaded, picture, 2.0, True, trouble=HOSTILE)
+    html = status_html([part], 0.1, (6, 4), HOSTILE)
     assert "<script" not in html
     assert "<img" not in html
     assert "<b>0" not in html

@@ -19,31 +19,31 @@ INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Guard:
+class AccessControl:
     """Decides on every HTTP request, that for the page and that which opens the web socket."""
 
     token: str | None  # None: loopback, where none is needed
     cookie: str = "neeco"  # that holds it; browsers send one to all ports of a host, so it should name the port
 
-    def why_refused(self, path: str, headers: Mapping[str, Sequence[str]]) -> str | None:
-        """Why a request for `path` is refused, or None. `headers`: every value that each, in small letters, has."""
+    def refusal(self, path: str, headers: Mapping[str, Sequence[str]]) -> str | None:
+        """Why a request for `path` is refused, or None. headers: name in small letters -> all its values."""
         hosts, origins = headers.get("host", ()), headers.get("origin", ())
         if len(hosts) != 1 or len(origins) > 1 or not HOST_HEADER.fullmatch(hosts[0]):
             return "one Host and at most one Origin are expected"
-        # a page of another site whose name was made to lead here (DNS rebinding) says that name
-        if self.token is None and not is_loopback(hostname(hosts[0])):
+        # DNS rebinding: another site's name that resolves to this machine appears as the Host
+        if self.token is None and not is_loopback(re.sub(r":\d*$", "", hosts[0])):
             return "open http://127.0.0.1, not another name of this machine"
         if origins and origins[0].partition("://")[2].lower() != hosts[0].lower():
             return "a page of another site asks"
-        if self.token is not None and not (self.carried(path) or self._remembered(headers)):
+        if self.token is not None and not (self.in_address(path) or self._in_cookie(headers)):
             return "the token is missing or wrong; open the whole address that neeco view printed"
         return None
 
-    def carried(self, path: str) -> bool:
+    def in_address(self, path: str) -> bool:
         """Does the address itself carry the token?"""
         return any(self._is_token(value) for value in parse_qs(path.partition("?")[2]).get("token", ()))
 
-    def _remembered(self, headers: Mapping[str, Sequence[str]]) -> bool:
+    def _in_cookie(self, headers: Mapping[str, Sequence[str]]) -> bool:
         pairs = (pair.partition("=") for value in headers.get("cookie", ()) for pair in value.split(";"))
         return any(name.strip() == self.cookie and self._is_token(value.strip()) for name, _, value in pairs)
 
@@ -52,20 +52,20 @@ class Guard:
         return self.token is not None and hmac.compare_digest(value.encode(errors="replace"), self.token.encode())
 
     def page_headers(self, path: str, page: bytes, host: str) -> dict[str, str]:
-        """What the browser is told with the page: to load and connect to nothing else, and to remember the token."""
+        """Headers of the page: the browser loads and connects to nothing else, and remembers the token."""
         headers = {
-            "Content-Security-Policy": policy(page, host),
-            "Referrer-Policy": "no-referrer",  # or the address would tell the token
+            "Content-Security-Policy": content_security_policy(page, host),
+            "Referrer-Policy": "no-referrer",  # or the address would give the token away
             "X-Content-Type-Options": "nosniff",
             "Cross-Origin-Resource-Policy": "same-origin",
             "Cache-Control": "no-store",
         }
-        if self.carried(path):
+        if self.in_address(path):
             headers["Set-Cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
         return headers
 
 
-def policy(page: bytes, host: str) -> str:
+def content_security_policy(page: bytes, host: str) -> str:
     """The Content-Security-Policy of a page whose own scripts may run, and nothing that is injected into it."""
     scripts = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in INLINE_SCRIPT.findall(page)]
     allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
@@ -83,11 +83,6 @@ def policy(page: bytes, host: str) -> str:
             "frame-ancestors 'none'",
         ]
     )
-
-
-def hostname(host: str) -> str:
-    """A Host header without its port."""
-    return re.sub(r":\d*$", "", host).lower()
 
 
 def is_loopback(host: str) -> bool:
@@ -118,7 +113,7 @@ def free_port(host: str, port: int) -> int:
     raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last.strerror or last}; give others")
 
 
-def address_of(host: str, port: int, token: str | None) -> str:
+def url_of(host: str, port: int, token: str | None) -> str:
     """What to open in a browser."""
     if host in ("0.0.0.0", "::", ""):
         host = socket.gethostname()

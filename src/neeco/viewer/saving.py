@@ -1,4 +1,4 @@
-"""What a user keeps while looking: states for `synthesize --states`, and single labelled images."""
+"""What a user saves while looking: states for `synthesize --states`, and single labelled images."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import load_record, record_path, write_sample
 
 if TYPE_CHECKING:
-    from neeco.raster.types import Camera
-    from neeco.viewer.source import Loaded
+    from neeco.viewer.runs import LoadedRun
 
 FOLDER = "kept"  # of the run
 STATES, SAMPLES = "states.jsonl", "samples"
 
 
-class Keeper:
+class SavedStates:
     """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it."""
 
     def __init__(self, run: Path) -> None:
@@ -41,37 +40,30 @@ class Keeper:
         """What `synthesize --states` takes."""
         return self.folder / STATES
 
-    def keep(self, loaded: Loaded, state: State, world_from_camera: np.ndarray) -> int:
-        """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are kept. Raises
+    def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
+        """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises
         NeecoError where the file cannot be written, or holds states of another scene."""
         line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
         with self._lock:
-            lines = [*self._lines(loaded), line]
-            write_text(self.states_path, "".join(f"{kept}\n" for kept in lines))
-            return len(lines)
+            return self._write([*self._lines(loaded), line])
 
-    def forget(self, loaded: Loaded) -> int:
+    def remove_last(self, loaded: LoadedRun) -> int:
         """Take the last one out again; returns how many are left. Raises NeecoError."""
         with self._lock:
-            lines = self._lines(loaded)[:-1]
-            if lines:
-                write_text(self.states_path, "".join(f"{kept}\n" for kept in lines))
-            else:
-                self.states_path.unlink(missing_ok=True)
-            return len(lines)
+            return self._write(self._lines(loaded)[:-1])
 
-    def kept(self, loaded: Loaded) -> list[StateLine]:
-        """What is kept, checked against the scene. Raises NeecoError."""
+    def read(self, loaded: LoadedRun) -> list[StateLine]:
+        """What is saved, checked against the scene. Raises NeecoError."""
         if not self.states_path.exists():
             return []
         return read_states(self.states_path, loaded.scene.instruments)
 
-    def save(self, loaded: Loaded, state: State, world_from_camera: np.ndarray) -> Path:
+    def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
         """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics and size; returns the
         image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
         scene = gaussian_scene(loaded.scene, "save labelled image")
         labeller = CompositedLabels(scene)
-        camera = self.camera(loaded, world_from_camera)
+        camera = moved_camera(loaded.recorded.cameras[0], world_from_camera)
         with scene.torch_threads(), torch.no_grad():
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = annotate(scene, drawing, labeller.names)
@@ -83,16 +75,19 @@ class Keeper:
             record = write_sample(root, index, drawing, labels, {})
         return root / record["image"]
 
-    def camera(self, loaded: Loaded, world_from_camera: np.ndarray) -> Camera:
-        """A recorded camera, standing there."""
-        return moved_camera(loaded.recorded.cameras[0], world_from_camera)
-
-    def _lines(self, loaded: Loaded) -> list[str]:
+    def _lines(self, loaded: LoadedRun) -> list[str]:
         """The lines that are there, of this scene's states."""
         lines = []
-        for line in self.kept(loaded):
-            told = state_to_json(line.state)
+        for line in self.read(loaded):
+            entry = state_to_json(line.state)
             if line.world_from_camera is not None:
-                told["camera"] = camera_to_json(to_numpy(torch.from_numpy(line.world_from_camera)))
-            lines.append(json.dumps(told, allow_nan=False))
+                entry["camera"] = camera_to_json(to_numpy(torch.from_numpy(line.world_from_camera)))
+            lines.append(json.dumps(entry, allow_nan=False))
         return lines
+
+    def _write(self, lines: list[str]) -> int:
+        if lines:
+            write_text(self.states_path, "".join(f"{line}\n" for line in lines))
+        else:
+            self.states_path.unlink(missing_ok=True)
+        return len(lines)

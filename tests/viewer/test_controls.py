@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from viewer_world import FRAMES, LIMITS, grasper_scene
 
 from neeco.capture.model import Instrument, InstrumentState, State
-from neeco.viewer.steering import (
+from neeco.viewer.controls import (
+    Controls,
+    InstrumentControls,
     Shaft,
-    Steered,
-    Wishes,
-    between,
-    counterpart,
+    controlled_state,
+    corresponding_frame,
+    interpolated_state,
     shafts_of,
     slider_ranges,
-    steered_state,
 )
 
 NAME = "grasper"
@@ -35,20 +35,20 @@ def two_states() -> tuple[State, State]:
     )
 
 
-def steered(frame: float = 0.0, **wishes) -> tuple[np.ndarray, dict[str, float]]:
-    state = steered_state(two_states(), {NAME: TILTED}, Wishes(frame, {NAME: Steered(**wishes)}))
+def steered(frame: float = 0.0, **controls) -> tuple[np.ndarray, dict[str, float]]:
+    state = controlled_state(two_states(), {NAME: TILTED}, Controls(frame, {NAME: InstrumentControls(**controls)}))
     return state.instruments[NAME].pose.numpy(), dict(state.instruments[NAME].joints)
 
 
 def test_a_recorded_frame_is_itself() -> None:
     states = two_states()
-    state = steered_state(states, {NAME: TILTED}, Wishes(1.0, {NAME: Steered()}))
+    state = controlled_state(states, {NAME: TILTED}, Controls(1.0, {NAME: InstrumentControls()}))
     assert state.instruments[NAME] is states[1].instruments[NAME]
     assert state.time == states[1].time
 
 
 def test_half_way_between_two_frames_everything_is_half_way() -> None:
-    state = between(two_states(), 0.5)
+    state = interpolated_state(two_states(), 0.5)
     pose = state.instruments[NAME].pose.numpy()
     assert pose[:3, 3] == pytest.approx([5, 0, 0])
     assert Rotation.from_matrix(pose[:3, :3]).as_rotvec() == pytest.approx([0, 0, 0.5])
@@ -59,7 +59,7 @@ def test_half_way_between_two_frames_everything_is_half_way() -> None:
 @pytest.mark.parametrize(("frame", "same"), [(-3.0, 0), (7.0, 1)])
 def test_outside_the_recording_are_its_ends(frame: float, same: int) -> None:
     states = two_states()
-    assert between(states, frame) is states[same]
+    assert interpolated_state(states, frame) is states[same]
 
 
 def test_sliding_goes_along_the_shaft_and_turns_nothing() -> None:
@@ -102,8 +102,8 @@ def test_a_given_pose_stands_instead_of_the_recorded_and_the_rest_adds_to_it() -
 
 def test_joints_that_are_not_named_stay_as_recorded() -> None:
     state = State({NAME: InstrumentState(pose_of(0, 0, 0, 0, 0, 0), {"a": 0.1, "b": 0.2})})
-    wishes = Wishes(0.0, {NAME: Steered(joints={"b": 0.9})})
-    assert steered_state([state], {NAME: TILTED}, wishes).instruments[NAME].joints == {"a": 0.1, "b": 0.9}
+    controls = Controls(0.0, {NAME: InstrumentControls(joints={"b": 0.9})})
+    assert controlled_state([state], {NAME: TILTED}, controls).instruments[NAME].joints == {"a": 0.1, "b": 0.9}
 
 
 def test_steered_poses_are_rigid() -> None:
@@ -114,26 +114,28 @@ def test_steered_poses_are_rigid() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wishes", "frame"),
+    ("controls", "frame"),
     [
-        (Wishes(3.0), 3),
-        (Wishes(3.5), None),
-        (Wishes(3.0, {NAME: Steered()}), 3),
-        (Wishes(3.0, {NAME: Steered(roll=0.1)}), None),
-        (Wishes(3.0, {NAME: Steered(joints={"jaw_angle": 0.2})}), None),
-        (Wishes(3.0, {NAME: Steered(pose=np.eye(4))}), None),
+        (Controls(3.0), 3),
+        (Controls(3.5), None),
+        (Controls(3.0, {NAME: InstrumentControls()}), 3),
+        (Controls(3.0, {NAME: InstrumentControls(roll=0.1)}), None),
+        (Controls(3.0, {NAME: InstrumentControls(joints={"jaw_angle": 0.2})}), None),
+        (Controls(3.0, {NAME: InstrumentControls(pose=np.eye(4))}), None),
     ],
 )
-def test_only_an_unsteered_frame_is_recorded(wishes: Wishes, frame: int | None) -> None:
-    assert wishes.recorded_frame == frame
+def test_only_an_unsteered_frame_is_recorded(controls: Controls, frame: int | None) -> None:
+    assert controls.recorded_frame == frame
 
 
 @pytest.mark.parametrize("method", ["kinematic", "neeco", "3dgs", "deformable-3dgs", "4dgs"])
 def test_every_method_is_steered_to_a_state_it_can_draw(method: str) -> None:
     scene = make_scene(method)
     shafts = shafts_of(scene)
-    wishes = Wishes(2.5, {item.name: Steered({"jaw_angle": 0.5}, 2.0, 0.1, 0.2, 0.3) for item in scene.instruments})
-    state = steered_state(scene.recorded.states, shafts, wishes)
+    controls = Controls(
+        2.5, {item.name: InstrumentControls({"jaw_angle": 0.5}, 2.0, 0.1, 0.2, 0.3) for item in scene.instruments}
+    )
+    state = controlled_state(scene.recorded.states, shafts, controls)
     with torch.no_grad():
         assert torch.isfinite(scene.render(state, scene.recorded.cameras[0]).color).all()
     assert set(shafts) == {item.name for item in scene.instruments}
@@ -142,7 +144,7 @@ def test_every_method_is_steered_to_a_state_it_can_draw(method: str) -> None:
 def test_a_field_is_steered_by_time_alone() -> None:
     scene = make_nerf()
     assert not shafts_of(scene)["rod"].learned
-    assert steered_state(scene.recorded.states, shafts_of(scene), Wishes(1.5)).time == pytest.approx(2.0)
+    assert controlled_state(scene.recorded.states, shafts_of(scene), Controls(1.5)).time == pytest.approx(2.0)
 
 
 def test_a_learned_shaft_is_the_one_that_is_drawn() -> None:
@@ -182,7 +184,7 @@ def test_a_joint_that_never_moved_still_has_a_range() -> None:
 
 
 def test_recordings_of_one_length_go_frame_by_frame_others_by_their_share() -> None:
-    assert counterpart(3.5, FRAMES, FRAMES) == 3.5
-    assert counterpart(2.5, 6, 11) == pytest.approx(5.0)
-    assert counterpart(2.0, 5, 4) == 2.0  # 1.5, and a frame has a frame beside it
-    assert counterpart(0.0, 1, 7) == 0.0
+    assert corresponding_frame(3.5, FRAMES, FRAMES) == 3.5
+    assert corresponding_frame(2.5, 6, 11) == pytest.approx(5.0)
+    assert corresponding_frame(2.0, 5, 4) == 2.0  # 1.5, and a frame has a frame beside it
+    assert corresponding_frame(0.0, 1, 7) == 0.0

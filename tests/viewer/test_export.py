@@ -18,8 +18,7 @@ from scene_worlds import make_scene
 from neeco.errors import NeecoError
 from neeco.scene.canonical import SH_C0
 from neeco.scene.scene import Scene
-from neeco.viewer.export import export_page, page_of
-from neeco.viewer.packed import pack
+from neeco.viewer.export import export_page, pack, page_of
 
 CPU = torch.device("cpu")
 SIZES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
