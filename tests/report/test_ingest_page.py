@@ -21,9 +21,9 @@ from neeco.ingest.motion import RoughShape
 from neeco.ingest.pipeline import IngestResult
 from neeco.ingest.registration import ClockOffset, Registration
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
+from neeco.report.ingest_assessment import assess_ingest
 from neeco.report.ingest_figures import in_view, main_axes, read_tracks, round_length
 from neeco.report.ingest_page import write_ingest_page
-from neeco.report.verdict import give_verdict
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}
@@ -201,7 +201,7 @@ def test_the_side_view_has_the_tissue_ahead_of_the_camera():
     ],
 )  # fmt: skip
 def test_the_verdict_names_what_is_doubtful(changes, level, piece):
-    verdict = give_verdict(made(SAMPLE, **changes), read_capture(SAMPLE))
+    verdict = assess_ingest(made(SAMPLE, **changes), read_capture(SAMPLE))
     assert verdict.level == level
     assert piece in " ".join([verdict.headline, *verdict.doubts])
 

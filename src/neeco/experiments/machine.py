@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,9 +31,11 @@ DRAWS = 7  # timed per run and round
 PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer images
 
 
-def machine(device: torch.device) -> dict[str, Any]:
-    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one."""
+def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
+    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one; of a study also its
+    `workers`, and the threads that each of several has."""
     on_gpu = device.type == "cuda"
+    share = threads_per_worker(workers) if workers is not None and workers > 1 else None
     return {
         "cpu": processor_name(),
         "cores": usable_cores(),
@@ -43,7 +46,7 @@ def machine(device: torch.device) -> dict[str, Any]:
         "torch": torch.__version__,
         "backend": f"{cuda_backend()} (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
         "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
-    }
+    } | ({} if workers is None else {"workers": workers, "threads_per_worker": share})
 
 
 def hardware_words(machine: Mapping[str, Any]) -> str:
@@ -52,14 +55,26 @@ def hardware_words(machine: Mapping[str, Any]) -> str:
     return f"{gpu}{machine['cpu']}, {machine['cores']} cores"
 
 
+def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
+    """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
+    count = machine["threads_per_worker"] or machine[threads]
+    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
+    return f"{hardware_words(machine)}, {count} thread{'s' if count > 1 else ''}{workers}, torch {machine['torch']}"
+
+
+def threads_per_worker(workers: int, cores: int | None = None) -> int:
+    """Each of `workers` gets its share of the cores, at least one thread."""
+    return max(1, (cores or usable_cores()) // workers)
+
+
 def processor_name() -> str:
     """The processor's name as the system knows it."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model"))]
-    return names[0] if names else platform.processor() or platform.machine()
+        text = ""
+    found = re.search(r"^(?:model name|Model)[^:\n]*:(.*)$", text, re.MULTILINE)
+    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
@@ -85,11 +100,10 @@ def reset_peak_memory() -> bool:
 def peak_memory_mb() -> float | None:
     """Most resident memory of this process since the last reset, in MiB; None where the system does not tell."""
     try:
-        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        found = re.search(r"^VmHWM:\s+(\d+)", STATUS.read_text(encoding="ascii", errors="replace"), re.MULTILINE)
     except OSError:
         return None
-    peaks = [round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith("VmHWM:")]
-    return peaks[0] if peaks else None
+    return round(int(found[1]) / 1024, 1) if found else None
 
 
 @torch.no_grad()

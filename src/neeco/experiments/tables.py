@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from neeco.files import write_text
@@ -174,8 +175,9 @@ def latex_table(table: Table, caption: str) -> str:
 
     headings, rows = _texts(table, latex_escape, r"\textbf{{{}}}", "failed")
     columns = "l" * len(table.keys) + "r" * (len(headings) - len(table.keys))
-    frame = pandas.DataFrame(rows, columns=headings)
-    return str(frame.to_latex(index=False, escape=False, caption=latex_escape(caption), column_format=columns))
+    style = pandas.DataFrame(rows, columns=headings).style.hide(axis="index")
+    caption = latex_escape(caption)
+    return str(style.to_latex(hrules=True, position_float="centering", caption=caption, column_format=columns))
 
 
 def latex_document(caption: str, tables: Sequence[Table], lead: Sequence[str], notes: Sequence[str]) -> str:
@@ -207,16 +209,10 @@ def _texts(table: Table, escape: Callable[[str], str], bold: str, failed: str) -
     return headings + [""] * (width - len(headings)), rows
 
 
-def write_files(output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str]) -> None:
+def write_files(
+    output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str] = MappingProxyType({})
+) -> None:
     """Write `texts` by suffix as STEM.csv, STEM.md and STEM.tex into `output`, and `data` by name into its data/."""
     files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
     for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():
         write_text(path, text)
-
-
-markdown_lines = markdown_table
-
-
-def latex_lines(table: Table, caption: str) -> list[str]:
-    """The lines of `latex_table`."""
-    return latex_table(table, caption).splitlines()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neeco.capture.model import Capture
-from neeco.evaluation.difference import PART_COLORS
+from neeco.evaluation.image_metrics import PART_COLORS
 from neeco.evaluation.mask_metrics import mean_of
 from neeco.experiments.downstream.job import default_conditions
 from neeco.experiments.downstream.results import (

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from neeco.capture.images import read_labels
 from neeco.capture.model import Capture
-from neeco.evaluation.difference import PART_COLORS, Pixels, overlay_outline, overlay_parts
+from neeco.evaluation.image_metrics import PART_COLORS, Pixels, overlay_outline, overlay_parts
 from neeco.evaluation.mask_metrics import box_ious
 from neeco.experiments.downstream.job import AUGMENT, REAL, job_folder, predictions_folder
 from neeco.experiments.downstream.results import MAIN, title_of

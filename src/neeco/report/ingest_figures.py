@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import outline
+from neeco.evaluation.image_metrics import outline
 from neeco.ingest.motion import RoughShape
 from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera

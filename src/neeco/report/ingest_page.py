@@ -14,8 +14,8 @@ from neeco.ingest.pipeline import IngestResult
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited
+from neeco.report.ingest_assessment import assess_ingest, clock_cost_mm, rms
 from neeco.report.page import split_counts, write_page
-from neeco.report.verdict import clock_cost_mm, give_verdict, rms
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -37,7 +37,7 @@ def write_ingest_page(result: IngestResult, path: Path, capture: Capture | None 
         stamps=[result.capture],
         result=result,
         capture=capture,
-        verdict=give_verdict(result, capture),
+        verdict=assess_ingest(result, capture),
         splits=split_counts(capture),
         in_view=[
             (item.name, figures.in_view(capture, item.name)) for item in capture.instruments if capture.registered
@@ -73,7 +73,7 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
     rows = []
     for name, clock in result.clocks.items():
         sure = f"±{clock.sd * 1000:.1f}" if np.isfinite(clock.sd) and clock.sd > 0 else "–"
-        moved = clock_cost_mm(name, clock.sd, result, capture)
+        moved = clock_cost_mm(name, clock.sd, capture)
         cost = f"{moved:.2f}" if moved else "–"
         offset = f"{clock.seconds * 1000:+.1f}".replace("-", "−")
         rows.append([name, offset, sure, cost, clock.source])
