@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from neeco.capture import read_capture
 from neeco.capture.model import Frame
 from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.files import write_text
 from neeco.raster.native import set_threads
 from neeco.scene import Drawable

@@ -43,7 +43,7 @@ def prepare() -> None:
         "neeco.ingest.pipeline",
         "neeco.ingest.convert",
         "neeco.report.annotated_page",
-        "neeco.report.comparison_page",
+        "neeco.report.study_pages",
         "neeco.report.downstream_page",
         "neeco.report.ingest_page",
         "neeco.synthesis.annotated",

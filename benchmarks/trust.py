@@ -22,7 +22,7 @@ from torch import Tensor
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
 from neeco.scene.scene import gaussian_scene

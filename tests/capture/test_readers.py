@@ -19,7 +19,7 @@ from neeco.capture.images import read_image, read_labels, read_mask, write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.points import points_in_view, read_ply
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.mask_folders import load_reference
 from neeco.raster import Camera
 
 ASCII_HEADER = b"ply\nformat ascii 1.0\nelement vertex 1\n" + b"".join(b"property float %c\n" % axis for axis in b"xyz")

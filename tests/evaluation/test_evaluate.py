@@ -1,4 +1,4 @@
-"""A whole evaluation of a world whose photographs the scene itself drew."""
+"""A whole evaluation of a world whose recorded images the scene itself drew."""
 
 import json
 from dataclasses import replace
@@ -102,11 +102,11 @@ def test_ignored_pixels_do_not_count(world, tmp_path):
     frame = run.recorded.frames[1]
     state = replace(
         frame.state, instruments={"bar": replace(frame.state.instruments["bar"], pose=world.translation(z=-50))}
-    )  # the bar is behind the camera now: only where it was in the photograph is the drawing wrong
+    )  # the bar is behind the camera now: only where it was in the recorded image is the drawing wrong
     ignore = torch.full((world.HEIGHT, world.WIDTH), 255, dtype=torch.uint8)
-    photo = frame.load_image()
+    recorded = frame.load_image()
     empty = world.rasterize(run.scene.at(state), frame.camera).color
-    ignore[(photo - empty).abs().amax(-1) > 0.004] = 0
+    ignore[(recorded - empty).abs().amax(-1) > 0.004] = 0
     path = tmp_path / "ignore.png"
     write_labels(path, ignore)
     open_frame, masked_frame = replace(frame, state=state), replace(frame, state=state, mask_path=path)
@@ -129,7 +129,7 @@ def test_an_unknown_split_is_refused_naming_those_there_are(world, tmp_path):
 
 
 def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_path, monkeypatch):
-    from neeco.evaluation import evaluate, lpips
+    from neeco.evaluation import evaluate, image_metrics
 
     seen = {}
 
@@ -143,10 +143,10 @@ def test_drawing_takes_one_thread_of_torch_and_lpips_those_it_found(world, tmp_p
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        network = lpips.Lpips((lpips.Convolution(1, 1, 0, None, True),), one_by_one_filter())
-        monkeypatch.setattr(lpips, "find_lpips", lambda folder: {"alexnet": network})
+        network = image_metrics.Lpips((image_metrics.Convolution(1, 1, 0, None, True),), one_by_one_filter())
+        monkeypatch.setattr(image_metrics, "find_lpips", lambda folder: {"alexnet": network})
         monkeypatch.setattr(evaluate, "draw", noting("draw", evaluate.draw))
-        monkeypatch.setattr(lpips, "conv2d", noting("lpips", lpips.conv2d))
+        monkeypatch.setattr(image_metrics, "relu", noting("lpips", image_metrics.relu))
         run = make_run(world, tmp_path)
         monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
         assert main(["evaluate", str(run.path), "--splits", "test"]) == 0

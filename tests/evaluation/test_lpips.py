@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from neeco.capture.images import read_image
 from neeco.errors import NeecoError
-from neeco.evaluation.lpips import NETWORKS, Lpips, find_lpips, load_lpips
+from neeco.evaluation.image_metrics import NETWORKS, Lpips, find_lpips, load_lpips
 
 WEIGHTS = os.environ.get("NEECO_LPIPS_WEIGHTS", "")
 needs_weights = pytest.mark.skipif(not WEIGHTS, reason="NEECO_LPIPS_WEIGHTS names no weights")
@@ -43,7 +43,8 @@ def test_a_full_mask_changes_nothing_and_ignored_pixels_do_not_count():
     target = torch.rand(64, 64, 3, generator=random)
     image = torch.rand(64, 64, 3, generator=random)
     everywhere = torch.ones(64, 64, dtype=torch.bool)
-    assert network.distance(image, target, everywhere) == pytest.approx(network.distance(image, target), rel=1e-5)
+    # a mean and a weighted mean of at most 15 x 15 cells: each sum of n float32 is right to n * 6e-8
+    assert network.distance(image, target, everywhere) == pytest.approx(network.distance(image, target), rel=5e-5)
     left = everywhere.clone()
     left[:, 32:] = False
     changed = image.clone()

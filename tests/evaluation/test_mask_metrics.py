@@ -1,4 +1,4 @@
-"""Overlap numbers worked out by hand."""
+"""Overlap numbers worked out by hand, and which masks a frame is scored against."""
 
 import math
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neeco.errors import NeecoError
+from neeco.evaluation.mask_folders import truth_file
 from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, to_truth_ids
 from neeco.labels.labellers import composited_parts
 from neeco.raster.types import Rendering
@@ -67,3 +68,20 @@ def test_a_pixel_is_instrument_where_its_columns_together_pass_the_threshold():
 def test_the_mean_leaves_out_what_is_not_known():
     assert mean_of([1.0, None, math.nan, 3.0]) == 2.0
     assert math.isnan(mean_of([None]))
+
+
+def test_exact_truth_comes_before_a_reference_mask(tmp_path):
+    assert truth_file(tmp_path, "000") is None
+    for folder in ("reference_masks", "truth/masks"):
+        (tmp_path / folder).mkdir(parents=True)
+        file = tmp_path / folder / "000.png"
+        file.touch()
+        assert truth_file(tmp_path, "000") == file
+
+
+def test_truth_lies_in_its_capture(tmp_path):
+    (tmp_path / "capture" / "truth" / "masks").mkdir(parents=True)
+    (tmp_path / "other.png").touch()
+    (tmp_path / "capture" / "truth" / "masks" / "000.png").symlink_to(tmp_path / "other.png")
+    with pytest.raises(NeecoError, match=r"000.png: a link leads out of .*capture"):
+        truth_file(tmp_path / "capture", "000")

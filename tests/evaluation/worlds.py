@@ -112,7 +112,7 @@ def state_at(x: float, y: float, z: float = 60.0, yaw: float = 0.0) -> State:
 
 
 def make_capture(root: Path, scene: TinyScene, splits: tuple[str, ...], *, truth: bool = True) -> Capture:
-    """One photograph per entry of `splits`, drawn by the scene itself, so every score has a known best."""
+    """One recorded image per entry of `splits`, drawn by the scene itself, so every score has a known best."""
     frames = []
     for index, split in enumerate(splits):
         state, camera = state_at(3.0 * index - 5, 2.0 * index - 3), camera_at(0.3 * index)
@@ -130,7 +130,7 @@ def make_capture(root: Path, scene: TinyScene, splits: tuple[str, ...], *, truth
 
 
 def moved(frame: Frame, instrument: Tensor, camera: Tensor) -> Frame:
-    """The same photograph with wrong poses: both transforms are applied in the moving body's own frame."""
+    """The same recorded image with wrong poses: both transforms are applied in the moving body's own frame."""
     given = frame.state.instruments["bar"]
     state = replace(frame.state, instruments={"bar": replace(given, pose=given.pose @ instrument)})
     return replace(

@@ -13,15 +13,26 @@ import torch
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import load_reference
-from neeco.experiments import ablation_run, training_job
-from neeco.experiments.ablation_results import phase_1_psnr, psnr_at, table_of, verdict
-from neeco.experiments.ablation_run import chosen_ablations, distinct_variants, run_ablations
-from neeco.experiments.ablation_tables import agreement, csv_text, latex, markdown, write_tables
-from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, Derived
+from neeco.evaluation.mask_folders import load_reference
+from neeco.experiments import ablation_study, training_job
+from neeco.experiments.ablation_study import (
+    ablation_csv,
+    agreement,
+    chosen_ablations,
+    direction,
+    distinct_variants,
+    grid,
+    markdown,
+    phase_1_psnr,
+    psnr_at,
+    run_ablations,
+    table_of,
+    write_tables,
+)
+from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, AblationPlan, Derived
 from neeco.experiments.derived import derive_capture
-from neeco.experiments.plans import AblationPlan
-from neeco.report.ablation_page import write_ablation_report
+from neeco.experiments.tables import latex_table
+from neeco.report.study_pages import write_ablation_report
 from neeco.training import train as train_module
 from neeco.training.run import read_config
 
@@ -30,7 +41,7 @@ SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
 
 @pytest.fixture(autouse=True)
 def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ablation_run, "score_label_ways", lambda *_: pytest.fail("labels were not asked for"))
+    monkeypatch.setattr(ablation_study, "score_label_ways", lambda *_: pytest.fail("labels were not asked for"))
 
 
 @pytest.fixture
@@ -64,7 +75,7 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
         off["values"]["psnr.test"] - on["values"]["psnr.test"], abs=1e-4
     )
     assert off["values"]["psnr.test"] == ablation["runs"][0]["splits"]["test"]["psnr"]
-    assert off["agrees"]["psnr.test"] == verdict(off["difference"]["psnr.test"], 22.26 - 28.31)
+    assert off["agrees"]["psnr.test"] == direction(off["difference"]["psnr.test"], 22.26 - 28.31)
     assert {row["label"] for row in uniform["curves"]} == {"off", "on"}
 
 
@@ -113,9 +124,9 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
         return {way: dict.fromkeys(splits, value) for way, value in (("composited", 0.9), ("threshold", 0.6))}
 
     labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
-    monkeypatch.setattr(ablation_run, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
-    monkeypatch.setattr(ablation_run, "distinct_variants", lambda chosen: [NEECO])
-    monkeypatch.setattr(ablation_run, "score_label_ways", score)
+    monkeypatch.setattr(ablation_study, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
+    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [NEECO])
+    monkeypatch.setattr(ablation_study, "score_label_ways", score)
     for _ in range(2):
         table = run_ablations(labels)["tables"][0]
     assert asked == ["neeco"]
@@ -177,7 +188,7 @@ def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_mea
     [(-3.0, -1.0, "yes"), (0.5, -1.0, "no"), (0.05, -1.0, "even"), (-0.09, -1.0, "even"), (None, -1.0, None)],
 )
 def test_directions_agree_when_the_signs_do(ours: float | None, paper: float, told: str | None) -> None:
-    assert verdict(ours, paper) == told
+    assert direction(ours, paper) == told
 
 
 def test_phase_1_ends_at_two_fifths_of_the_run_and_its_last_quarter_counts(tmp_path: Path) -> None:
@@ -201,10 +212,10 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
         row["values"] = {key: psnr for key in table["judged"]}
         if not row["reference"]:
             row["difference"] = {key: psnr - 22.0 for key in table["judged"]}
-            row["agrees"] = {key: verdict(psnr - 22.0, -1.0) for key in table["judged"]}
+            row["agrees"] = {key: direction(psnr - 22.0, -1.0) for key in table["judged"]}
     table["measures"] = table["judged"]
     assert agreement(table) == "8 of 12 as in the paper, 4 the other way"
-    rows = list(csv.DictReader(io.StringIO(csv_text(table))))
+    rows = list(csv.DictReader(io.StringIO(ablation_csv(table))))
     assert len(rows) == 4 * 4
     assert rows[0] | {"difference": float(rows[0]["difference"])} == {
         "table": "sh-compensation",
@@ -218,7 +229,7 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
         "agrees": "yes",
     }
     assert "\n| both | 16.82 | 22.00 |  |" in markdown(table)
-    assert r"test PSNR at 20 \%: paper" in latex(table)
+    assert r"test PSNR at 20 \%: paper" in latex_table(grid(table), table["title"])
     written = write_tables(tmp_path, {"tables": [table]})
     assert [path.suffix for path in written] == [".csv", ".md", ".tex"]
 

@@ -21,8 +21,7 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.experiments import training_job as jobs_module
-from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
-from neeco.experiments.summary import distances_to_training
+from neeco.experiments.comparison import ComparisonSpec, compare, distances_to_training, plan_comparison
 from neeco.experiments.training_job import Budget
 from neeco.scene.methods import method_settings
 from neeco.settings import plain

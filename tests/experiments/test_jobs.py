@@ -19,8 +19,8 @@ from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.experiments import study
 from neeco.experiments import training_job as module
-from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
-from neeco.experiments.study import check_workers, run_jobs, threads_per_worker
+from neeco.experiments.machine import peak_memory_mb, reset_peak_memory, threads_per_worker
+from neeco.experiments.study import check_workers, run_jobs
 from neeco.experiments.training_job import UNLIMITED, Budget, HeldOutFrames
 from neeco.raster.native import set_threads
 from neeco.training import train as train_module

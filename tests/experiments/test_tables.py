@@ -10,9 +10,16 @@ import pytest
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.experiments.comparison_tables import latex_text, markdown_text, summary_csv, tables_of
+from neeco.experiments.comparison import (
+    RUN_METRICS,
+    SPLIT_METRICS,
+    comparison_csv,
+    latex_text,
+    markdown_text,
+    summarise,
+    tables_of,
+)
 from neeco.experiments.study import spread
-from neeco.experiments.summary import RUN_METRICS, SPLIT_METRICS, summarise
 from neeco.experiments.tables import latex_escape
 
 PSNR = {"a_b": (20.0, 22.0), "c|d": (20.5, 21.5), "lost": ()}
@@ -91,7 +98,7 @@ def test_latex_escaping(text: str, escaped: str) -> None:
 
 
 def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
-    rows = list(csv.DictReader(io.StringIO(summary_csv(comparison))))
+    rows = list(csv.DictReader(io.StringIO(comparison_csv(comparison))))
     assert [row["name"] for row in rows] == ["a_b", "c|d", "lost"]
     assert float(rows[0]["psnr_std"]) == 2**0.5
     assert rows[2]["psnr_mean"] == ""

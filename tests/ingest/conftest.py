@@ -24,6 +24,7 @@ instruments:
       jaw_angle: {file: jaw.csv, calibration: table.csv}
 laparoscope: camera.csv
 sync: sync.json
+settings: {shape_frames: 3, registration_steps: 1}
 """
 
 

@@ -14,10 +14,8 @@ import yaml
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.ingest import pipeline
-from neeco.ingest.pipeline import ingest
+from neeco.ingest.pipeline import IngestResult, ingest
 from neeco.ingest.recording import read_recording
-from neeco.ingest.result import IngestResult
 
 pytest.importorskip("cv2")
 pytest.importorskip("av")
@@ -26,11 +24,6 @@ pytest.importorskip("pycolmap")
 
 def silent(what: str, done: int, total: int) -> None:
     """StageProgress that nobody watches."""
-
-
-@pytest.fixture(autouse=True)
-def few_frames_carved(monkeypatch):
-    monkeypatch.setattr(pipeline, "FRAMES", 3)
 
 
 def run(recorded, **changes) -> IngestResult:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -189,17 +188,6 @@ def as_images(case: Case) -> None:
 EDITS: list[Callable[[Case], None]] = [edit_table, edit_table, edit_bytes, edit_yaml, edit_files, edit_flags, as_images]
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Registration and page with less of what only takes time."""
-    from neeco.ingest import pipeline, registration
-    from neeco.report import ingest_figures
-
-    monkeypatch.setattr(registration, "least_squares", partial(registration.least_squares, max_nfev=1))
-    monkeypatch.setattr(pipeline, "FRAMES", 3)
-    monkeypatch.setattr(ingest_figures, "FIGURES", 1)
-
-
 def tree(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
 
@@ -244,13 +232,13 @@ def fuzz(seed: int, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize("seed", range(56))
-def test_it_is_refused_in_one_line_or_becomes_a_capture(seed, recorded, quick, capsys, monkeypatch):
+def test_it_is_refused_in_one_line_or_becomes_a_capture(seed, recorded, capsys, monkeypatch):
     monkeypatch.chdir(recorded.folder)
     fuzz(seed, recorded.folder, capsys)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(56, 600))
-def test_hundreds_are_refused_in_one_line_or_become_captures(seed, recorded, quick, capsys, monkeypatch):
+def test_hundreds_are_refused_in_one_line_or_become_captures(seed, recorded, capsys, monkeypatch):
     monkeypatch.chdir(recorded.folder)
     fuzz(seed, recorded.folder, capsys)

@@ -18,7 +18,7 @@ from neeco.capture.check import errors_only
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording import read_recording
-from neeco.ingest.work import begin, states_at
+from neeco.ingest.synchronized import SynchronizedRecording
 
 pytest.importorskip("cv2")
 pytest.importorskip("pycolmap")
@@ -136,24 +136,24 @@ def test_an_output_that_exists_is_not_touched(recording: Path, tmp_path: Path) -
     assert (tmp_path / "capture" / "mine.txt").read_text() == "keep"
 
 
-def states_with_limits(recording: Path, limits: list[float], folder: Path) -> list[float]:
+def states_with_limits(recording: Path, limits: list[float]) -> list[float]:
     document = yaml.safe_load(recording.read_text())
     document["instruments"][0]["joints"]["jaw_angle"]["limits"] = limits
     document["sync"]["em"] = OFFSET
     recording.write_text(yaml.safe_dump(document))
-    work = begin(read_recording(recording), folder, silent)
-    states, usable = states_at(work, work.times)
+    synchronized = SynchronizedRecording(read_recording(recording), silent)
+    states, usable = synchronized.states_at(synchronized.times)
     return states["tool"][1]["jaw_angle"][usable].tolist()
 
 
 def test_noise_does_not_carry_readings_beyond_their_limits(recording: Path, tmp_path: Path) -> None:
-    free = states_with_limits(recording, [-1.0, 3.0], tmp_path)
+    free = states_with_limits(recording, [-1.0, 3.0])
     least, greatest = min(free) + 0.02, max(free) + 0.5
-    held = states_with_limits(recording, [least, greatest], tmp_path)
+    held = states_with_limits(recording, [least, greatest])
     assert min(held) == pytest.approx(least)
     assert max(held) == pytest.approx(max(free))
     with pytest.raises(NeecoError, match=r"jaw\.csv: readings go .* beyond the joint's limits"):
-        states_with_limits(recording, [min(free) + 0.2, greatest], tmp_path)
+        states_with_limits(recording, [min(free) + 0.2, greatest])
 
 
 def test_logs_that_never_meet_the_video_are_refused_before_any_work(recording: Path, tmp_path: Path) -> None:

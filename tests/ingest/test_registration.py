@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.clocks import correlate, offset_from_instrument
 from neeco.ingest.logs import PoseLog
-from neeco.ingest.registration import register_with_laparoscope
+from neeco.ingest.registration import correlate, offset_from_instrument, register_with_laparoscope
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from neeco.ingest.select import choose_frames, look_over
+from neeco.ingest.frame_selection import choose_frames, frame_features
 
 
 def picture(shift: float, blur: int = 1) -> np.ndarray:
@@ -24,32 +24,33 @@ STATES[:, 0] = 2.0 * np.arange(30)
 
 
 def test_a_blurred_frame_is_dropped_and_says_so() -> None:
-    look = look_over(picture(4 * i, blur=15 if i == 12 else 1) for i in range(30))
-    selection = choose_frames(look, np.ones(30, dtype=bool), STATES, None)
-    assert dict(selection.dropped).keys() == {12}
-    assert "blurred" in dict(selection.dropped)[12]
+    features = frame_features(picture(4 * i, blur=15 if i == 12 else 1) for i in range(30))
+    _, dropped = choose_frames(features, np.ones(30, dtype=bool), STATES, None)
+    assert dropped.keys() == {12}
+    assert "blurred" in dropped[12]
+    assert not choose_frames(features, np.ones(30, dtype=bool), STATES, None, min_sharpness=0.01)[1]
 
 
 def test_a_frame_like_the_one_before_is_dropped_unless_the_instrument_moved() -> None:
-    look = look_over(picture(4 * min(i, 20)) for i in range(30))
+    features = frame_features(picture(4 * min(i, 20)) for i in range(30))
     still = STATES.copy()
     still[25:] = still[24]
-    kept = choose_frames(look, np.ones(30, dtype=bool), still, None).kept
+    kept, _ = choose_frames(features, np.ones(30, dtype=bool), still, None)
     assert kept.tolist() == list(range(25))
 
 
 def test_a_limit_keeps_extremes_and_both_ends() -> None:
-    look = look_over(picture(4 * i) for i in range(30))
+    features = frame_features(picture(4 * i) for i in range(30))
     states = STATES.copy()
     states[:, 5] = 0.0
     states[17, 5] = 3.0  # a state like no other
-    kept = choose_frames(look, np.ones(30, dtype=bool), states, 6).kept
+    kept, _ = choose_frames(features, np.ones(30, dtype=bool), states, 6)
     assert len(kept) == 6
     assert {0, 17, 29} <= set(kept.tolist())
 
 
 def test_frames_without_a_state_are_dropped() -> None:
-    look = look_over(picture(4 * i) for i in range(30))
+    features = frame_features(picture(4 * i) for i in range(30))
     usable = np.ones(30, dtype=bool)
     usable[:5] = False
-    assert choose_frames(look, usable, STATES, None).kept.min() == 5
+    assert choose_frames(features, usable, STATES, None)[0].min() == 5

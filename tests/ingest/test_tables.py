@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.tables import Rows, read_table
+from neeco.ingest.formats import read_table
+from neeco.ingest.logs import Rows
 
 
 @pytest.fixture

@@ -11,12 +11,10 @@ from itertools import pairwise
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.experiments.summary import summarise
-from neeco.report import comparison_shots
+from neeco.experiments.comparison import summarise
+from neeco.report import study_pages
 from neeco.report.charts import Series, binned, legend, line_chart
-from neeco.report.comparison_page import command_of, write_comparison_report
-from neeco.report.comparison_shots import median_frame
-from neeco.report.standings import first_in, standings
+from neeco.report.study_pages import command_of, findings, leader, median_frame, write_comparison_report
 
 VOID = {"meta", "img", "br", "path", "circle", "link"}
 FIGURES = ("summary.csv", "jobs.csv", "frames.csv", "curves.csv", "distance.csv", "speed.csv")
@@ -29,7 +27,7 @@ def capture(world, tmp_path, monkeypatch):
     def open_run(folder):
         return nullcontext(world.TinyRun(folder, scenes[folder.name.split("-seed")[0]], None))
 
-    monkeypatch.setattr(comparison_shots, "open_run", open_run)
+    monkeypatch.setattr(study_pages, "open_run", open_run)
     splits = ("train", "test", "test", "test", "unseen")
     return world.make_capture(tmp_path / "capture <b>", world.TinyScene(), splits)
 
@@ -189,32 +187,32 @@ def numbers(mean, std=None):
 
 def test_sentences_call_first_only_what_is_clear_of_the_spread():
     rows = [{"name": "a", "psnr": numbers(20.0, 0.2)}, {"name": "b", "psnr": numbers(20.3, 0.2)}]
-    assert first_in(rows, "psnr", "PSNR", " dB", 1) == (
+    assert leader(rows, "psnr", "PSNR", " dB", 1) == (
         "b and a level in PSNR, 20.3 dB, 0.3 dB apart (within the seeds' spread)"
     )
     rows[1]["psnr"] = numbers(21.0, 0.2)
-    assert first_in(rows, "psnr", "PSNR", " dB", 1) == (
+    assert leader(rows, "psnr", "PSNR", " dB", 1) == (
         "b first in PSNR, 21.0 dB, 1.0 dB before a (clear of the seeds' spread)"
     )
     rows[1]["psnr"] = numbers(21.0)
-    assert first_in(rows, "psnr", "PSNR", " dB", 1) == "b first in PSNR, 21.0 dB, 1.0 dB before a"
-    assert first_in([{"name": "a", "psnr": numbers(None)}], "psnr", "PSNR", " dB", 1) is None
+    assert leader(rows, "psnr", "PSNR", " dB", 1) == "b first in PSNR, 21.0 dB, 1.0 dB before a"
+    assert leader([{"name": "a", "psnr": numbers(None)}], "psnr", "PSNR", " dB", 1) is None
 
 
 def test_sentences_go_split_by_split(comparison):
-    told = standings(comparison)
+    told = findings(comparison)
     assert told[0].startswith("test: kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
     assert told[1].startswith("unseen: kinematic first")
     assert "level in drawing speed" in told[2]
 
 
 def test_one_seed_is_said_once(comparison):
-    assert not any("one seed" in sentence for sentence in standings(comparison))
+    assert not any("one seed" in sentence for sentence in findings(comparison))
     for row in comparison["summary"]:
         for value in row.values():
             if isinstance(value, dict) and value.get("std") is not None:
                 value["std"] = None
-    told = standings(comparison)
+    told = findings(comparison)
     assert sum("one seed" in sentence for sentence in told) == 1
     assert "not known" not in told[0]
 
@@ -245,7 +243,7 @@ def test_names_at_the_ends_of_lines_do_not_cover_one_another():
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, noon, monkeypatch):
     capture = world.make_capture(tmp_path / HOSTILE, world.TinyScene(), ("train", "test", "unseen"))
     opened = nullcontext(world.TinyRun(tmp_path, world.TinyScene(), None))
-    monkeypatch.setattr(comparison_shots, "open_run", lambda folder: opened)
+    monkeypatch.setattr(study_pages, "open_run", lambda folder: opened)
     jobs = [job(f"{HOSTILE}{k}", seed, 24.0 + k, 0.8) for k in (0, 1) for seed in (0, 1)]
     comparison = comparison_of(capture, [*jobs, {**FAILED, "name": HOSTILE, "error": HOSTILE}])
     comparison |= {"notes": [HOSTILE], "settings": [HOSTILE], "version": HOSTILE}

@@ -17,10 +17,9 @@ from PIL import Image
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.ingest.clocks import ClockOffset
-from neeco.ingest.moving import RoughShape
-from neeco.ingest.registration import Registration
-from neeco.ingest.result import IngestResult
+from neeco.ingest.motion import RoughShape
+from neeco.ingest.pipeline import IngestResult
+from neeco.ingest.registration import ClockOffset, Registration
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_figures import in_view, main_axes
 from neeco.report.ingest_page import write_ingest_page

@@ -7,15 +7,14 @@ from typing import Any
 from rich.console import Console
 
 from neeco.cli._output import fitted
-from neeco.experiments.plans import AblationPlan
+from neeco.experiments.ablations import AblationPlan
 
 
 def run(plan: AblationPlan) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.ablation_run import run_ablations
-    from neeco.experiments.ablation_tables import write_tables
-    from neeco.report.ablation_page import write_ablation_report
+    from neeco.experiments.ablation_study import run_ablations, write_tables
+    from neeco.report.study_pages import write_ablation_report
 
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
@@ -29,7 +28,7 @@ def run(plan: AblationPlan) -> int:
 
 def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
     """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
-    from neeco.experiments.ablation_tables import agreement, grid
+    from neeco.experiments.ablation_study import agreement, grid
 
     for table in ablation["tables"]:
         if table["judged"]:

@@ -57,9 +57,8 @@ class Compare:
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.comparison import compare, failures, plan_comparison
-    from neeco.experiments.comparison_tables import absent_notes, budget_words, tables_of
-    from neeco.report.comparison_page import write_comparison_report
+    from neeco.experiments.comparison import absent_notes, budget_words, compare, failures, plan_comparison, tables_of
+    from neeco.report.study_pages import write_comparison_report
 
     with Bars() as bars:
         plan = plan_comparison(_spec(args))

@@ -12,7 +12,7 @@ from neeco.settings import Device
 if TYPE_CHECKING:
     import torch
 
-    from neeco.evaluation.lpips import Lpips
+    from neeco.evaluation.image_metrics import Lpips
     from neeco.training.run import Run
 
 SAMPLE = "liver-mini"
@@ -33,7 +33,7 @@ class Arguments:
 def run(args: Arguments) -> int:
     """Do it all and say where everything lies."""
     from neeco.errors import NeecoError
-    from neeco.evaluation.lpips import find_lpips
+    from neeco.evaluation.image_metrics import find_lpips
     from neeco.raster.devices import device_of
     from neeco.training.run import open_run
 

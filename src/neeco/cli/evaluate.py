@@ -48,7 +48,7 @@ def run(args: Evaluate) -> int:
     from neeco.cli._output import ready_for_json
     from neeco.cli._progress import Bars
     from neeco.evaluation.evaluate import evaluate_run
-    from neeco.evaluation.lpips import find_lpips
+    from neeco.evaluation.image_metrics import find_lpips
     from neeco.files import new_folder, write_json
     from neeco.raster.devices import device_of
     from neeco.report import write_report

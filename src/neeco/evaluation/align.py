@@ -1,7 +1,7 @@
-"""Aligned scoring: fit instrument and camera pose of one frame to its photograph, the scene frozen.
+"""Aligned scoring: fit instrument and camera pose of one frame to its recorded image, the scene frozen.
 
 Trackers are off by a millimetre, which moves the drawn instrument by pixels whatever the model does. Fitting the pose
-separates what the scene knows from what the tracker said. The fit is Levenberg-Marquardt on the photometric residual
+separates what the scene learned from the tracker's error. The fit is Levenberg-Marquardt on the photometric residual
 (Huber weights), coarse to fine, with Jacobian columns by finite differences of drawings: it needs no gradient of the
 scene, so every method is aligned the same way, and a handful of steps does what gradient descent needs dozens for.
 """
@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from neeco.capture.model import Frame, InstrumentState, State
-from neeco.evaluation.resize import resize_camera, resize_image
+from neeco.capture.model import Frame, State
+from neeco.evaluation.image_metrics import resize_camera, resize_image
 from neeco.raster import rasterize
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.shadow import shadowed
@@ -36,15 +36,24 @@ class AlignConfig:
     sigma_camera_deg: float = 0.3
     levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # resolutions, coarse to fine
     steps: tuple[int, ...] = (3, 2, 2)  # Gauss-Newton steps at each
-    huber: float = 0.05  # colour residual beyond which a pixel pulls linearly: highlights and unseen tissue
+    huber: float = 0.05  # colour residual beyond which a pixel pulls linearly: highlights and unobserved tissue
     correlation_px: float = 100.0  # neighbouring pixels err together: so many count as one observation
     step_mm: float = 0.1  # finite difference at full resolution, larger at coarse levels
     step_deg: float = 0.1
 
 
 @dataclass(frozen=True)
+class Fit:
+    """A frame's fitted poses, drawable like the given ones, and the increments that led to them."""
+
+    state: State
+    camera: Camera
+    increments: Tensor  # [6 * (instruments + 1)] float64: rotation vector rad, translation mm, the camera's last
+
+
+@dataclass(frozen=True)
 class _Level:
-    """The photograph at one resolution."""
+    """The recorded image at one resolution."""
 
     camera: Camera  # size and intrinsics; its pose is the given one
     target: Tensor  # [h, w, 3]
@@ -69,6 +78,12 @@ class _Problem:
         camera = [config.sigma_camera_deg * torch.pi / 180] * 3 + [config.sigma_camera_mm] * 3
         return torch.tensor(instrument * len(self.names) + camera, dtype=torch.float64)
 
+    @property
+    def scale(self) -> float:
+        """Weight of a squared residual against the prior: errors of about `huber`, many pixels and 3 colours
+        correlated."""
+        return 1.0 / (self.config.huber**2 * self.config.correlation_px * 3)
+
     def moved_state(self, parameters: Tensor) -> State:
         """The state with each instrument moved by its increment."""
         instruments = dict(self.state.instruments)
@@ -87,26 +102,25 @@ class _Problem:
         """The posed scene."""
         return self.scene.at(self.moved_state(parameters))
 
-    def draw(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
+    def render(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
         """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
         return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
 
+    def cost(self, level: _Level, image: Tensor, parameters: Tensor) -> float:
+        """Huber cost of the residual plus the prior, in units of -log probability."""
+        huber = self.config.huber
+        residual = _smooth(image - level.target, level.weight).abs()
+        per_value = torch.where(residual < huber, 0.5 * residual**2, huber * (residual - 0.5 * huber))
+        data = self.scale * float(per_value.sum(dtype=torch.float64))
+        return data + 0.5 * float(((parameters / self.sigmas) ** 2).sum())
 
-@dataclass(frozen=True)
-class Fit:
-    """A frame's fitted poses, drawable like the given ones, and the increments that led to them."""
 
-    state: State
-    camera: Camera
-    increments: Tensor  # [6 * (instruments + 1)] float64: rotation vector rad, translation mm, the camera's last
-
-
-@torch.no_grad()
 def align_frame(scene: Scene, frame: Frame, config: AlignConfig | None = None) -> tuple[State, Camera]:
-    """Fit the poses of `frame` to its photograph and return the fitted state and camera, drawable like the given ones.
+    """Fit the poses of `frame` to its recorded image and return the fitted state and camera, drawable like the given
+    ones.
 
-    See `fit_frame`. Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the photograph cannot
-    be read.
+    See `fit_frame`. Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the image cannot be
+    read.
     """
     fit = fit_frame(scene, frame, frame.load_image(), config=config)
     return fit.state, fit.camera
@@ -116,7 +130,7 @@ def align_frame(scene: Scene, frame: Frame, config: AlignConfig | None = None) -
 def fit_frame(
     scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
 ) -> Fit:
-    """Fit the poses of `frame` to its photograph `image` [H, W, 3].
+    """Fit the poses of `frame` to its recorded `image` [H, W, 3].
 
     One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), with
     weak Gaussian priors at zero; joints and intrinsics stay. Pixels outside the frame's loss mask do not count.
@@ -128,7 +142,11 @@ def fit_frame(
     levels = [_level(frame.camera, image, mask, factor, config) for factor in config.levels]
     increments = torch.zeros(6 * (len(names) + 1), dtype=torch.float64)
     if start is not None and len(start) == len(increments):
-        increments = min((increments, start), key=lambda tried: _cost_at(problem, levels[0], tried))
+
+        def cost(tried: Tensor) -> float:
+            return problem.cost(levels[0], problem.render(problem.gaussians(tried), levels[0], tried), tried)
+
+        increments = min((increments, start), key=cost)
     for level, steps in zip(levels, config.steps, strict=True):
         increments = _fit_level(problem, level, increments, steps)
     return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
@@ -145,23 +163,21 @@ def _level(camera: Camera, image: Tensor, mask: Tensor | None, factor: float, co
 def _fit_level(problem: _Problem, level: _Level, parameters: Tensor, steps: int) -> Tensor:
     """A few Levenberg-Marquardt steps at one resolution; every accepted step lowers the cost."""
     gaussians = problem.gaussians(parameters)
-    image = problem.draw(gaussians, level, parameters)
-    cost = _cost(problem, level, image, parameters)
+    image = problem.render(gaussians, level, parameters)
+    cost = problem.cost(level, image, parameters)
     damping = 1e-3
     for _ in range(steps):
         normal, gradient = _normal_equations(problem, level, parameters, gaussians, image)
-        accepted = False
         for _ in range(3):
             system = normal + damping * torch.diag(torch.diagonal(normal))
             trial = parameters - torch.linalg.solve(system, gradient)
             trial_gaussians = problem.gaussians(trial)
-            trial_image = problem.draw(trial_gaussians, level, trial)
-            trial_cost = _cost(problem, level, trial_image, trial)
+            trial_image = problem.render(trial_gaussians, level, trial)
+            trial_cost = problem.cost(level, trial_image, trial)
             if trial_cost < cost:
-                accepted = True
                 break
             damping *= 10
-        if not accepted:
+        else:
             break
         parameters, gaussians, image, cost = trial, trial_gaussians, trial_image, trial_cost
         damping = max(damping / 10, 1e-6)
@@ -173,7 +189,7 @@ def _normal_equations(
 ) -> tuple[Tensor, Tensor]:
     """J^T W J [P, P] and J^T W r [P] of residual and prior at `parameters`, Jacobian by forward differences."""
     residual = _smooth(image - level.target, level.weight)
-    weight = _scale(problem.config) / (residual.abs() / problem.config.huber).clamp_min(1.0)
+    weight = problem.scale / (residual.abs() / problem.config.huber).clamp_min(1.0)
     # drawn a dozen times: the shadows, which move as little as what casts them, once
     camera = problem.scene.camera(problem.moved_camera(level.camera, parameters))
     still = shadowed(gaussians, camera, rasterize)
@@ -184,31 +200,13 @@ def _normal_equations(
         moved[index] += step
         is_camera = index >= len(parameters) - 6
         posed = still if is_camera else replace(problem.gaussians(moved), headlight=still.headlight)
-        columns.append(_smooth(problem.draw(posed, level, moved) - image, level.weight).flatten() / step)
+        columns.append(_smooth(problem.render(posed, level, moved) - image, level.weight).flatten() / step)
     jacobian = torch.stack(columns)  # [P, h * w * 3]
     weighted = jacobian * weight.flatten()
     precision = problem.sigmas**-2
     normal = (weighted @ jacobian.T).double() + torch.diag(precision)
     gradient = (weighted @ residual.flatten()).double() + precision * parameters
     return normal, gradient
-
-
-def _cost_at(problem: _Problem, level: _Level, parameters: Tensor) -> float:
-    return _cost(problem, level, problem.draw(problem.gaussians(parameters), level, parameters), parameters)
-
-
-def _cost(problem: _Problem, level: _Level, image: Tensor, parameters: Tensor) -> float:
-    """Huber cost of the residual plus the prior, in units of -log probability."""
-    huber = problem.config.huber
-    residual = _smooth(image - level.target, level.weight).abs()
-    per_value = torch.where(residual < huber, 0.5 * residual**2, huber * (residual - 0.5 * huber))
-    data = _scale(problem.config) * float(per_value.sum(dtype=torch.float64))
-    return data + 0.5 * float(((parameters / problem.sigmas) ** 2).sum())
-
-
-def _scale(config: AlignConfig) -> float:
-    """Weight of a squared residual against the prior: errors of about `huber`, many pixels and 3 colours correlated."""
-    return 1.0 / (config.huber**2 * config.correlation_px * 3)
 
 
 def _smooth(difference: Tensor, weight: Tensor) -> Tensor:
@@ -219,22 +217,16 @@ def _smooth(difference: Tensor, weight: Tensor) -> Tensor:
     return conv2d(planes, kernel, padding=1)[:, 0].permute(1, 2, 0)
 
 
-def moves(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:
-    """How far a fit moved every instrument, by name, and the `camera`; each as `moved_by` says it."""
-    moved = {name: moved_by(given, state.instruments[name]) for name, given in frame.state.instruments.items()}
-    return moved | {"camera": moved_by(frame.camera, camera)}
-
-
-def moved_by(given: InstrumentState | Camera, fitted: InstrumentState | Camera) -> dict[str, float]:
-    """How far a fit moved a pose: {"mm": distance of the origins, "deg": angle of the rotation}."""
-    before, after = _pose(given), _pose(fitted)
-    relative = torch.linalg.inv(before) @ after
-    cosine = ((torch.diagonal(relative[:3, :3]).sum() - 1) / 2).clamp(-1, 1)
-    return {
-        "mm": float(relative[:3, 3].norm()),
-        "deg": float(torch.rad2deg(torch.arccos(cosine))),
+def pose_changes(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:
+    """How far a fit moved every instrument, by name, and the `camera` (see `pose_change`)."""
+    moved = {
+        name: pose_change(given.pose, state.instruments[name].pose) for name, given in frame.state.instruments.items()
     }
+    return moved | {"camera": pose_change(frame.camera.world_from_camera, camera.world_from_camera)}
 
 
-def _pose(item: InstrumentState | Camera) -> Tensor:
-    return (item.world_from_camera if isinstance(item, Camera) else item.pose).double()
+def pose_change(given: Tensor, fitted: Tensor) -> dict[str, float]:
+    """How far pose `fitted` [4, 4] is from `given`: {"mm": distance of the origins, "deg": angle of the rotation}."""
+    relative = torch.linalg.inv(given.double()) @ fitted.double()
+    cosine = ((torch.diagonal(relative[:3, :3]).sum() - 1) / 2).clamp(-1, 1)
+    return {"mm": float(relative[:3, 3].norm()), "deg": float(torch.rad2deg(torch.arccos(cosine)))}

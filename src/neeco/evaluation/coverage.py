@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from neeco.capture.model import Frame
-from neeco.evaluation.resize import resize_camera, resize_mask
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.evaluation.image_metrics import resize_camera, resize_mask
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.pinhole import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
@@ -31,7 +30,7 @@ CHUNK = 16  # views tested at once; most points are found seen in the first chun
 
 @dataclass(frozen=True)
 class Coverage:
-    """Depth maps of the training views, drawn once and asked for every test frame."""
+    """Depth maps of the training views, rendered once and compared with every test frame."""
 
     camera_from_world: Tensor  # [V, 4, 4]
     intrinsics: Tensor  # [V, 4] fx, fy, cx, cy in px of the depth maps
@@ -69,23 +68,18 @@ class Coverage:
 
 
 @torch.no_grad()
-def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
-    """Draw the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
-    count = min(len(frames), MAX_VIEWS)
-    chosen = [frames[round(index)] for index in np.linspace(0, len(frames) - 1, count)] if count else []
-    drawn = []
-    for frame in chosen:
-        camera = _small(frame.camera)
-        rendering = scene.render(frame.state, camera)
-        drawn.append((scene.camera(camera), _filled(rendering)))
-    height = max((camera.height for camera, _ in drawn), default=1)
-    width = max((camera.width for camera, _ in drawn), default=1)
-    depths = torch.zeros(len(drawn), height, width)
-    for index, (_, depth) in enumerate(drawn):
+def observed_depths(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
+    """Render the depth maps of (at most MAX_VIEWS of) the training `frames`, small, instrument included."""
+    chosen = [frames[index] for index in evenly_spaced(len(frames), MAX_VIEWS)]
+    cameras = [_small(frame.camera) for frame in chosen]
+    maps = [_filled(scene.render(frame.state, camera)) for frame, camera in zip(chosen, cameras, strict=True)]
+    height, width = max((len(depth) for depth in maps), default=1), max((depth.shape[1] for depth in maps), default=1)
+    depths, views = torch.zeros(len(maps), height, width), torch.zeros(len(maps), 4, 4)
+    for index, (depth, camera) in enumerate(zip(maps, cameras, strict=True)):
         depths[index, : depth.shape[0], : depth.shape[1]] = depth
-    cameras = [camera for camera, _ in drawn]
+        views[index] = torch.linalg.inv(scene.camera(camera).world_from_camera.cpu().double()).float()
     return Coverage(
-        _stack([torch.linalg.inv(camera.world_from_camera.cpu().double()).float() for camera in cameras], (4, 4)),
+        views,
         torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras]).reshape(-1, 4),
         depths,
         torch.tensor([[c.width, c.height] for c in cameras], dtype=torch.long).reshape(-1, 2),
@@ -93,7 +87,7 @@ def observe(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
 
 
 @torch.no_grad()
-def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Tensor, Tensor]:
+def unobserved_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Tensor, Tensor]:
     """Tissue in `frame` that no training view saw, and all its tissue: two bool masks [H, W].
 
     The surface is the scene's own expected depth at the frame's state and camera; where nothing is drawn, that of the
@@ -106,10 +100,10 @@ def unseen_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tuple[Te
         tissue = composited_parts(rendering, threshold_of(scene)).cpu() == 0
     centers = pixel_centers(camera.height, camera.width)
     points = unproject_world(centers, _filled(rendering), scene.camera(camera))  # [h, w, 3]
-    unseen = torch.zeros_like(tissue)
-    unseen[tissue] = ~coverage.seen(points[tissue])
+    unobserved = torch.zeros_like(tissue)
+    unobserved[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)
-    return resize_mask(unseen, *size), resize_mask(tissue, *size)
+    return resize_mask(unobserved, *size), resize_mask(tissue, *size)
 
 
 def _small(camera: Camera) -> Camera:
@@ -125,7 +119,3 @@ def _filled(rendering: Rendering) -> Tensor:
         return depth
     rows, columns = distance_transform_edt(hollow, return_distances=False, return_indices=True)
     return depth[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
-
-
-def _stack(matrices: list[Tensor], shape: tuple[int, int]) -> Tensor:
-    return torch.stack(matrices) if matrices else torch.zeros(0, *shape)

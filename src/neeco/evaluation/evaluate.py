@@ -1,4 +1,4 @@
-"""How good a run is: every number, per split, as given and aligned."""
+"""How good a run is: every number, per split, at the given poses and at aligned ones."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
-from neeco.capture.model import Capture, Frame, State
+from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.align import align_frame, moves
-from neeco.evaluation.coverage import Coverage, observe, unseen_tissue
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, Lpips
-from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, mean_of, to_truth_ids
-from neeco.evaluation.scoring import LPIPS_KEYS, SCORES, photograph, score
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.align import align_frame, pose_changes
+from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
+from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
+from neeco.evaluation.mask_folders import Reference, load_reference
+from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, iou, mean_of, to_truth_ids
 from neeco.files import write_json
-from neeco.labels.drawing import draw
+from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise
-from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 
 if TYPE_CHECKING:
@@ -34,12 +33,25 @@ if TYPE_CHECKING:
 EVALUATION_FILE = "evaluation.json"
 TIMED_DRAWS = 7
 TIMED_SECONDS = 10.0  # after which a slow scene is not drawn again
+LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
+SCORES = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "lpips_vgg",
+    "psnr_instrument",
+    "mask_iou",
+    "mask_dice",
+    "psnr_covered",
+    "psnr_uncovered",
+    "covered_fraction",
+)
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
 @dataclass
-class _Split:
-    """Rows and part tallies of one split under one kind of pose."""
+class _Tally:
+    """Scores of the frames of one split, drawn at one kind of pose."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     parts: PartTally = field(default_factory=PartTally)
@@ -53,6 +65,18 @@ class _Context:
     capture: Capture
     networks: Mapping[str, Lpips]
     coverage: Coverage
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """A frame as recorded, with all that scoring needs; made once, used for the given and the aligned drawing."""
+
+    image: Tensor  # [H, W, 3] in [0, 1]
+    mask: Tensor | None  # [H, W] bool, False where pixels do not count
+    reference: Reference | None
+    unobserved: Tensor  # [H, W] bool, tissue that no training frame saw
+    tissue: Tensor  # [H, W] bool
+    features: dict[str, list[Tensor]]  # LPIPS features by network name
 
 
 def evaluate_run(
@@ -78,43 +102,31 @@ def evaluate_run(
         gaussian_scene(scene, "--align")
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
-    context = _Context(scene, capture, networks, observe(scene, capture.split("train")))
+    context = _Context(scene, capture, networks, observed_depths(scene, capture.split("train")))
     report("training views", 1, 1)
-    evaluation = _evaluate_splits(context, splits, ("given", "aligned") if align else ("given",), report)
-    write_json(run.path / EVALUATION_FILE, evaluation)
-    return evaluation
-
-
-def _evaluate_splits(
-    context: _Context, splits: Sequence[str], kinds: tuple[str, ...], report: Progress
-) -> dict[str, Any]:
-    """What `evaluate_run` returns."""
-    scene, capture = context.scene, context.capture
-    notes = _scene_notes(scene, context.networks)
+    kinds = ("given", "aligned") if align else ("given",)
+    notes = _scene_notes(scene, networks)
     result: dict[str, Any] = {kind: {} for kind in kinds}
-    labels: dict[str, Any] = {
-        "threshold": threshold_of(scene),
-        "names": [list(name) for name in scene.label_names],
-        "jaw_assignment": {kind: {} for kind in kinds},
-    }
+    jaw_assignment: dict[str, Any] = {kind: {} for kind in kinds}
     per_frame: dict[str, Any] = {kind: {} for kind in kinds}
     for split in splits:
         frames = capture.split(split)
-        tallies = {kind: _Split() for kind in kinds}
+        tallies = {kind: _Tally() for kind in kinds}
         for index, frame in enumerate(frames):
             report(split, index, len(frames))
             _score_frame(context, frame, tallies)
         report(split, len(frames), len(frames))
         fps, count = _speed(scene, frames)
         for kind, tally in tallies.items():
-            numbers, assignment = _summary(scene, tally)
+            numbers, jaw_assignment[kind][split] = _summary(scene, tally)
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
-            labels["jaw_assignment"][kind][split] = assignment
             per_frame[kind][split] = tally.rows
         notes += _split_notes(split, result["given"][split])
-    cleaned = _clean(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
-    assert isinstance(cleaned, dict)
-    return cleaned
+    names = [list(name) for name in scene.label_names]
+    labels = {"threshold": threshold_of(scene), "names": names, "jaw_assignment": jaw_assignment}
+    evaluation: dict[str, Any] = _finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
+    write_json(run.path / EVALUATION_FILE, evaluation)
+    return evaluation
 
 
 def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tuple[str, ...]:
@@ -132,33 +144,52 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
     return tuple(dict.fromkeys(splits))
 
 
-def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Split]) -> None:
+def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
     """Draw one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
     scene = context.scene
-    seen = unseen_tissue(context.coverage, scene, frame)
-    photo = photograph(frame, load_reference(context.capture, frame), seen, context.networks)
+    unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
+    reference = load_reference(context.capture, frame)
+    image, mask = frame.load_image(), frame.load_mask()
+    networks = context.networks if min(image.shape[:2]) >= MIN_SIZE else {}
+    features = {name: network.features(image) for name, network in networks.items()}
+    recorded = _Recorded(image, mask, reference, unobserved, tissue, features)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
             state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
-            row |= _fit_of(frame, state, camera)
+            row["moved"] = pose_changes(frame, state, camera)
+            row["world_from_camera"] = camera.world_from_camera.tolist()
+            row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         drawing = draw(scene, state, camera)
-        tally.rows.append(row | score(drawing, photo, context.networks))
-        if drawing.parts is not None and photo.reference is not None and photo.reference.parts is not None:
-            tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), photo.reference.parts, photo.mask)
+        tally.rows.append(row | _scores(drawing, recorded, networks))
+        if drawing.parts is not None and reference is not None and reference.parts is not None:
+            tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), reference.parts, mask)
 
 
-def _fit_of(frame: Frame, state: State, camera: Camera) -> dict[str, Any]:
-    """The fitted poses, and how far they moved."""
-    return {
-        "moved": moves(frame, state, camera),
-        "world_from_camera": camera.world_from_camera.tolist(),
-        "world_from_instrument": {name: item.pose.tolist() for name, item in state.instruments.items()},
-    }
+def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
+    """All numbers of one frame, by the names in SCORES; None where there is nothing to compare with."""
+    image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
+    counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
+    tissue = int((recorded.tissue & counted).sum())
+    row: dict[str, float | None] = dict.fromkeys(SCORES)
+    row["psnr"] = psnr(image, target, counted)
+    row["ssim"] = ssim(image, target, mask)
+    row["psnr_covered"] = psnr(image, target, counted & ~recorded.unobserved)
+    row["psnr_uncovered"] = psnr(image, target, counted & recorded.unobserved)
+    row["covered_fraction"] = 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None
+    shown = image if mask is None else torch.where(mask[..., None], image, target)
+    for name, network in networks.items():
+        row[LPIPS_KEYS[name]] = network.between(network.features(shown), recorded.features[name], mask)
+    if reference is not None:
+        row["psnr_instrument"] = psnr(image, target, counted & reference.mask)
+        if drawing.parts is not None:
+            row["mask_iou"] = iou(drawing.parts > 0, reference.mask, counted)
+            row["mask_dice"] = dice(drawing.parts > 0, reference.mask, counted)
+    return row
 
 
-def _summary(scene: Drawable, tally: _Split) -> tuple[dict[str, Any], str | None]:
+def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], str | None]:
     """Means over the frames that have the number, and which way the jaws were matched."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.rows]) for key in SCORES}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.rows)
@@ -175,8 +206,8 @@ def _summary(scene: Drawable, tally: _Split) -> tuple[dict[str, Any], str | None
 
 @torch.no_grad()
 def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]:
-    """Posed draws per second (median of TIMED_DRAWS after two to warm up; of fewer where those take long) and Gaussians
-    drawn."""
+    """Posed renderings per second (median of TIMED_DRAWS after two that do not count; of fewer where those take long)
+    and Gaussians drawn."""
     seconds: list[float] = []
     for index in range(TIMED_DRAWS + 2):
         frame = frames[index % len(frames)]
@@ -219,12 +250,12 @@ def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
     return notes
 
 
-def _clean(value: Any) -> Any:
+def _finite(value: Any) -> Any:
     """The same structure with NaN and infinity as None: JSON has no such numbers."""
     if isinstance(value, dict):
-        return {key: _clean(item) for key, item in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
+        return [_finite(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

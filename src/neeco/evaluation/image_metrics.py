@@ -1,17 +1,45 @@
-"""How close a drawn image is to the photograph: PSNR and SSIM, over all pixels or those of a mask."""
+"""How close a drawn image is to the recorded one: PSNR, SSIM, LPIPS, and pictures of where it is wrong.
+
+LPIPS is Zhang et al., CVPR 2018, version 0.1, in plain torch; the weights are the user's, nothing is downloaded.
+"""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from safetensors.torch import load_file
+from scipy.ndimage import binary_erosion
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
+
+from neeco.errors import NeecoError
+from neeco.raster.native import torch_threads
+from neeco.raster.types import Camera
+
+Pixels = NDArray[np.uint8]  # [H, W, 3]
 
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
 _C1, _C2 = 0.01**2, 0.03**2  # Wang et al. 2004, eq. 13, for a dynamic range of 1
+WEIGHTS_VARIABLE = "NEECO_LPIPS_WEIGHTS"
+MIN_SIZE = 32  # px; below it the pooled maps vanish
+FULL_SCALE = 0.25  # mean absolute difference of a pixel drawn in the brightest colour; fixed, so maps can be compared
+# black - violet - red - yellow - white: dark is right, bright is wrong; lightness rises evenly, for grey print
+_COLORS = np.array(
+    [[0, 0, 4], [60, 15, 110], [150, 38, 103], [221, 81, 58], [251, 165, 10], [252, 255, 200]], np.float64
+)
+PART_COLORS = np.array(
+    [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66]],
+    np.float64,
+)  # Okabe and Ito: told apart by colour-blind readers
+LEGEND_HEIGHT, LEGEND_FONT = 14, 10  # px
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -35,17 +63,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     mask [H, W] bool: ignored pixels are taken from `target` (so they disturb no window) and left out of the mean.
     NaN when no pixel counts.
     """
-    values = ssim_map(image, target, mask)
-    if mask is not None:
-        values = values[mask]
-    return float(values.mean()) if values.numel() else math.nan
-
-
-def ssim_map(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """SSIM per pixel and channel, [H, W, 3]; arguments as in `ssim`.
-
-    Not the loss's (`raster.losses.ssim_map`), which sums its window in another order: scores keep their last bits.
-    """
+    # not the loss's (`raster.losses.ssim_map`), which sums its window in another order: scores keep their last bits
     if mask is not None:
         image = torch.where(mask[..., None], image, target)
     x = image.permute(2, 0, 1)  # [3, H, W]
@@ -57,19 +75,215 @@ def ssim_map(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tenso
     covariance = mean_xy - mean_x * mean_y
     numerator = (2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)
     denominator = (mean_x * mean_x + mean_y * mean_y + _C1) * (var_x + var_y + _C2)
-    return (numerator / denominator).permute(1, 2, 0)
+    values = (numerator / denominator).permute(1, 2, 0)  # [H, W, 3]
+    if mask is not None:
+        values = values[mask]
+    return float(values.mean()) if values.numel() else math.nan
 
 
 def _blur(planes: Tensor) -> Tensor:
     """Gaussian blur of [C, H, W] planes with zero padding; the window is separable, so two passes of 11 taps."""
-    window = _window(planes.dtype, planes.device)
+    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window = (weights / weights.sum()).to(planes)
     pad = SSIM_WINDOW // 2
     rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))
     return conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
 
 
-@lru_cache(maxsize=2)
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    return (weights / weights.sum()).to(device, dtype)
+@dataclass(frozen=True)
+class Convolution:
+    """A convolution with ReLU. `pool`: (kernel, stride) of the max pooling before it. `tap`: its output is compared."""
+
+    kernel: int
+    stride: int
+    padding: int
+    pool: tuple[int, int] | None
+    tap: bool
+
+
+_ALEXNET = (
+    Convolution(11, 4, 2, None, True),
+    Convolution(5, 1, 2, (3, 2), True),
+    Convolution(3, 1, 1, (3, 2), True),
+    Convolution(3, 1, 1, None, True),
+    Convolution(3, 1, 1, None, True),
+)
+_VGG16 = tuple(
+    Convolution(3, 1, 1, (2, 2) if block > 0 and index == 0 else None, index == depth - 1)
+    for block, depth in enumerate((2, 2, 3, 3, 3))
+    for index in range(depth)
+)
+NETWORKS: dict[str, tuple[Convolution, ...]] = {"alexnet": _ALEXNET, "vgg16": _VGG16}
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """A perceptual distance: 0 for equal images, larger is further apart."""
+
+    layers: tuple[Convolution, ...]
+    weights: dict[str, Tensor]  # features.i.weight [O, I, k, k], features.i.bias [O], linear.j.weight [O]
+    threads: int = field(default_factory=torch.get_num_threads)  # of torch: these convolutions gain from several
+
+    @torch.no_grad()
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Unit-normalised feature maps, each [C, h, w], of an image [H, W, 3] in [0, 1]."""
+        image = image.float()
+        shift = image.new_tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
+        scale = image.new_tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
+        maps: list[Tensor] = []
+        x = ((image.permute(2, 0, 1) * 2 - 1 - shift) / scale)[None]
+        with torch_threads(self.threads):
+            for index, layer in enumerate(self.layers):
+                if layer.pool is not None:
+                    x = max_pool2d(x, *layer.pool)
+                weight, bias = self.weights[f"features.{index}.weight"], self.weights[f"features.{index}.bias"]
+                x = relu(conv2d(x, weight, bias, stride=layer.stride, padding=layer.padding))
+                if layer.tap:
+                    maps.append(x[0] / (x[0].norm(dim=0, keepdim=True) + 1e-10))
+        return maps
+
+    @torch.no_grad()
+    def between(self, first: list[Tensor], second: list[Tensor], mask: Tensor | None = None) -> float:
+        """Distance of two images given by their `features`.
+
+        mask [H, W] bool: each feature-map cell counts by the fraction of its image area that is True. The images should
+        agree where the mask is False, because receptive fields reach across its border.
+        """
+        total = 0.0
+        for index, (a, b) in enumerate(zip(first, second, strict=True)):
+            weight = self.weights[f"linear.{index}.weight"].view(-1, 1, 1)
+            difference = ((a - b) ** 2 * weight).sum(0)  # [h, w]
+            if mask is None:
+                total += float(difference.mean())
+            else:
+                share = adaptive_avg_pool2d(mask[None].float(), (difference.shape[0], difference.shape[1]))[0]
+                total += float((difference * share).sum() / share.sum())
+        return total
+
+    def distance(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+        """LPIPS of `image` [H, W, 3] against `target` [H, W, 3], both in [0, 1]; pixels outside `mask` do not count."""
+        if mask is not None:
+            image = torch.where(mask[..., None], image, target)
+        return self.between(self.features(image), self.features(target), mask)
+
+
+def find_lpips(folder: Path | None = None) -> dict[str, Lpips]:
+    """The networks whose weights lie in `folder`, else in the folder NEECO_LPIPS_WEIGHTS names; empty when neither is.
+
+    Raises NeecoError when a folder is named but holds no usable weights: a wrong path must not look like a missing one.
+    """
+    source = "--lpips-weights"
+    if folder is None:
+        value = os.environ.get(WEIGHTS_VARIABLE, "")
+        if not value:
+            return {}
+        folder, source = Path(value), WEIGHTS_VARIABLE
+    if not folder.is_dir():
+        raise NeecoError(f"{folder}: {source}: no such folder; name the one that holds alexnet.safetensors")
+    found = {name: load_lpips(path, name) for name in NETWORKS if (path := folder / f"{name}.safetensors").exists()}
+    if not found:
+        raise NeecoError(f"{folder}: {source}: holds neither alexnet.safetensors nor vgg16.safetensors")
+    return found
+
+
+def load_lpips(path: Path, network: str) -> Lpips:
+    """Read a network ("alexnet" or "vgg16") from a safetensors file. Raises NeecoError when unreadable or misshapen."""
+    layers = NETWORKS[network]
+    try:
+        weights = load_file(path)
+    except Exception as error:  # safetensors raises its own, undocumented types
+        raise NeecoError(f"{path}: not a readable safetensors file: {' '.join(str(error).split())}") from error
+    taps = 0
+    for index, layer in enumerate(layers):
+        weight, bias = weights.get(f"features.{index}.weight"), weights.get(f"features.{index}.bias")
+        if weight is None or bias is None or weight.dim() != 4 or weight.shape[-1] != layer.kernel:
+            raise NeecoError(f"{path}: features.{index}: missing, or not the filter that {network} has there")
+        if layer.tap:
+            linear = weights.get(f"linear.{taps}.weight")
+            if linear is None or linear.numel() != weight.shape[0]:
+                raise NeecoError(f"{path}: linear.{taps}.weight: missing or not of {weight.shape[0]} channels")
+            taps += 1
+    return Lpips(layers, {name: tensor.float() for name, tensor in weights.items()})
+
+
+def difference_map(
+    image: np.ndarray, target: np.ndarray, full_scale: float = FULL_SCALE, legend: bool = True
+) -> Pixels:
+    """|image - target| averaged over colours, in a fixed colour map; [H, W, 3] float in [0, 1] both, uint8 out.
+
+    Differences of `full_scale` and above take the brightest colour. `legend`: a labelled scale is drawn below the map,
+    which makes the result LEGEND_HEIGHT px taller.
+    """
+    difference = np.abs(np.asarray(image, np.float64) - np.asarray(target, np.float64)).mean(axis=2)
+    colored = _colored(difference / full_scale)
+    return np.concatenate([colored, _legend(colored.shape[1], full_scale)]) if legend else colored
+
+
+def overlay_parts(image: np.ndarray, parts: np.ndarray, opacity: float = 0.45) -> Pixels:
+    """Tint each part of `parts` [H, W] (0 is left clear) over `image` [H, W, 3] in [0, 1]; outline the whole mask."""
+    pixels = np.asarray(image, np.float64) * 255
+    colors = PART_COLORS[(parts.astype(np.int64) - 1) % len(PART_COLORS)]
+    inside = parts > 0
+    pixels[inside] = (1 - opacity) * pixels[inside] + opacity * colors[inside]
+    pixels[outline(inside)] = 255
+    return _to_uint8(pixels)
+
+
+def overlay_outline(image: Pixels, mask: np.ndarray, color: tuple[int, int, int] = (255, 255, 0)) -> Pixels:
+    """`image` uint8 [H, W, 3] with the outline of a second mask [H, W], such as the truth's, drawn over it."""
+    pixels = image.copy()
+    pixels[outline(mask > 0)] = color
+    return pixels
+
+
+def outline(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels of the mask with a 4-neighbour outside it; the image's border is no outside."""
+    return mask & ~binary_erosion(mask, border_value=1)
+
+
+def _colored(fraction: np.ndarray) -> Pixels:
+    """Colour map of values [H, W]; below 0 and above 1 are clipped."""
+    position = np.clip(fraction, 0, 1)
+    stops = np.linspace(0, 1, len(_COLORS))
+    return _to_uint8(np.stack([np.interp(position, stops, _COLORS[:, channel]) for channel in range(3)], axis=-1))
+
+
+def _legend(width: int, full_scale: float) -> Pixels:
+    """A strip [LEGEND_HEIGHT, width, 3]: the colour scale with its ends and middle labelled."""
+    strip = Image.new("RGB", (width, LEGEND_HEIGHT))
+    strip.paste(Image.fromarray(_colored(np.linspace(0, 1, width)[None].repeat(4, 0))), (0, 1))
+    pen, font = ImageDraw.Draw(strip), ImageFont.load_default(LEGEND_FONT)
+    for place, anchor in ((0.0, "ls"), (0.5, "ms"), (1.0, "rs")):
+        pen.text((round(place * width), LEGEND_HEIGHT - 2), f"{place * full_scale:.3g}", "white", font, anchor)
+    return np.asarray(strip)
+
+
+def _to_uint8(pixels: np.ndarray) -> Pixels:
+    return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
+
+
+def resize_camera(camera: Camera, factor: float) -> Camera:
+    """The same pinhole with `factor` times the pixels along each side (rounded to whole pixels, at least one)."""
+    width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+    across, down = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        cx=camera.cx * across,  # pixel centres lie at +0.5, so scaling needs no offset
+        cy=camera.cy * down,
+        width=width,
+        height=height,
+    )
+
+
+def resize_image(image: Tensor, camera: Camera) -> Tensor:
+    """Area-average an image [H, W, C] to the camera's size."""
+    planes = image.permute(2, 0, 1)[None]
+    return interpolate(planes, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
+
+
+def resize_mask(mask: Tensor, width: int, height: int) -> Tensor:
+    """Nearest-neighbour resize of a bool mask [H, W]."""
+    return interpolate(mask[None, None].float(), size=(height, width), mode="nearest-exact")[0, 0] > 0.5

@@ -1,4 +1,7 @@
-"""Folders of masks, whoever made them: which file is which image's, and what its numbers mean."""
+"""Masks to compare: a capture's truth or reference masks, and folders of masks, whoever made them.
+
+For evaluation only: nothing that learns may read a capture's truth.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,53 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from torch import Tensor
 
-from neeco.capture import read_capture
-from neeco.capture.images import open_image
+from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
+from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
-from neeco.evaluation.truth import REFERENCE_FOLDER, read_reference, truth_file
-from neeco.files import read_json
+from neeco.files import read_json, require_inside
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
 PARTS_FILE = "parts.json"  # what the ids of a folder that `neeco render` wrote mean
 TRUTH_NAMES = {number: part for part, number in TRUTH_PARTS.items()}
+REFERENCE_FOLDER = "reference_masks"
+MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # in which a frame's is looked for, in this order
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The instrument's true mask, and its parts where they are known."""
+
+    mask: Tensor  # [H, W] bool
+    parts: Tensor | None  # [H, W] uint8, the truth's numbers
+
+
+def truth_file(root: Path, name: str) -> Path | None:
+    """The mask that the frame called `name` of the capture in `root` is scored against; None when it has none. Raises
+    NeecoError where a link leads out of the capture."""
+    file = next((file for folder in MASK_FOLDERS if (file := root / folder / f"{name}.png").is_file()), None)
+    return None if file is None else require_inside(file, root)
+
+
+def load_reference(capture: Capture, frame: Frame) -> Reference | None:
+    """The mask to score a frame against: `truth/masks/<stem>.png` (parts), else `reference_masks/<stem>.png` (0/255).
+
+    None when the capture has neither. Raises NeecoError when the file is damaged or of another size than the frame.
+    """
+    file = truth_file(capture.root, frame.name)
+    return None if file is None else _read_reference(file, frame)
+
+
+def _read_reference(file: Path, frame: Frame) -> Reference:
+    """What `truth_file` found of a frame: part ids (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), or a mask."""
+    size = frame.camera.width, frame.camera.height
+    if file.parent.name == REFERENCE_FOLDER:
+        return Reference(read_mask(file, size), None)
+    parts = read_labels(file, size)
+    return Reference(parts > 0, parts)
 
 
 @dataclass(frozen=True)
@@ -36,8 +74,8 @@ class Masks:
         """Ids [H, W] uint8 of the image of that name; 0 is tissue. Raises NeecoError."""
         if name not in self.frames:
             return read_ids(self.files[name])
-        known = read_reference(self.files[name], self.frames[name])
-        return (known.mask if known.parts is None else known.parts).numpy().astype(np.uint8)
+        reference = _read_reference(self.files[name], self.frames[name])
+        return (reference.mask if reference.parts is None else reference.parts).numpy().astype(np.uint8)
 
     def counted(self, name: str) -> np.ndarray | None:
         """bool [H, W], False where the image's pixels are to be ignored; None when all count. Raises NeecoError."""
@@ -66,21 +104,20 @@ def read_ids(path: Path) -> np.ndarray:
     image = open_image(path)
     if image.format != "PNG":
         raise NeecoError(f"{path}: a mask must be PNG, this is {image.format}, which alters values; save it as PNG")
-    if image.mode == "1":
-        return np.asarray(image).astype(np.uint8) * 255
-    if image.mode == "L":
-        return np.array(image, np.uint8)
+    pixels = np.array(image)
+    if image.mode in ("1", "L"):
+        return pixels.astype(np.uint8) * (255 if image.mode == "1" else 1)
     if image.mode == "P":
-        return _palette_ids(image)
-    if image.mode in ("LA", "RGB", "RGBA"):
-        pixels = np.asarray(image)
-        colours = pixels[..., :-1] if image.mode.endswith("A") else pixels
-        if image.mode.endswith("A") and pixels[..., -1].min(initial=255) < 255:
+        return _palette_ids(image, pixels)
+    if image.mode not in ("LA", "RGB", "RGBA"):
+        raise NeecoError(f"{path}: image mode {image.mode} is no mask; save 8-bit grey or palette PNG")
+    if image.mode.endswith("A"):
+        if pixels[..., -1].min(initial=255) < 255:
             raise NeecoError(f"{path}: a mask must not be transparent; save it as grey PNG")
-        if (colours == colours[..., :1]).all():
-            return np.ascontiguousarray(colours[..., 0])
+        pixels = pixels[..., :-1]
+    if not (pixels == pixels[..., :1]).all():
         raise NeecoError(f"{path}: a colour image: which part is which colour? save ids as grey or palette PNG")
-    raise NeecoError(f"{path}: image mode {image.mode} is no mask; save 8-bit grey or palette PNG")
+    return np.ascontiguousarray(pixels[..., 0])
 
 
 def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str = "--classes") -> Masks:
@@ -103,10 +140,10 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
         _check_ids(files, {255}, "0 and 255", option)
         return Masks(path, files, None)
     names = classes if classes is not None else _stated_names(path)
-    if names is not None:
-        _check_ids(files, set(names), ", ".join(f"{number} {part}" for number, part in names.items()), option)
-        return Masks(path, files, names)
-    return _guessed(path, files, suffix == "", option)
+    if names is None:
+        return _guessed(path, files, suffix == "", option)
+    _check_ids(files, set(names), ", ".join(f"{number} {part}" for number, part in names.items()), option)
+    return Masks(path, files, names)
 
 
 def read_truth(path: Path) -> Capture | Path:
@@ -150,14 +187,12 @@ def _capture_masks(path: Path, frames: Sequence[Frame], classes: Mapping[int, st
         raise NeecoError(f"{path}: its frames have no truth/masks and no {REFERENCE_FOLDER}; give a folder of masks")
     parts = all(file.parent.name != REFERENCE_FOLDER for file in files.values())
     if classes is not None and not parts:
-        raise NeecoError(
-            f"--truth-classes: {path / REFERENCE_FOLDER} tell the instrument, no parts; leave --truth-classes out"
-        )
+        what = f"{path / REFERENCE_FOLDER} tell the instrument, no parts"
+        raise NeecoError(f"--truth-classes: {what}; leave --truth-classes out")
     return Masks(path, files, (classes or TRUTH_NAMES) if parts else None, frames=masked)
 
 
-def _palette_ids(image: Image.Image) -> np.ndarray:
-    ids = np.array(image, np.uint8)
+def _palette_ids(image: Image.Image, ids: np.ndarray) -> np.ndarray:
     palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
     used = np.unique(ids)
     if used.max() >= len(palette):
@@ -176,9 +211,8 @@ def _stated_names(path: Path) -> dict[int, str] | None:
     try:
         return {int(entry["id"]): str(entry["part"]) for entry in stated["ids"] if entry["id"]}
     except (KeyError, TypeError, ValueError):
-        raise NeecoError(
-            f'{file}: ids: expected [{{"id": 1, "part": "shaft"}}, …]; mend it or give --classes'
-        ) from None
+        expected = 'expected [{"id": 1, "part": "shaft"}, …]'
+        raise NeecoError(f"{file}: ids: {expected}; mend it or give --classes") from None
 
 
 def _found_ids(file: Path) -> set[int]:

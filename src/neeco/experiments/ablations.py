@@ -1,4 +1,4 @@
-"""What `neeco ablate` takes away, and what the paper found when it did: definitions, no logic.
+"""What `neeco ablate` takes away, and what the paper found when it did: definitions, no logic, nothing heavy imported.
 
 Numbers under `paper` are the NeeCo paper's ablation tables (dB). Its runs went to 20,000 steps, so the schedule is
 stated for those (`schedule.published_steps`) and scaled to the run. The paper's own numbers (18.68 dB in phase 1, 18.88
@@ -10,18 +10,53 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from neeco.experiments.families import KINEMATIC_RUNS, NEECO_RUNS, Family
+import tyro
+
+from neeco.settings import Device
 
 CHECKPOINTS = (20, 40, 60, 100)  # per cent of the run: the paper's 4k, 8k, 12k and 20k steps
 NOISE_DEGREES_PER_MM = 0.2
+PUBLISHED_STEPS = 20_000
+PHASE_1_STEPS = 8_000
+PHASE_1_SHARE = PHASE_1_STEPS / PUBLISHED_STEPS
 
+# measures; {split}: the first held-out split, `test` where there is one
 PHASE_1_PSNR = "phase_1_psnr"  # training frames, as in the paper
-FINAL_PSNR = "psnr.{split}"  # {split}: the first held-out split, `test` where there is one
+FINAL_PSNR = "psnr.{split}"
+CHECKPOINT_PSNR = tuple(f"psnr_at_{percent}.{{split}}" for percent in CHECKPOINTS)
 
-Group = Literal["paper", "ours"]
-LabelWay = Literal["composited", "threshold"]
+
+@dataclass(frozen=True)
+class AblationPlan:
+    """Take parts of the methods away one by one, as the paper does and beyond; tables, figures and a page of both.
+
+    The same command again goes on where it was interrupted.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    """Capture folder."""
+    output: Path
+    """Folder for tables, report.html and the runs."""
+    tables: tuple[str, ...] = ("paper", "ours")
+    """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, labels,
+    frames, tracker-noise), or tables by name."""
+    iterations: int = 1_000
+    """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
+    kinematic_iterations: int | None = None
+    """Steps of every kinematic run, which cost less; by default as many, but at least 1,000."""
+    seed: int = 0
+    """Of every run, and of the noise put on tracker poses."""
+    workers: int = 1
+    """Runs at once (more than one needs neeco[cluster])."""
+    transforms: str = "transforms.json"
+    """Which transforms file of the capture to read."""
+    settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = ()
+    """Any other field of the training config, as NAME=VALUE (e.g. max_tissue_gaussians=4000), in every run;
+    repeatable."""
+    device: Device = "auto"
 
 
 @dataclass(frozen=True)
@@ -39,10 +74,10 @@ class Derived:
 
 @dataclass(frozen=True)
 class Variant:
-    """One run: a method of a family with some settings (as for `--set`) on the capture or on one derived from it."""
+    """One run: a method with some settings (as for `--set`) on the capture or on one derived from it."""
 
     name: str  # of its run folder
-    family: Family
+    method: Literal["neeco", "kinematic"]
     settings: tuple[str, ...] = ()
     derived: Derived | None = None
 
@@ -57,7 +92,7 @@ class Entry:
     variant: Variant
     paper: Mapping[str, float] = field(default_factory=dict)
     expected: int = 0
-    label_way: LabelWay | None = None
+    label_way: Literal["composited", "threshold"] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +112,7 @@ class Ablation:
     """
 
     name: str
-    group: Group
+    group: Literal["paper", "ours"]
     title: str
     question: str
     comparisons: tuple[Comparison, ...]
@@ -86,20 +121,32 @@ class Ablation:
     level_name: str = ""
 
 
-NEECO = Variant("neeco", NEECO_RUNS)
-KINEMATIC = Variant("kinematic", KINEMATIC_RUNS)
+NEECO = Variant("neeco", "neeco")
+KINEMATIC = Variant("kinematic", "kinematic")
 
 
 def _neeco(name: str, *settings: str) -> Variant:
-    return Variant(f"neeco-{name}", NEECO_RUNS, settings)
+    return Variant(f"neeco-{name}", "neeco", settings)
 
 
 def _kinematic(name: str, *settings: str) -> Variant:
-    return Variant(f"kinematic-{name}", KINEMATIC_RUNS, settings)
+    return Variant(f"kinematic-{name}", "kinematic", settings)
 
 
 def _on(derived: Derived) -> Variant:
-    return Variant(f"kinematic-{derived.name}", KINEMATIC_RUNS, derived=derived)
+    return Variant(f"kinematic-{derived.name}", "kinematic", derived=derived)
+
+
+def _ours(name: str, title: str, question: str, compared: str, *entries: Entry, **levels: Any) -> Ablation:
+    """A table of ours of one comparison, whose reference is the run of `kinematic` as it is."""
+    reference = next(entry.label for entry in entries if entry.variant == KINEMATIC)
+    return Ablation(name, "ours", title, question, (Comparison(compared, reference, entries),), **levels)
+
+
+def _switch(name: str, title: str, question: str, off: str) -> Ablation:
+    """A table of ours: `kinematic` with and without what the setting `off` turns off."""
+    entries = (Entry("off", _kinematic(f"no-{name}", off)), Entry("on", KINEMATIC))
+    return _ours(name, title, question, name.replace("-", " "), *entries)
 
 
 def _schedule_part(title: str, part: str, name: str, plain: float, published: float, inverse: float) -> Comparison:
@@ -113,11 +160,12 @@ def _schedule_part(title: str, part: str, name: str, plain: float, published: fl
 
 
 def _at_checkpoints(label: str, variant: Variant, *psnr: float) -> Entry:
-    return Entry(label, variant, dict(zip(CHECKPOINT_MEASURES, psnr, strict=True)))
+    return Entry(label, variant, dict(zip(CHECKPOINT_PSNR, psnr, strict=True)))
 
 
-CHECKPOINT_MEASURES = tuple(f"psnr_at_{percent}.{{split}}" for percent in CHECKPOINTS)
-NO_DENSITY = ("density_interval", "opacity_reset", "gradient_threshold")
+NO_SH, NO_COMPENSATION = "schedule.sh_order=off", "schedule.compensation=off"
+NO_DENSITY = ("schedule.density_interval=off", "schedule.opacity_reset=off", "schedule.gradient_threshold=off")
+NO_ORDER = "schedule.frame_order=off"
 
 PAPER = (
     Ablation(
@@ -143,21 +191,15 @@ PAPER = (
                 "both",
                 (
                     _at_checkpoints(
-                        "none",
-                        _neeco("no-sh-no-compensation", "schedule.sh_order=off", "schedule.compensation=off"),
-                        *(15.21, 16.37, 19.02, 20.63),
+                        "none", _neeco("no-sh-no-compensation", NO_SH, NO_COMPENSATION), 15.21, 16.37, 19.02, 20.63
                     ),
-                    _at_checkpoints(
-                        "SH", _neeco("no-compensation", "schedule.compensation=off"), *(15.34, 16.77, 20.64, 22.53)
-                    ),
-                    _at_checkpoints(
-                        "compensation", _neeco("no-sh", "schedule.sh_order=off"), *(16.73, 18.69, 20.66, 22.81)
-                    ),
-                    _at_checkpoints("both", NEECO, *(16.82, 18.88, 21.54, 23.78)),
+                    _at_checkpoints("SH", _neeco("no-compensation", NO_COMPENSATION), 15.34, 16.77, 20.64, 22.53),
+                    _at_checkpoints("compensation", _neeco("no-sh", NO_SH), 16.73, 18.69, 20.66, 22.81),
+                    _at_checkpoints("both", NEECO, 16.82, 18.88, 21.54, 23.78),
                 ),
             ),
         ),
-        CHECKPOINT_MEASURES,
+        CHECKPOINT_PSNR,
     ),
     Ablation(
         "density-off",
@@ -168,10 +210,7 @@ PAPER = (
             Comparison(
                 "density control",
                 "on",
-                (
-                    Entry("off", _neeco("no-density", *(f"schedule.{part}=off" for part in NO_DENSITY)), expected=-1),
-                    Entry("on", NEECO),
-                ),
+                (Entry("off", _neeco("no-density", *NO_DENSITY), expected=-1), Entry("on", NEECO)),
             ),
         ),
         (FINAL_PSNR,),
@@ -186,7 +225,7 @@ PAPER = (
                 "uniform motion",
                 "on",
                 (
-                    Entry("off", _neeco("no-uniform-motion", "schedule.frame_order=off"), {FINAL_PSNR: 22.26}),
+                    Entry("off", _neeco("no-uniform-motion", NO_ORDER), {FINAL_PSNR: 22.26}),
                     Entry("on", NEECO, {FINAL_PSNR: 28.31}),
                 ),
             ),
@@ -195,36 +234,20 @@ PAPER = (
     ),
 )
 
-_HALF, _QUARTER = Derived("frames-half", 0.5), Derived("frames-quarter", 0.25)
 _NOISE = tuple(Derived(f"noise-{level:g}mm", noise_mm=level) for level in (0.5, 1.0, 2.0))
-
-
-def _switch(name: str, title: str, question: str, off: str) -> Ablation:
-    """Something of `kinematic` that `off` turns off."""
-    entries = (Entry("off", _kinematic(f"no-{name}", off)), Entry("on", KINEMATIC))
-    return Ablation(name, "ours", title, question, (Comparison(name.replace("-", " "), "on", entries),))
-
 
 OURS = (
     _switch(
         "joints", "Joints", "What do learned hinges bring over an instrument that moves as one piece?", "joints=[]"
     ),
-    Ablation(
+    _ours(
         "refinement",
-        "ours",
         "Refinement of the recorded geometry",
         "What do correcting every training frame's instrument pose, and the clock, bring?",
-        (
-            Comparison(
-                "refinement",
-                "both on",
-                (
-                    Entry("frame poses off", _kinematic("no-frame-poses", "refine.frame_poses=false")),
-                    Entry("latency off", _kinematic("no-latency", "refine.latency=false")),
-                    Entry("both on", KINEMATIC),
-                ),
-            ),
-        ),
+        "refinement",
+        Entry("frame poses off", _kinematic("no-frame-poses", "refine.frame_poses=false")),
+        Entry("latency off", _kinematic("no-latency", "refine.latency=false")),
+        Entry("both on", KINEMATIC),
     ),
     _switch(
         "shaft-roll",
@@ -232,22 +255,14 @@ OURS = (
         "What does spinning the shaft about its axis while training bring?",
         "deformation.shaft_roll=0",
     ),
-    Ablation(
+    _ours(
         "parts",
-        "ours",
         "Decided parts",
         "What does it bring that Gaussians decide between an instrument's parts, and that wrists are looked for again?",
-        (
-            Comparison(
-                "parts",
-                "both on",
-                (
-                    Entry("mixed parts", _kinematic("no-part-sharpness", "deformation.part_sharpness=0")),
-                    Entry("wrists once", _kinematic("no-wrist-again", "deformation.wrist_again=false")),
-                    Entry("both on", KINEMATIC),
-                ),
-            ),
-        ),
+        "parts",
+        Entry("mixed parts", _kinematic("no-part-sharpness", "deformation.part_sharpness=0")),
+        Entry("wrists once", _kinematic("no-wrist-again", "deformation.wrist_again=false")),
+        Entry("both on", KINEMATIC),
     ),
     _switch(
         "shadow",
@@ -279,40 +294,24 @@ OURS = (
             for variant in (NEECO, KINEMATIC)
         ),
     ),
-    Ablation(
+    _ours(
         "frames",
-        "ours",
         "Number of training frames",
         "How much is lost with fewer frames, evenly spread over the recording?",
-        (
-            Comparison(
-                "training frames",
-                "all",
-                (
-                    Entry("all", KINEMATIC),
-                    Entry("1/2", _on(_HALF)),
-                    Entry("1/4", _on(_QUARTER)),
-                ),
-            ),
-        ),
+        "training frames",
+        Entry("all", KINEMATIC),
+        Entry("1/2", _on(Derived("frames-half", 0.5))),
+        Entry("1/4", _on(Derived("frames-quarter", 0.25))),
         levels=(1.0, 0.5, 0.25),
         level_name="share of the training frames",
     ),
-    Ablation(
+    _ours(
         "tracker-noise",
-        "ours",
         "Tracker noise",
         "How much is lost when the instrument poses of the training frames are off by more than they already are?",
-        (
-            Comparison(
-                "noise added",
-                "0 mm",
-                (
-                    Entry("0 mm", KINEMATIC),
-                    *(Entry(f"{noise.noise_mm:g} mm", _on(noise)) for noise in _NOISE),
-                ),
-            ),
-        ),
+        "noise added",
+        Entry("0 mm", KINEMATIC),
+        *(Entry(f"{noise.noise_mm:g} mm", _on(noise)) for noise in _NOISE),
         levels=(0.0, *(noise.noise_mm for noise in _NOISE)),
         level_name="noise added per axis, mm",
     ),

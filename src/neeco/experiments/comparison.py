@@ -1,4 +1,4 @@
-"""`compare`: several methods on the same frames under the same budget, over several seeds."""
+"""`compare`: several methods on the same frames under the same budget, over several seeds; its numbers and tables."""
 
 from __future__ import annotations
 
@@ -11,15 +11,25 @@ from typing import Any
 from neeco import __version__
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
+from neeco.capture.model import RecordedStates
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE, Progress, held_out_splits
-from neeco.evaluation.lpips import WEIGHTS_VARIABLE, find_lpips
-from neeco.experiments.comparison_tables import write_tables
-from neeco.experiments.machine import machine, measure_speed
+from neeco.evaluation.image_metrics import WEIGHTS_VARIABLE, find_lpips
+from neeco.experiments.machine import machine, machine_words, measure_speed
 from neeco.experiments.masks import check_masks, score_folder, score_runs, splits_with_truth
-from neeco.experiments.study import JobEvent, check_output, check_workers, run_jobs, threads_per_worker
-from neeco.experiments.summary import distances_to_training, summarise
+from neeco.experiments.study import JobEvent, Result, check_output, check_workers, run_and_record, spread
+from neeco.experiments.tables import (
+    Column,
+    SummaryRow,
+    Table,
+    csv_text,
+    latex_document,
+    markdown_document,
+    summary_csv,
+    summary_table,
+    write_files,
+)
 from neeco.experiments.training_job import (
     ANEW,
     BUDGET,
@@ -42,7 +52,37 @@ from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
 COMPARISON_FILE = "comparison.json"
-FRAME_SCORES = {"frame": str} | dict.fromkeys(("psnr", "psnr_instrument", "mask_iou"), (float, None))
+FRAME_SCORES = ("psnr", "psnr_instrument", "mask_iou")
+SPLIT_COLUMNS = (
+    Column("psnr", "PSNR", 2, "high"),
+    Column("ssim", "SSIM", 3, "high"),
+    Column("lpips", "LPIPS", 3, "low"),
+    Column("psnr_instrument", "PSNR instrument", 2, "high"),
+    Column("mask_iou", "label IoU", 3, "high"),
+)
+MASK_COLUMNS = (
+    Column("iou", "label IoU", 3, "high"),
+    Column("challenge_iou", "Challenge IoU", 3, "high"),
+    Column("challenge_iou_parts", "of parts", 3, "high"),
+    Column("dice", "Dice", 3, "high"),
+    Column("boundary_f", "boundary F", 3, "high"),
+    Column("box_ap", "box AP", 3, "high"),
+)
+RUN_COLUMNS = (
+    Column("iterations", "iterations"),
+    Column("seconds", "minutes", 2, None, 1 / 60),
+    Column("processor_seconds", "CPU minutes", 2, None, 1 / 60),
+    Column("fps", "FPS", 1, "high"),
+    Column("num_gaussians", "Gaussians"),
+    Column("peak_memory_mb", "peak MiB", 0, "low"),
+)
+SPLIT_METRICS = tuple(column.key for column in SPLIT_COLUMNS)
+MASK_METRICS = tuple(column.key for column in MASK_COLUMNS)
+RUN_METRICS = ("seconds", "processor_seconds", "fps", "num_gaussians", "peak_memory_mb", "iterations")
+ABSENT = {  # why nobody has a number
+    "psnr_instrument": "the capture has no true masks, or no run finished",
+    "mask_iou": "no method here carries labels, the capture has no true masks, or no run finished",
+}
 
 
 @dataclass(frozen=True)
@@ -75,6 +115,11 @@ class ComparisonPlan:
     notes: tuple[str, ...]
     given_masks: tuple[dict[str, Any], ...]  # scores of the folders of masks
 
+    @property
+    def names(self) -> list[str]:
+        """Methods and folders of masks."""
+        return list(dict.fromkeys([*self.spec.methods, *self.spec.masks]))
+
 
 def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
@@ -84,10 +129,27 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
         raise NeecoError(f"--seeds: {spec.seeds} is none at all; give at least 1")
     check_workers(spec.workers, device)
     configs = _configs(spec)
-    capture = _open_capture(spec, configs)
+    capture = read_checked(spec.capture, spec.transforms)
+    for name, config in configs.items():
+        if need := unmet_need(config.method, capture):
+            raise NeecoError(f"--methods: {name} needs {need}, which {spec.capture} has not; leave it out")
     networks = find_lpips(spec.lpips_weights)
     _check_output(spec)
-    jobs = _jobs(spec, configs)
+    jobs = tuple(
+        TrainingJob(
+            name,
+            seed,
+            spec.capture,
+            job_folder(spec.output, name, seed),
+            config,
+            spec.budget,
+            spec.splits,
+            spec.lpips_weights,
+            spec.device,
+        )
+        for seed in range(spec.seeds)  # every method's first seed comes first: half of the runs show them all
+        for name, config in configs.items()
+    )
     digest = fingerprint(capture)
     for job in jobs:
         job.check()
@@ -97,41 +159,35 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     notes = [] if networks else [f"lpips: no weights; give --lpips-weights or set {WEIGHTS_VARIABLE}"]
     scored: list[dict[str, Any]] = []
     for name, folder in spec.masks.items():
-        rows, told = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
+        rows, missing = score_folder(name, None, folder, capture, splits_with_truth(capture, splits))
         scored += rows
-        notes += told
+        notes += missing
     return ComparisonPlan(spec, capture, jobs, splits, tuple(notes), tuple(scored))
 
 
 def compare(
-    plan: ComparisonPlan, news: Callable[[JobEvent], None] | None = None, progress: Progress | None = None
+    plan: ComparisonPlan, events: Callable[[JobEvent], None] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
 
     Given again after an interruption, it goes on where it stopped; given again with more methods or seeds, it adds
-    them. A method that fails is told in its place. comparison.json is complete at every moment; `complete` says whether
-    all is in it. news: told of the jobs; progress: of what follows them.
+    them. A failed run has its reason in its place. comparison.json is valid at every moment; `complete` says whether
+    all is in it. events: of the jobs; progress: of what follows them.
     """
-    spec = plan.spec
-    report = progress or (lambda what, done, total: None)
+    spec, file = plan.spec, plan.spec.output / COMPARISON_FILE
     with own_folder(spec.output):
-        finished = _finished_before(plan)
+        files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
+        finished = {index: read_result(path) for index, path in files.items() if path.exists()}
+        finished = {index: job for index, job in finished.items() if list(job["splits"]) == list(plan.splits)}
 
-        def write() -> None:  # what is known is on disk at every moment
-            write_json(spec.output / COMPARISON_FILE, _document(plan, [finished[k] for k in sorted(finished)]))
+        def record(results: Sequence[Result]) -> None:
+            write_json(file, _document(plan, results))
 
-        def keep(latest: JobEvent) -> None:
-            if latest.result is not None:
-                finished[latest.index] = latest.result
-                write()
-            if news:
-                news(latest)
-
-        write()
-        results = run_jobs(plan.jobs, spec.workers, keep, {spec.capture: plan.capture})
+        record([finished[index] for index in sorted(finished)])
+        results = run_and_record(plan.jobs, spec.workers, record, finished, events, {spec.capture: plan.capture})
         result = _document(plan, results) | {"complete": True}
-        _measure(plan, result, report)
-        write_json(spec.output / COMPARISON_FILE, result)
+        _measure(plan, result, progress or (lambda what, done, total: None))
+        write_json(file, result)
         write_tables(spec.output, result)
     return result
 
@@ -146,13 +202,6 @@ def failures(comparison: Mapping[str, Any]) -> list[str]:
     return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
 
 
-def _finished_before(plan: ComparisonPlan) -> dict[int, dict[str, Any]]:
-    """What earlier starts left of these jobs, by the job's place."""
-    files = {index: job.folder / JOB_FILE for index, job in enumerate(plan.jobs)}
-    found = {index: read_result(file) for index, file in files.items() if file.exists()}
-    return {index: job for index, job in found.items() if list(job["splits"]) == list(plan.splits)}
-
-
 def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     """Every method's settings by name. Raises NeecoError."""
     if not spec.methods:
@@ -163,54 +212,22 @@ def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
-def _jobs(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> tuple[TrainingJob, ...]:
-    return tuple(
-        TrainingJob(
-            name,
-            seed,
-            spec.capture,
-            job_folder(spec.output, name, seed),
-            config,
-            spec.budget,
-            spec.splits,
-            spec.lpips_weights,
-            spec.device,
-        )
-        for seed in range(spec.seeds)  # every method's first seed comes first: a look halfway sees them all
-        for name, config in configs.items()
-    )
-
-
-def _open_capture(spec: ComparisonSpec, configs: Mapping[str, TrainConfig]) -> Capture:
-    path = spec.capture
-    capture = read_checked(path, spec.transforms)
-    for name, config in configs.items():
-        if need := unmet_need(config.method, capture):
-            raise NeecoError(f"--methods: {name} needs {need}, which {path} has not; leave it out")
-    return capture
-
-
 def _check_output(spec: ComparisonSpec) -> None:
     """Raises NeecoError when `output` holds something else, or the comparison of another capture or budget."""
     noun, about = "comparison", "compares methods on"
     stored = check_output(spec.output, COMPARISON_FILE, COMPARISON_SCHEMA, spec.capture, noun, about)
     if stored is None:
         return
-    require_like(stored, {"budget": BUDGET}, str(spec.output / COMPARISON_FILE), "give another --output")
+    file, differs = spec.output / COMPARISON_FILE, "give another --output"
+    require_like(stored, {"budget": BUDGET}, str(file), differs)
     if stored["budget"] != asdict(spec.budget):
         before = Budget(*(stored["budget"][key] for key in BUDGET))
-        told = f"budget: compares after {before}, not {spec.budget}"
-        raise NeecoError(f"{spec.output / COMPARISON_FILE}: {told}; give another --output")
+        raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; {differs}")
 
 
-def _names(plan: ComparisonPlan) -> list[str]:
-    return list(dict.fromkeys([*plan.spec.methods, *plan.spec.masks]))
-
-
-def _document(plan: ComparisonPlan, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """comparison.json as far as the jobs alone tell it."""
+def _document(plan: ComparisonPlan, results: Sequence[Result]) -> dict[str, Any]:
+    """comparison.json as far as the jobs alone give it."""
     spec = plan.spec
-    threads = threads_per_worker(spec.workers) if spec.workers > 1 else None
     methods: list[dict[str, Any]] = [
         {"name": name, "method": config, "source": "train", "folder": "runs"}
         for name, config in dict.fromkeys((job.name, job.config.method) for job in plan.jobs)
@@ -219,12 +236,13 @@ def _document(plan: ComparisonPlan, results: Sequence[dict[str, Any]]) -> dict[s
         {"name": name, "method": None, "source": "masks", "folder": str(path.absolute())}
         for name, path in spec.masks.items()
     ]
+    failed = [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job]
     return {
         "schema": COMPARISON_SCHEMA,
         "version": __version__,
         "complete": False,
         "capture": str(spec.capture.absolute()),
-        "machine": machine(device_of(spec.device)) | {"workers": spec.workers, "threads_per_worker": threads},
+        "machine": machine(device_of(spec.device), spec.workers),
         "budget": asdict(spec.budget),
         "transforms": spec.transforms,
         "settings": list(spec.assignments),
@@ -232,41 +250,52 @@ def _document(plan: ComparisonPlan, results: Sequence[dict[str, Any]]) -> dict[s
         "splits": list(plan.splits),
         "methods": methods,
         "jobs": list(results),
-        "summary": summarise(_names(plan), plan.splits, results, (), plan.given_masks),
-        "curves": _curves(plan.spec, results),
-        "distance": _distance(plan, results),
+        "summary": summarise(plan.names, plan.splits, results, (), plan.given_masks),
+        **_frame_rows(plan, [job for job in results if "error" not in job]),
         "speed": {"rows": []},
         "masks": list(plan.given_masks),
-        "notes": list(plan.notes)
-        + [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job],
+        "notes": [*plan.notes, *failed],
     }
 
 
-def _curves(spec: ComparisonSpec, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Held-out PSNR of every finished job at about ten moments; seconds on the budget's clock."""
-    rows = []
-    for job in (job for job in results if "error" not in job):
-        for entry in read_json_lines(job_folder(spec.output, job["name"], job["seed"]) / CURVE_FILE):
-            row = {"name": job["name"], "seed": job["seed"], "seconds": entry[SECONDS_ON[spec.budget.clock]]}
-            rows.append(row | {key: entry[key] for key in ("iteration", "split", "psnr")})
-    return rows
-
-
-def _distance(plan: ComparisonPlan, results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Every held-out frame's scores beside its distance from the training states."""
+def _frame_rows(plan: ComparisonPlan, done: Sequence[Result]) -> dict[str, list[dict[str, Any]]]:
+    """What figures are drawn from. curves: held-out PSNR of every finished job at about ten moments, seconds on the
+    budget's clock; distance: every held-out frame's scores beside its distance from the training states."""
     distances = distances_to_training(plan.capture)
-    rows = []
-    for job in (job for job in results if "error" not in job):
-        folder = job_folder(plan.spec.output, job["name"], job["seed"])
+    curves, distance = [], []
+    like = {"per_frame": {"given": {split: [{"frame": str} | dict.fromkeys(FRAME_SCORES, (float, None))]
+                                    for split in plan.splits}}}  # fmt: skip
+    for job in done:
+        folder, names = (
+            job_folder(plan.spec.output, job["name"], job["seed"]),
+            {key: job[key] for key in ("name", "seed")},
+        )
+        for row in read_json_lines(folder / CURVE_FILE):
+            seconds = {"seconds": row[SECONDS_ON[plan.spec.budget.clock]]}
+            curves.append(names | seconds | {key: row[key] for key in ("iteration", "split", "psnr")})
         file = folder / EVALUATION_FILE
-        like = {"per_frame": {"given": {split: [FRAME_SCORES] for split in plan.splits}}}
         frames = require_like(read_json(file), like, str(file), ANEW)["per_frame"]["given"]
         for split in (split for split in plan.splits if split != "train"):
-            for entry in frames[split]:
-                row = {"name": job["name"], "seed": job["seed"], "split": split, "frame": entry["frame"]}
-                row["distance"] = distances.get(entry["frame"])
-                rows.append(row | {key: entry[key] for key in ("psnr", "psnr_instrument", "mask_iou")})
-    return rows
+            for row in frames[split]:
+                place = {"split": split, "frame": row["frame"], "distance": distances.get(row["frame"])}
+                distance.append(names | place | {key: row[key] for key in FRAME_SCORES})
+    return {"curves": curves, "distance": distance}
+
+
+def distances_to_training(capture: Capture) -> dict[str, float]:
+    """Distance of every frame outside `train` from the nearest training frame's state, by frame name.
+
+    A state's coordinates are the instruments' positions (mm), the entries of their rotation matrices and their joints
+    (rad), or the time (s) where the capture has no instruments. Each is divided by its standard deviation over the
+    training frames; the distance is the root mean square over the coordinates, so it reads in standard deviations of
+    the training states. Coordinates that stand still in training are left out; empty when all do.
+    """
+    names = [instrument.name for instrument in capture.instruments]
+    recorded = RecordedStates([frame.state for frame in capture.split("train")], names)
+    if recorded.still:
+        return {}
+    others = [frame for frame in capture.frames if frame.split != "train"]
+    return {frame.name: float(recorded.distances(frame.state).min()) for frame in others}
 
 
 def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> None:
@@ -275,10 +304,130 @@ def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> 
     done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
     runs = [(name, seed, job_folder(folder, name, seed)) for name, seed in done]
     if runs:
-        told = splits_with_truth(plan.capture, plan.splits)
+        splits = splits_with_truth(plan.capture, plan.splits)
         device = device_of(plan.spec.device)
-        scored = score_runs(runs, folder, plan.capture, told, device, partial(report, "scoring masks"))
+        scored = score_runs(runs, folder, plan.capture, splits, device, partial(report, "scoring masks"))
         result["masks"] = [*plan.given_masks, *scored]
         opened = [(name, seed, load_run(path)) for name, seed, path in runs]
         result["speed"] = measure_speed(opened, plan.capture, device, partial(report, "measuring speed"))
-    result["summary"] = summarise(_names(plan), plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])
+    result["summary"] = summarise(plan.names, plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])
+
+
+def summarise(
+    names: Sequence[str],
+    splits: Sequence[str],
+    jobs: Sequence[Mapping[str, Any]],
+    speeds: Sequence[Mapping[str, Any]] = (),
+    masks: Sequence[Mapping[str, Any]] = (),
+) -> list[dict[str, Any]]:
+    """One row per name and split; every metric as {"mean", "std", "n"} over the seeds that finished.
+
+    jobs: what `run_jobs` returns. speeds: rows of `measure_speed`; where there are some, fps is theirs on the cpu
+    backend instead of the jobs' own. masks: {"name", "seed", "split", metric: value}. `failed` counts the seeds that
+    did not finish.
+    """
+    rows = []
+    for name in names:
+        done = [job for job in jobs if job["name"] == name and "error" not in job]
+        failed = sum(job["name"] == name and "error" in job for job in jobs)
+        measured = [row["fps"] for row in speeds if row["name"] == name and row["backend"] == "cpu"]
+        of_run = {metric: spread(job[metric] for job in done) for metric in RUN_METRICS}
+        if measured:
+            of_run["fps"] = spread(measured)
+        for split in splits:
+            scores = [job["splits"].get(split, {}) for job in done]
+            of_masks = [entry for entry in masks if entry["name"] == name and entry["split"] == split]
+            row: dict[str, Any] = {"name": name, "split": split, "failed": failed}
+            row |= {metric: spread(score.get(metric) for score in scores) for metric in SPLIT_METRICS}
+            row |= {metric: spread(entry.get(metric) for entry in of_masks) for metric in MASK_METRICS}
+            rows.append(row | of_run)
+    return rows
+
+
+def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
+    """One table per split, then the methods' own. Columns that nobody has a number for are left out."""
+    finished = {job["name"] for job in comparison["jobs"] if "error" not in job}
+    reasons: dict[str, str] = {}  # of methods of which no seed finished
+    for job in comparison["jobs"]:
+        if "error" in job and job["name"] not in finished:
+            reasons.setdefault(job["name"], job["error"])
+
+    def table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> Table:
+        entries = [SummaryRow((row["name"],), row, reasons.get(row["name"])) for row in rows]
+        return summary_table(title, ("method",), columns, entries)
+
+    tables = []
+    for split in comparison["splits"]:
+        rows = [row for row in comparison["summary"] if row["split"] == split]
+        scored = any(row["iou"]["n"] for row in rows)  # the same number, for other people's masks too
+        ours = [column for column in SPLIT_COLUMNS if not (scored and column.key == "mask_iou")]
+        tables.append(table(f"split {split}", (*ours, *MASK_COLUMNS), rows))
+    trained, first = trained_methods(comparison), comparison["splits"][0]
+    rows = [row for row in comparison["summary"] if row["split"] == first and row["name"] in trained]
+    return [*tables, table("training and drawing", RUN_COLUMNS, rows)]
+
+
+def trained_methods(comparison: Mapping[str, Any]) -> list[str]:
+    """The methods by name, without the folders of masks."""
+    return [entry["name"] for entry in comparison["methods"] if entry["source"] == "train"]
+
+
+def absent_notes(comparison: Mapping[str, Any]) -> list[str]:
+    """What the tables lack, and why."""
+    notes = list(comparison["notes"])
+    for key in SPLIT_METRICS:
+        known = any(row[key]["n"] for row in comparison["summary"])
+        if not known and not any(note.startswith(key) for note in notes):
+            notes.append(f"{key}: nobody has it: {ABSENT.get(key, 'no run finished')}")
+    if not any(row["seconds"]["std"] is not None for row in comparison["summary"]):
+        notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
+    return notes
+
+
+def budget_words(comparison: Mapping[str, Any]) -> str:
+    """What every run was given, and how often."""
+    seeds = len(comparison["seeds"])
+    return f"{Budget(**comparison['budget'])} each, {seeds} seed{'s' if seeds > 1 else ''}"
+
+
+def markdown_text(comparison: Mapping[str, Any]) -> str:
+    """Markdown: a heading, one table per split, the methods' own, and what is absent."""
+    lead = f"{budget_words(comparison)}. {machine_words(comparison['machine'])}."
+    title = f"Comparison on {Path(comparison['capture']).name}"
+    return markdown_document(title, lead, tables_of(comparison), "seeds", absent_notes(comparison))
+
+
+def latex_text(comparison: Mapping[str, Any]) -> str:
+    """LaTeX tables for the package booktabs, one per split and one of the methods' own."""
+    caption = f"{Path(comparison['capture']).name}, {{}}. {budget_words(comparison)}."
+    lead = [machine_words(comparison["machine"])]
+    return latex_document(caption, tables_of(comparison), lead, absent_notes(comparison))
+
+
+def comparison_csv(comparison: Mapping[str, Any]) -> str:
+    """One line per method and split, unrounded; unknown numbers are empty."""
+    metrics = (*SPLIT_METRICS, *MASK_METRICS, *RUN_METRICS)
+    return summary_csv(["name", "split", "failed"], metrics, comparison["summary"])
+
+
+def data_files(comparison: Mapping[str, Any]) -> dict[str, str]:
+    """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
+    job_columns = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
+    jobs = [
+        {**job, **numbers, "split": split}
+        for job in comparison["jobs"]
+        for split, numbers in (job["splits"] or {"": {}}).items()
+    ]
+    speed_columns = ["name", "seed", "method", "backend", "fps", "milliseconds", "draws", "num_gaussians"]
+    return {
+        "jobs.csv": csv_text(job_columns, jobs),
+        "curves.csv": csv_text(["name", "seed", "seconds", "iteration", "split", "psnr"], comparison["curves"]),
+        "distance.csv": csv_text(["name", "seed", "split", "frame", "distance", *FRAME_SCORES], comparison["distance"]),
+        "speed.csv": csv_text(speed_columns, comparison["speed"]["rows"]),
+    }
+
+
+def write_tables(output: Path, comparison: Mapping[str, Any]) -> None:
+    """Write comparison.csv, .md and .tex, and data/*.csv behind them, into `output`."""
+    texts = {"csv": comparison_csv(comparison), "md": markdown_text(comparison), "tex": latex_text(comparison)}
+    write_files(output, "comparison", texts, data_files(comparison))

@@ -16,7 +16,7 @@ import torch
 from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.truth import MASK_FOLDERS
+from neeco.evaluation.mask_folders import MASK_FOLDERS
 from neeco.experiments.ablations import NOISE_DEGREES_PER_MM, Derived
 from neeco.files import is_vacant, read_json, write_atomically, write_json
 from neeco.raster.rotations import rotation_from_vector
@@ -106,8 +106,4 @@ def _copy_masks(root: Path, name: str, output: Path) -> None:
     for folder in MASK_FOLDERS:
         source = root / folder / f"{name}.png"
         if source.is_file():
-            write_atomically(output / folder / source.name, partial(_copy, source))
-
-
-def _copy(source: Path, target: Path) -> None:
-    shutil.copyfile(source, target)
+            write_atomically(output / folder / source.name, partial(shutil.copyfile, source))

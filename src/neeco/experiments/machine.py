@@ -30,9 +30,11 @@ DRAWS = 7  # timed per run and round
 PATIENCE = 5.0  # s per run and round, half of it to warm up: slow methods are timed by fewer images
 
 
-def machine(device: torch.device) -> dict[str, Any]:
-    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one."""
+def machine(device: torch.device, workers: int | None = None) -> dict[str, Any]:
+    """Processor, cores this process may use, threads, versions, and the GPU where `device` is one; of a study also its
+    `workers`, and the threads that each of several has."""
     on_gpu = device.type == "cuda"
+    share = threads_per_worker(workers) if workers is not None and workers > 1 else None
     return {
         "cpu": processor_name(),
         "cores": usable_cores(),
@@ -43,13 +45,25 @@ def machine(device: torch.device) -> dict[str, Any]:
         "torch": torch.__version__,
         "backend": f"{cuda_backend()} (CUDA {torch.version.cuda})" if on_gpu else f"cpu ({simd()})",
         "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
-    }
+    } | ({} if workers is None else {"workers": workers, "threads_per_worker": share})
 
 
 def hardware_words(machine: Mapping[str, Any]) -> str:
     """What computed, of what `machine` returned: the GPU, if it was one, and the processor."""
     gpu = f"{machine['gpu']}, " if machine.get("gpu") else ""
     return f"{gpu}{machine['cpu']}, {machine['cores']} cores"
+
+
+def machine_words(machine: Mapping[str, Any], threads: str = "threads") -> str:
+    """The machine that a study's numbers were taken on. threads: the field that counts them where it had one worker."""
+    count = machine["threads_per_worker"] or machine[threads]
+    workers = f", {machine['workers']} at once" if machine["workers"] > 1 else ""
+    return f"{hardware_words(machine)}, {count} thread{'s' if count > 1 else ''}{workers}, torch {machine['torch']}"
+
+
+def threads_per_worker(workers: int, cores: int | None = None) -> int:
+    """Each of `workers` gets its share of the cores, at least one thread."""
+    return max(1, (cores or usable_cores()) // workers)
 
 
 def processor_name() -> str:

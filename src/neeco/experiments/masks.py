@@ -12,10 +12,9 @@ from neeco.capture import Capture
 from neeco.capture.images import write_labels
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, open_masks
+from neeco.evaluation.mask_folders import PARTS_FILE, PARTS_SUFFIX, load_reference, open_masks, truth_file
 from neeco.evaluation.mask_metrics import iou, mean_of
 from neeco.evaluation.mask_scores import score_masks
-from neeco.evaluation.truth import load_reference, truth_file
 from neeco.files import write_json
 from neeco.labels.drawing import draw, draw_layers
 from neeco.labels.labellers import CompositedLabels, Labeller, ThresholdLabels

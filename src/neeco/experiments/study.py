@@ -27,7 +27,7 @@ import torch
 from neeco.capture import Capture
 from neeco.cluster import address, joined, require_ray
 from neeco.errors import NeecoError
-from neeco.experiments.machine import usable_cores
+from neeco.experiments.machine import threads_per_worker
 from neeco.files import is_vacant, read_json, require_inside, write_text
 from neeco.raster.devices import device_of, readable_failures
 
@@ -163,11 +163,6 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
         return _failed(job, f"{type(error).__name__}: {reason}; see {record}")
     record.unlink(missing_ok=True)
     return result
-
-
-def threads_per_worker(workers: int, cores: int | None = None) -> int:
-    """Each of `workers` gets its share of the cores, at least one thread."""
-    return max(1, (cores or usable_cores()) // workers)
 
 
 def check_workers(workers: int, device: torch.device) -> None:

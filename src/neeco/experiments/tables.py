@@ -174,8 +174,9 @@ def latex_table(table: Table, caption: str) -> str:
 
     headings, rows = _texts(table, latex_escape, r"\textbf{{{}}}", "failed")
     columns = "l" * len(table.keys) + "r" * (len(headings) - len(table.keys))
-    frame = pandas.DataFrame(rows, columns=headings)
-    return str(frame.to_latex(index=False, escape=False, caption=latex_escape(caption), column_format=columns))
+    style = pandas.DataFrame(rows, columns=headings).style.hide(axis="index")
+    caption = latex_escape(caption)
+    return str(style.to_latex(hrules=True, position_float="centering", caption=caption, column_format=columns))
 
 
 def latex_document(caption: str, tables: Sequence[Table], lead: Sequence[str], notes: Sequence[str]) -> str:
@@ -212,11 +213,3 @@ def write_files(output: Path, stem: str, texts: Mapping[str, str], data: Mapping
     files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
     for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():
         write_text(path, text)
-
-
-markdown_lines = markdown_table
-
-
-def latex_lines(table: Table, caption: str) -> list[str]:
-    """The lines of `latex_table`."""
-    return latex_table(table, caption).splitlines()

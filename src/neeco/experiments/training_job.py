@@ -21,8 +21,7 @@ from neeco.capture.check import read_checked
 from neeco.capture.model import Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
-from neeco.evaluation.image_metrics import psnr
-from neeco.evaluation.lpips import find_lpips
+from neeco.evaluation.image_metrics import find_lpips, psnr
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
 from neeco.experiments.study import JobProgress, Result
 from neeco.files import read_json, read_text, require_like, write_json, write_text

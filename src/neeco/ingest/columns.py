@@ -1,4 +1,4 @@
-"""Which columns of a log hold what: as a recording says, and as common loggers name them."""
+"""Which columns of a log hold what, in which unit: as a recording says, or as common loggers name them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from neeco.ingest.units import split_unit
+from neeco.errors import NeecoError
 
+TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
 FORMS = {
@@ -18,12 +19,26 @@ FORMS = {
     EULER: (3,),
     ROTATION_MATRIX: (9,),
     MATRIX: (12, 16),
-}  # how many columns each takes; matrices row by row
+}  # how many columns each form of rotation takes; matrices row by row
+
+UNITS = {
+    "length": {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3},
+    "angle": {"rad": 1.0, "deg": 0.017453292519943295},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}  # kind -> unit -> its scale to mm, rad or s
+_ALIASES = {
+    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "centimeters": "cm", "centimetres": "cm",
+    "radian": "rad", "radians": "rad", "degree": "deg", "degrees": "deg", "°": "deg",
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
+    "usec": "us", "microseconds": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns",
+}  # fmt: skip
+_UNIT_SUFFIX = re.compile(r"^(?P<base>.*?)(?:[\s_\-/]+|[\s_]*[\[(]\s*)(?P<unit>[a-zµ°]+)\s*[\])]?$")
 
 
 @dataclass(frozen=True)
 class Units:
-    """Units as a recording says them; None: the columns' names say it."""
+    """Units that a recording states; None: the columns' names state it."""
 
     time: str | None = None
     length: str | None = None
@@ -32,7 +47,7 @@ class Units:
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """A log of poses (tracker_from_sensor) in a CSV file. What is None is recognised from the header.
+    """A log of poses (tracker_from_sensor). What is None is recognised from the header.
 
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
@@ -40,7 +55,7 @@ class PoseColumns:
     """
 
     path: Path
-    clock: str = "em"
+    clock: str = TRACKER_CLOCK
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
     rotation: tuple[str, ...] | None = None
@@ -54,8 +69,8 @@ class PoseColumns:
 
 @dataclass(frozen=True)
 class JointColumns:
-    """A log of one joint sensor in a CSV file. `calibration`: a table from its counts to angles; None: the column
-    holds angles. limits: of the joint, rad, for the capture."""
+    """A log of one joint sensor. calibration: a table from its counts to angles (None: the column holds angles);
+    limits: of the joint, rad, for the capture."""
 
     path: Path
     clock: str
@@ -68,8 +83,8 @@ class JointColumns:
 
 
 @dataclass(frozen=True)
-class Recognised:
-    """The columns a header seems to name. None: not found; `unclear`: found in more ways than one, or only in part."""
+class RecognisedColumns:
+    """The columns that a header seems to name. None: not found; unclear: what was found in several ways or in part."""
 
     time: tuple[str, ...] | None = None
     position: tuple[str, ...] | None = None
@@ -82,19 +97,70 @@ class Recognised:
     unclear: dict[str, str] = field(default_factory=dict)
 
 
-# names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
+def canonical_unit(text: str) -> str:
+    """`mm` for millimetres, `deg` for degrees ...; the text itself, in small letters, when it is no known unit."""
+    lower = text.strip().lower().replace("µ", "u")
+    return _ALIASES.get(lower, lower)
+
+
+def split_unit(name: str, kind: str) -> tuple[str, str | None]:
+    """A column's name without its unit, and the unit of that kind ("length", "angle", "time") or None."""
+    match = _UNIT_SUFFIX.match(name.strip().lower())
+    unit = canonical_unit(match["unit"]) if match else None
+    if match and unit in UNITS[kind]:
+        return match["base"].strip("_ "), unit
+    return name.strip().lower(), None
+
+
+def scale_of(
+    path: Path, names: tuple[str, ...], kind: str, stated: str | None, implied: str | None, hint: str
+) -> float:
+    """The factor to mm, rad or s of some columns of a file.
+
+    The unit is in their names, else `stated` by the recording, else `implied` by the file's format. hint: added to
+    the question when there is none. Raises NeecoError when nothing gives the unit or two sources disagree.
+    """
+    found = {unit for name in names if (unit := split_unit(name, kind)[1])}
+    listed = ", ".join(names)
+    if len(found) > 1:
+        raise NeecoError(f"{path}: columns {listed}: named in different units; write them in one {kind} unit")
+    unit = next(iter(found), None)
+    if unit and stated and unit != stated:
+        raise NeecoError(
+            f"{path}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct whichever is wrong"
+        )
+    unit = unit or stated or implied
+    if unit is None:
+        raise NeecoError(
+            f"{path}: columns {listed}: in which {kind} unit?{hint} Say it in the header (for example "
+            f"{names[0]}_{next(iter(UNITS[kind]))}) or in the recording's units.{kind} ({', '.join(UNITS[kind])})"
+        )
+    return UNITS[kind][unit]
+
+
+# column names without their unit, in order of preference; a name also matches behind a prefix ("tool_timestamp")
 _TIMES = (
     "header_stamp", "timestamp", "time_stamp", "stamp", "time", "t", "elapsed", "secs", "sec", "seconds", "__time",
 )  # fmt: skip
-_LONG = ("position_", "translation_", "pos_", "trans_")  # may follow any prefix: "field.pose.position.x"
-_SHORT = ("t", "p", "")
-_QUATERNION_LONG = ("orientation_", "rotation_", "quaternion_", "quat_", "q_", "q")
+_Choices = list[tuple[bool, list[str]]]  # (may all stand behind one prefix, names)
+
+
+def _choices(axes: str, prefixed: bool, *stems: str) -> _Choices:
+    return [(prefixed, [stem + axis for axis in axes]) for stem in stems]
+
+
+_POSITIONS = _choices("xyz", True, "position_", "translation_", "pos_", "trans_")
+_POSITIONS += _choices("xyz", False, "t", "p", "") + _choices("xyz", True, "t", "p", "")
+_QUATERNIONS = _choices("wxyz", True, "orientation_", "rotation_", "quaternion_", "quat_", "q_", "q")
+_QUATERNIONS += [(prefixed, ["q0", "qx", "qy", "qz"]) for prefixed in (False, True)] + _choices("wxyz", False, "")
+_ROTATION_VECTORS = _choices("xyz", True, "rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec")
+_EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
-def recognise_time(header: Sequence[str]) -> Recognised:
+def recognise_time(header: Sequence[str]) -> RecognisedColumns:
     """The column of times."""
-    plain = {_plain(split_unit(name, "time")[0]): name for name in reversed(header) if name}
+    plain = _by_plain_name(header, "time")
     seconds = [name for name in plain if name.endswith("stamp_sec")]
     fraction = [name for name in plain if name.endswith(("stamp_nanosec", "stamp_nsec"))]
     if not seconds:  # `header.stamp.sec` reads as a stamp in seconds beside its nanoseconds
@@ -103,37 +169,34 @@ def recognise_time(header: Sequence[str]) -> Recognised:
         fraction = [name for name in split if name.endswith(("stamp_nanosec", "stamp_nsec", "stamp_nsecs"))]
         plain = plain | {name: split[name] for name in seconds + fraction}
     if len(seconds) == len(fraction) == 1:
-        return Recognised(time=(plain[seconds[0]], plain[fraction[0]]))
+        return RecognisedColumns(time=(plain[seconds[0]], plain[fraction[0]]))
     for wanted in _TIMES:
-        if wanted in plain:
-            found = plain[wanted]
-            break
         behind = [name for name in plain if len(wanted) > 1 and name.endswith("_" + wanted)]
-        if len(behind) == 1:
-            found = plain[behind[0]]
+        if wanted in plain or len(behind) == 1:
+            found = plain[wanted if wanted in plain else behind[0]]
             break
     else:
         frames = [name for name in header if _plain(name) in ("frame", "frame_number", "frame_id", "frame_no")]
-        return Recognised(time=(frames[0],), counts_frames=True) if frames else Recognised()
+        return RecognisedColumns(time=(frames[0],), counts_frames=True) if frames else RecognisedColumns()
     # `rostopic echo -p` writes %time and field.header.stamp in ns
     ros = found == "%time" or (found.lower().endswith("header.stamp") and found.lower().startswith("field."))
     spelled_out = _plain(found) in ("secs", "sec", "seconds", "__time")
-    return Recognised(time=(found,), time_unit="ns" if ros else "s" if spelled_out else None)
+    return RecognisedColumns(time=(found,), time_unit="ns" if ros else "s" if spelled_out else None)
 
 
-def recognise_pose(header: Sequence[str]) -> Recognised:
+def recognise_pose(header: Sequence[str]) -> RecognisedColumns:
     """The columns of time, position and rotation in a log of poses."""
     when = recognise_time(header)
     unclear: dict[str, str] = {}
     matrix = _matrix(header)
-    position = None if matrix and len(matrix) > 9 else _group(header, _position_names(), "length", "position", unclear)
+    position = None if matrix and len(matrix) > 9 else _group(header, _POSITIONS, "length", "position", unclear)
     rotation, form = _rotation(header, matrix, unclear)
     if position and rotation and set(position) & set(rotation):
         rotation = form = None
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    return Recognised(
+    return RecognisedColumns(
         time=when.time,
         position=position,
         rotation=rotation,
@@ -146,7 +209,7 @@ def recognise_pose(header: Sequence[str]) -> Recognised:
     )
 
 
-def recognise_value(header: Sequence[str]) -> tuple[str | None, Recognised]:
+def recognise_value(header: Sequence[str]) -> tuple[str | None, RecognisedColumns]:
     """The one column beside the time that can be a joint's reading (None when there are none or several)."""
     when = recognise_time(header)
     counters = {"frame", "seq", "index", "header_seq", "field_header_seq", "frame_id", "header_frame_id", "state"}
@@ -158,8 +221,7 @@ def recognise_value(header: Sequence[str]) -> tuple[str | None, Recognised]:
 def quaternion_form(names: Sequence[str]) -> str | None:
     """Whether four columns are named in the order w x y z or x y z w; None when their names do not say."""
     last = "".join(_plain(name)[-1:] for name in names)
-    first = _plain(names[0])
-    if last == "wxyz" or (last[1:] == "xyz" and first.endswith("q0")):
+    if last == "wxyz" or (last[1:] == "xyz" and _plain(names[0]).endswith("q0")):
         return QUATERNION_WXYZ
     return QUATERNION_XYZW if last == "xyzw" else None
 
@@ -168,12 +230,12 @@ def _plain(name: str) -> str:
     return re.sub(r"[.\s/:\-]+", "_", name.strip().lower()).strip("%_" if name[:2] != "__" else "")
 
 
-def _position_names() -> list[tuple[bool, list[str]]]:
-    """(may follow a prefix, names of x y z) in order of preference."""
-    return [
-        *((True, [stem + axis for axis in "xyz"]) for stem in _LONG),
-        *((prefixed, [stem + axis for axis in "xyz"]) for prefixed in (False, True) for stem in _SHORT),
-    ]
+def _by_plain_name(header: Sequence[str], kind: str) -> dict[str, str]:
+    """Columns by their plain names without the unit; of two alike, the first."""
+    plain: dict[str, str] = {}
+    for name in header:
+        plain.setdefault(_plain(split_unit(name, kind)[0]), name)
+    return plain
 
 
 def _rotation(
@@ -181,22 +243,14 @@ def _rotation(
 ) -> tuple[tuple[str, ...] | None, str | None]:
     if matrix:
         return matrix, ROTATION_MATRIX if len(matrix) == 9 else MATRIX
-    names = [
-        *((True, [stem + axis for axis in "wxyz"]) for stem in _QUATERNION_LONG),
-        *((prefixed, ["q0", "qx", "qy", "qz"]) for prefixed in (False, True)),
-        (False, ["w", "x", "y", "z"]),
-    ]
-    quaternion = _group(header, names, "length", "quaternion", unclear)
-    if quaternion:
+    if quaternion := _group(header, _QUATERNIONS, "length", "quaternion", unclear):
         return quaternion, QUATERNION_WXYZ
-    stems = ("rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec")
-    vector = _group(header, [(True, [stem + axis for axis in "xyz"]) for stem in stems], "angle", "rotation", unclear)
-    if vector:
+    if vector := _group(header, _ROTATION_VECTORS, "angle", "rotation", unclear):
         return vector, ROTATION_VECTOR
-    for triple in (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"]):
-        if _group(header, [(True, triple)], "angle", "rotation", {}):
+    for angles in _EULER_ANGLES:
+        if _group(header, [(True, angles)], "angle", "rotation", {}):
             unclear["rotation"] = (
-                f"{', '.join(triple)} have no one meaning; name them under columns.euler with an euler_convention "
+                f"{', '.join(angles)} have no one meaning; name them under columns.euler with an euler_convention "
                 "(or under columns.rotation_vector)"
             )
     if {"q0", "q1", "q2", "q3"} <= {_plain(name) for name in header}:
@@ -205,19 +259,16 @@ def _rotation(
 
 
 def _group(
-    header: Sequence[str], choices: list[tuple[bool, list[str]]], kind: str, what: str, unclear: dict[str, str]
+    header: Sequence[str], choices: _Choices, kind: str, what: str, unclear: dict[str, str]
 ) -> tuple[str, ...] | None:
     """The columns of the first choice of names that is there, behind one prefix if it may be."""
-    plain: dict[str, str] = {}
-    for name in header:
-        plain.setdefault(_plain(split_unit(name, kind)[0]), name)
+    plain = _by_plain_name(header, kind)
     for prefixed, names in choices:
         if all(name in plain for name in names):
             return tuple(plain[name] for name in names)
         if not prefixed:
             continue
-        ends = "_" + names[0]
-        prefixes = [name[: -len(ends)] for name in plain if name.endswith(ends)]
+        prefixes = [name.removesuffix("_" + names[0]) for name in plain if name.endswith("_" + names[0])]
         prefixes = [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
         if len(prefixes) == 1:
             return tuple(plain[f"{prefixes[0]}_{name}"] for name in names)
@@ -230,8 +281,8 @@ def _group(
 def _matrix(header: Sequence[str]) -> tuple[str, ...] | None:
     """Columns m00 ... m33 (or from 1; or m, t, r, mat, matrix): 16, 12 or, for a rotation alone, 9."""
     plain: dict[str, str] = {}
-    for name in header:
-        plain.setdefault(re.sub(r"[_\[\](),]", "", _plain(split_unit(name, "length")[0])), name)
+    for key, name in _by_plain_name(header, "length").items():
+        plain.setdefault(re.sub(r"[_\[\](),]", "", key), name)
     for stem in ("m", "t", "r", "mat", "matrix", "pose", "rot"):
         for first in (0, 1):
             for rows, columns in ((4, 4), (3, 4), (3, 3)):

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import shutil
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +19,8 @@ from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Frame
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
-from neeco.ingest.staging import staged
+from neeco.errors import NeecoError
+from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
@@ -96,3 +102,56 @@ def _warnings(report: ProblemReport) -> list[str]:
         return problem.severity == "warning" and problem.field not in said and problem.file != f"{MASKS}/"
 
     return [str(problem) for problem in report.problems if is_new(problem)]
+
+
+@contextmanager
+def staged(output: Path) -> Iterator[Path]:
+    """A temporary folder beside `output`, on the same disk, gone afterwards whatever happens (after SIGKILL: when
+    the same `output` is asked for again). What the block leaves in its `capture` becomes `output`.
+
+    Raises NeecoError when something other than an empty folder is at `output`, when another process is making it, and
+    when the disk refuses.
+    """
+    place = Path(os.path.abspath(output))  # `.` has no name and no parent of its own
+    folder = place.parent / f"{TEMPORARY}{hashlib.sha256(os.fsencode(place.name)).hexdigest()[:12]}"
+    if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
+        if folder.is_dir():  # of a process killed after its last step
+            with _emptied(folder, place):
+                pass
+        raise NeecoError(f"{output}: exists already; choose another --output or remove it")
+    with new_folder(place.parent), _emptied(folder, place):
+        yield folder
+        _move(folder / "capture", place)
+
+
+@contextmanager
+def _emptied(folder: Path, place: Path) -> Iterator[None]:
+    """An empty folder of this process's own, gone afterwards, to make `place` in."""
+    try:
+        with own_folder(folder, place):
+            _clear(folder)
+            try:
+                yield
+            finally:
+                _clear(folder)
+    finally:
+        with suppress(OSError):  # another process's, or gone
+            folder.rmdir()
+
+
+def _clear(folder: Path) -> None:
+    """Remove what is in a folder, but not its lock."""
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            shutil.rmtree(entry, ignore_errors=True)
+        elif entry.name != LOCK:
+            entry.unlink()
+
+
+def _move(capture: Path, place: Path) -> None:
+    try:
+        if place.exists():
+            place.rmdir()
+        capture.rename(place)
+    except OSError as error:
+        raise NeecoError(f"{place}: cannot write: {error.strerror or error}") from error

@@ -1,9 +1,8 @@
-"""Poses and readings at any time, from noisy logs: robust local polynomials (Cleveland 1979), never across a gap.
+"""Poses and readings at any time, from noisy logs: robust local regression (LOESS, Cleveland 1979), never across a gap.
 
-At each time asked for, a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how
-well they fit (bisquare). Rotations are fitted as rotation vectors about their local mean. How wide the window is
-follows from the log: the width that best predicts each sample from its neighbours. Ours beside scipy's Slerp and
-RotationSpline on purpose: these go through every sample, noise and all.
+At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how well they
+fit (bisquare). Rotations are fitted as rotation vectors about their local mean. The window's width is the one that best
+predicts each sample from its neighbours. (Slerp and RotationSpline of scipy go through every sample, noise and all.)
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from neeco.ingest.logs import PoseLog, ReadingLog
 
 WIDTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)  # half windows tried, in usual steps
 WIDEST_S = 1.0
-JUDGED = 600  # samples predicted to choose a width
-TOO_FEW, FEW = 4, 6  # samples in a window: fewer are interpolated linearly, fitted by a line
+VALIDATED = 600  # samples predicted to choose a width (cross-validation)
+MIN_SAMPLES, MIN_FOR_CURVATURE = 4, 6  # in a window: fewer are interpolated linearly, fitted by a line
 ROUNDS = 3  # of robust reweighting
 CUTOFF = 4.7  # bisquare, in noise sigmas per axis (Beaton & Tukey 1974)
 CHUNK = 300_000  # window samples worked on at once
@@ -72,7 +71,7 @@ def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = Non
 def pose_smoothing(log: PoseLog) -> Smoothing:
     """The windows that best predict each sample of this log from its neighbours (leave-one-out cross-validation)."""
     samples = _Samples(log.times, log.gaps)
-    chosen = samples.judged()
+    chosen = samples.validated()
 
     def position_errors(width: float) -> np.ndarray:
         fitted = _fit(samples, log.positions, log.times[chosen], width, leave_out=chosen)
@@ -91,7 +90,7 @@ def pose_smoothing(log: PoseLog) -> Smoothing:
 def reading_smoothing(log: ReadingLog) -> Smoothing:
     """The same for readings (the rotation's fields are 0)."""
     samples = _Samples(log.times, log.gaps)
-    chosen = samples.judged()
+    chosen = samples.validated()
 
     def errors(width: float) -> np.ndarray:
         fitted = _fit(samples, log.values[:, None], log.times[chosen], width, leave_out=chosen)
@@ -121,11 +120,11 @@ class _Samples:
         exact = (self.times[left] == times) | (self.times[right] == times)
         return inside & (exact | (self.stretch[left] == self.stretch[right]))
 
-    def judged(self) -> np.ndarray:
+    def validated(self) -> np.ndarray:
         """Samples [M] to choose a width by: evenly spread, never the end of a stretch."""
         inner = np.arange(len(self.times))
         inner = inner[(inner > self.first) & (inner < self.last - 1)]
-        return inner[np.unique(np.linspace(0, len(inner) - 1, JUDGED).astype(int))] if len(inner) else inner
+        return inner[np.unique(np.linspace(0, len(inner) - 1, VALIDATED).astype(int))] if len(inner) else inner
 
     def window(self, times: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         """Samples within `width` of each time, of its own stretch: index [N, K] and bool [N, K]."""
@@ -172,7 +171,7 @@ def _fit_rotations(
     if not len(times):
         return np.zeros((0, 4))
     step = (_rotation(quats[left]).inv() * _rotation(quats[right])).as_rotvec()
-    result = _wxyz(_rotation(quats[left]) * Rotation.from_rotvec(step * share[:, None]))
+    result = (_rotation(quats[left]) * Rotation.from_rotvec(step * share[:, None])).as_quat(scalar_first=True)
     if width <= 0:
         return result
     noise = _noise(_turns(quats))
@@ -182,7 +181,7 @@ def _fit_rotations(
         flat = np.repeat(np.arange(len(index)), index.shape[1])
         vectors = (mean[flat].inv() * _rotation(around.reshape(-1, 4))).as_rotvec().reshape(*index.shape, 3)
         vector = _local_polynomial(offsets, used, vectors, noise)
-        result[rows] = _wxyz(mean * Rotation.from_rotvec(vector))
+        result[rows] = (mean * Rotation.from_rotvec(vector)).as_quat(scalar_first=True)
     return result
 
 
@@ -193,8 +192,8 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     # with few samples the curvature is held at 0; the rest only keeps the equations solvable
     ridge = np.zeros((len(offsets), 3))
     ridge[:, 1] = 1e-9
-    ridge[:, 2] = np.where(used.sum(axis=1) < FEW, 1e6, 1e-9)
-    # start from what the middle of the window says, so that one wild sample does not bend the first fit
+    ridge[:, 2] = np.where(used.sum(axis=1) < MIN_FOR_CURVATURE, 1e6, 1e-9)
+    # start from what the middle of the window says, so that one outlier does not bend the first fit
     axis_first = np.moveaxis(values, -1, 0)  # [D, N, K]
     middle = np.moveaxis(_median(axis_first, np.broadcast_to(used, axis_first.shape)), 0, -1)[:, None]
     residuals = np.linalg.norm(values - middle, axis=-1)
@@ -212,8 +211,8 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
         scale = np.maximum(1.48 * _median(residuals, used) / axes, noise)
         weights = near * np.clip(1 - (residuals / (CUTOFF * axes * scale[:, None])) ** 2, 0, None) ** 2
         # a fit that trusts too few samples is no fit
-        lost = (weights > 0).sum(axis=1) < TOO_FEW
-        weights[lost] = near[lost]
+        distrusting = (weights > 0).sum(axis=1) < MIN_SAMPLES
+        weights[distrusting] = near[distrusting]
     return coefficients[:, 0]
 
 
@@ -225,7 +224,7 @@ def _best_width(samples: _Samples, errors: Callable[[float], np.ndarray]) -> tup
     found = [errors(width) for width in widths]
     if not len(found[0]):
         return 0.0, 0.0
-    # wild samples are no reason for one width or another
+    # outliers are no reason for one width or another
     limit = 5 * max(float(np.median(found[0])), 1e-12)
     scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in found]
     best = int(np.argmin(scores))
@@ -243,7 +242,7 @@ def _windows(
         index, used = samples.window(times[rows], width)
         if leave_out is not None:
             used &= index != leave_out[rows, None]
-        enough = used.sum(axis=1) >= TOO_FEW
+        enough = used.sum(axis=1) >= MIN_SAMPLES
         if enough.any():
             rows, index, used = rows[enough], index[enough], used[enough]
             yield rows, index, used, (samples.times[index] - times[rows, None]) / width
@@ -272,8 +271,4 @@ def _tricube(offsets: np.ndarray) -> np.ndarray:
 
 
 def _rotation(quats: np.ndarray) -> Rotation:
-    return Rotation.from_quat(quats[..., [1, 2, 3, 0]])
-
-
-def _wxyz(rotation: Rotation) -> np.ndarray:
-    return rotation.as_quat()[..., [3, 0, 1, 2]]
+    return Rotation.from_quat(quats, scalar_first=True)

@@ -1,11 +1,12 @@
-"""The camera's lens: read from a calibration, and taken out of the images once."""
+"""What the optics do to the images: the lens, read from a calibration and undistorted, and the round field of view."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 import yaml
+from scipy import ndimage
 
 from neeco.capture.documents import as_float, printable
 from neeco.errors import NeecoError
@@ -25,7 +27,15 @@ DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
 LARGEST = 1e9  # of any of a lens's numbers
-COUNTS = (0, 4, 5, 8, 12, 14)  # distortion coefficients that OpenCV's model comes with
+COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
+
+# The dark border around a round field of view.
+BORDER_SAMPLES = 48  # frames looked at
+DARK = 40.0  # of 255; a border brighter than this in most frames is no border
+MARGIN = 0.015  # of the radius taken off: the border's edge is blurred
+MISFIT = 0.015  # of the radius: how far the edge may be off a circle
+CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
+SHARP = 0.6  # share of the brightness inside the edge that must be gone right outside
 
 
 @dataclass(frozen=True)
@@ -150,9 +160,8 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     width, height = document.get("w"), document.get("h")
     size = _size(path, width, height)
     if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
-        focal = (
-            size[0] / 2 / math.tan(float(document["camera_angle_x"]) / 2) if document["camera_angle_x"] else math.nan
-        )
+        angle = float(document["camera_angle_x"])
+        focal = size[0] / 2 / math.tan(angle / 2) if angle else math.nan
         document = {"fl_x": focal, "fl_y": focal, "cx": size[0] / 2, "cy": size[1] / 2} | document
     missing = [key for key in ("fl_x", "cx", "cy") if key not in document]
     if missing:
@@ -187,7 +196,7 @@ def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], s
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
-    if len(coefficients) not in COUNTS:
+    if len(coefficients) not in COEFFICIENTS:
         raise NeecoError(
             f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV's models have 4, 5, 8, 12 or 14"
         )
@@ -215,16 +224,15 @@ class _Loader(yaml.SafeLoader):
     """YAML with OpenCV's matrices."""
 
 
-def _matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
-    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
-
-
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix_node)
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_tag}",
+        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
+    )
 
 
 def _read_opencv_yaml(path: Path) -> Any:
-    """By PyYAML, not cv2.FileStorage, on purpose: it reads ROS's files and plain lists too, and names a bad line."""
+    """By PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a bad line."""
     text = read_text(path, "OpenCV's calibration as YAML")
     if text.lstrip().startswith("<"):
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
@@ -253,3 +261,114 @@ def _numbers(path: Path, value: Any, field: str) -> list[float]:
                 raise NeecoError(f"{path}: {field}: {printable(entry)} is not a usable number; write it as OpenCV does")
             flat.append(number)
     return flat
+
+
+def visible_mask(images: Iterable[np.ndarray]) -> np.ndarray | None:
+    """bool [H, W], False on the dark border around a round field of view; None when the images have no such border.
+
+    images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDER_SAMPLES are used). The border
+    stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp all
+    along, counts: dark corners of a dim scene are none.
+    """
+    brightness = _brightest(images)
+    if brightness is None or min(brightness.shape) < 32:
+        return None
+    threshold = _dark_threshold(brightness)
+    if threshold is None:
+        return None
+    dark = ndimage.binary_opening(brightness < threshold, iterations=1)
+    outside = _touching_corners(dark)
+    if outside.sum() < 0.01 * outside.size:
+        return None
+    circle = _fit_circle(_border_edge(outside))
+    if circle is None or not _divides_dark_from_bright(circle, outside, brightness, threshold):
+        return None
+    x, y, radius = circle
+    rows, columns = np.indices(outside.shape)
+    return np.hypot(columns - x, rows - y) < radius * (1 - MARGIN) - 0.5
+
+
+def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:
+    """float [H, W]: how bright each pixel gets in its brightest frames, noise smoothed out."""
+    stack = [image.max(axis=2).astype(np.float32) for image in islice(images, BORDER_SAMPLES)]
+    if not stack:
+        return None
+    # the second brightest of ten, so that one flash or one damaged frame does not light up the border
+    return ndimage.gaussian_filter(np.percentile(np.stack(stack), 90, axis=0), 1.0)
+
+
+def _dark_threshold(brightness: np.ndarray) -> float | None:
+    """The brightness between border and scene, from the corners' black level up."""
+    height, width = brightness.shape
+    size = max(min(height, width) // 40, 2)
+    ends = (slice(size), slice(-size, None))
+    corners = [brightness[rows, columns] for rows in ends for columns in ends]
+    levels = sorted(float(np.median(corner)) for corner in corners)
+    black, spread = levels[1], float(np.median([np.std(corner) for corner in corners]))
+    middle = brightness[height // 4 : -height // 4, width // 4 : -width // 4]
+    scene = float(np.percentile(middle, 25))
+    if black > DARK or scene < black + 6 * max(spread, 0.5) + 4:
+        return None
+    return black + max(0.15 * (scene - black), 4 * max(spread, 0.5))
+
+
+def _touching_corners(dark: np.ndarray) -> np.ndarray:
+    """The dark regions that hold a corner of the image."""
+    labels, _ = ndimage.label(dark)
+    found = {int(labels[row, column]) for row in (1, -2) for column in (1, -2)} - {0}
+    return np.isin(labels, list(found))
+
+
+def _border_edge(outside: np.ndarray) -> np.ndarray:
+    """Pixels [M, 2] (x, y) of the scene beside the dark region, not those cut off by the image's edge."""
+    edge = ndimage.binary_dilation(outside) & ~outside
+    edge[:2] = edge[-2:] = False
+    edge[:, :2] = edge[:, -2:] = False
+    rows, columns = np.nonzero(edge)
+    return np.stack([columns, rows], axis=1).astype(np.float64)
+
+
+def _fit_circle(points: np.ndarray) -> tuple[float, float, float] | None:
+    """Centre and radius of the circle through most points [M, 2] (algebraic fit, Kasa 1976, reweighted)."""
+    if len(points) < 30:
+        return None
+    center = points.mean(axis=0)
+    local = points - center
+    design = np.column_stack([2 * local, np.ones(len(local))])
+    weights = np.ones(len(local))
+    for _ in range(20):
+        normal = design.T @ (design * weights[:, None]) + 1e-9 * np.eye(3)
+        a, b, c = np.linalg.solve(normal, design.T @ (weights * (local**2).sum(axis=1)))
+        radius = float(np.sqrt(max(c + a * a + b * b, 1e-9)))
+        residuals = np.hypot(local[:, 0] - a, local[:, 1] - b) - radius
+        scale = max(1.48 * float(np.median(np.abs(residuals))), 0.3)
+        weights = 1 / (1 + (residuals / (2 * scale)) ** 2) ** 2
+    if np.median(np.abs(residuals)) > max(MISFIT * radius, 1.0):
+        return None
+    return float(center[0] + a), float(center[1] + b), radius
+
+
+def _divides_dark_from_bright(
+    circle: tuple[float, float, float], outside: np.ndarray, brightness: np.ndarray, threshold: float
+) -> bool:
+    """Whether the circle is a plausible edge of the field of view, and divides dark from bright cleanly."""
+    x, y, radius = circle
+    height, width = outside.shape
+    if not (0.25 * min(width, height) < radius < 0.75 * max(width, height)):
+        return False
+    if not (0.25 * width < x < 0.75 * width and 0.2 * height < y < 0.8 * height):
+        return False
+    rows, columns = np.indices(outside.shape)
+    distance = np.hypot(columns - x, rows - y)
+    beyond, within = distance > radius * (1 + 2 * MISFIT) + 1, distance < radius * (1 - 2 * MISFIT) - 1
+    if beyond.sum() < 0.01 * beyond.size:
+        return False
+    ring = within & (distance > 0.9 * radius)
+    bright = np.mean(brightness[ring] >= threshold) if ring.any() else 0.0
+    if np.mean(outside[beyond]) <= CLEAN or np.mean(outside[within]) >= 1 - CLEAN or bright <= CLEAN:
+        return False
+    # a vignette darkens slowly; an edge does it within a few pixels
+    black = float(np.percentile(brightness[beyond], 10))
+    inner = float(np.median(brightness[(distance > 0.94 * radius) & (distance < 0.98 * radius)]))
+    outer = float(np.median(brightness[(distance > 1.02 * radius) & (distance < 1.06 * radius)]))
+    return inner - outer > SHARP * (inner - black)

@@ -1,7 +1,7 @@
-"""Logs of trackers and joint sensors: read, put in order, and told what was wrong with them.
+"""Logs of trackers and joint sensors: read, converted to mm, rad, s and quaternions, put in order.
 
-Whatever is left out is noted with how many rows and which; what cannot be told apart from a mistake in the recording
-(units, columns, most of the rows bad) is refused.
+What is left out is noted with how many rows and which. What may as well be a mistake in the recording (units, columns,
+most of the rows unusable) is refused.
 """
 
 from __future__ import annotations
@@ -10,35 +10,48 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest import columns as named
-from neeco.ingest.calibration import apply_calibration, read_calibration
 from neeco.ingest.columns import (
+    EULER,
     FORMS,
+    MATRIX,
+    QUATERNION_WXYZ,
+    QUATERNION_XYZW,
+    ROTATION_MATRIX,
+    ROTATION_VECTOR,
+    UNITS,
     JointColumns,
     PoseColumns,
-    Recognised,
+    RecognisedColumns,
     recognise_pose,
     recognise_time,
     recognise_value,
+    scale_of,
+    split_unit,
 )
-from neeco.ingest.rotations import continuous, to_quaternions
-from neeco.ingest.tables import Rows, Table, column_index, count_rows, listed, numbers, read_table
-from neeco.ingest.units import scale_of
+from neeco.ingest.formats import Table, column_index, count_rows, list_lines, numbers, read_table
+from neeco.raster.rotations import rotation_error
 
-FEWEST = 4  # samples of a usable log
-STATES_TOLD = 8  # of those that drop rows
+MIN_SAMPLES = 4  # of a usable log
+WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+LISTED_STATES = 8  # states that drop rows and are named in the notes
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
+TWO_TURNS = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
+CLAMPED = 0.05  # of a calibration table's range: readings that far outside it count as its end
+NORM_TOLERANCE = 0.02  # of a quaternion's length: two decimals pass
+ROUNDED_TOLERANCE = 0.02  # of R^T R - I: loggers round to two decimals
 
 
-@dataclass(frozen=True, eq=False)  # compared and remembered by identity: it holds arrays
+@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
 class PoseLog:
     """Poses tracker_from_sensor over time, on the log's own clock: t_log = t_video + offset.
 
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
-    first time after) where samples are missing; notes: what was dropped or mended, in words.
+    first time after) where samples are missing; notes: what was dropped or repaired, in words.
     """
 
     path: Path
@@ -50,7 +63,7 @@ class PoseLog:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)  # compared and remembered by identity: it holds arrays
+@dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
 class ReadingLog:
     """Readings of a joint, rad, over time; fields as in PoseLog."""
 
@@ -60,6 +73,39 @@ class ReadingLog:
     values: np.ndarray
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
+
+
+class Rows:
+    """Which rows of a table are in use; those left out, by reason, and those repaired, for the notes."""
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.keep = np.ones(len(table.rows), dtype=bool)
+        self.reasons: dict[str, list[int]] = {}  # the file's lines
+        self.repairs: list[str] = []
+
+    def drop(self, which: np.ndarray | list[int], reason: str) -> None:
+        """Leave rows out (bool [R], or their numbers), and note those that were in use."""
+        lines = self.table.lines[which][self.keep[which]]
+        if len(lines):
+            self.reasons.setdefault(reason, []).extend(lines.tolist())
+        self.keep[which] = False
+
+    def drop_wrong(self, wrong: np.ndarray, reason: str) -> None:
+        """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
+        lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
+        if len(lines) > max(1, WRONG_ROWS * count):
+            raise NeecoError(f"{self.table.path}: {list_lines(lines)} ({len(lines)} of {count_rows(count)}): {reason}")
+        self.drop(wrong, reason.split(";")[0])
+
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the rows, one sentence each."""
+        name = self.table.path.name
+        dropped = (
+            f"{name}: {count_rows(len(lines))} dropped: {reason} ({list_lines(lines)})"
+            for reason, lines in self.reasons.items()
+        )
+        return (*dropped, *(f"{name}: {repair}" for repair in self.repairs))
 
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
@@ -73,10 +119,9 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     times, order = _in_order(rows, times)
     quats, flips = continuous(quats[order])
     if flips:
-        rows.mended.append(f"the quaternion's sign flipped {flips} times; undone")
-    gaps = _gaps(times)
-    notes = (*rows.notes(), *_gap_notes(table.path, gaps))
-    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes)
+        rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
+    gaps, gap_notes = _gaps(table, times)
+    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, (*rows.notes(), *gap_notes))
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -92,49 +137,93 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     rows = Rows(table)
     times = _times(rows, source, found)
     values = _cells(rows, (value,))[:, 0]
-    notes: tuple[str, ...] = ()
+    clamped: tuple[str, ...] = ()
     if source.calibration is not None:
         calibration = read_calibration(source.calibration, source.units.angle)
-        values, outside, notes = apply_calibration(calibration, table, value, values, rows.keep)
+        values, outside, clamped = apply_calibration(calibration, table, value, values, rows.keep)
         reason = f"{value} lies far outside the calibration table {source.calibration.name}"
         rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
     else:
         hint = " Counts need a calibration table, `calibration`."
-        values = values * scale_of(str(table.path), (value,), "angle", source.units.angle, None, hint)
-        wild = np.abs(np.where(rows.keep, values, 0)) > 4 * np.pi
+        values = values * scale_of(table.path, (value,), "angle", source.units.angle, None, hint)
+        wild = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(wild, reason)
     times, order = _in_order(rows, times)
-    gaps = _gaps(times)
-    notes = (*rows.notes(), *notes, *_gap_notes(table.path, gaps))
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes)
+    gaps, gap_notes = _gaps(table, times)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))
 
 
-def _poses(rows: Rows, source: PoseColumns, found: Recognised) -> tuple[np.ndarray, np.ndarray]:
+def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
     form, rotation = _rotation_columns(table, source, found)
     position = source.position or found.position
-    if form == named.MATRIX:
+    if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
         raise NeecoError(f"{table.path}: header: {_unclear(table, found.unclear, 'position', 'x, y, z columns')}")
     else:
         read = (*position, *rotation)
     implied = found.length_unit if position == found.position else None
-    scale = scale_of(str(table.path), position, "length", source.units.length, implied, "")
+    scale = scale_of(table.path, position, "length", source.units.length, implied, "")
     angle = 1.0
-    if form in (named.EULER, named.ROTATION_VECTOR):
-        angle = scale_of(str(table.path), rotation, "angle", source.units.angle, None, "")
+    if form in (EULER, ROTATION_VECTOR):
+        angle = scale_of(table.path, rotation, "angle", source.units.angle, None, "")
     positions, turns = _parts(table, form, _cells(rows, read))
     positions = positions * scale
-    if form not in (named.EULER, named.ROTATION_VECTOR):  # trackers write zeros where they have no rotation
+    if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
         rows.drop((turns == 0).all(axis=1), "the rotation is all zeros (no measurement)")
     quats, good = to_quaternions(form, turns, source.euler_convention, angle)
     what = "a unit quaternion" if form.startswith("quaternion") else "a rotation"
     rows.drop_wrong(~good, f"{rotation[0]} ... {rotation[-1]} are not {what}; name the right columns")
-    _check_range(table, positions[rows.keep], position)
+    distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
+    if distance > FARTHEST_MM:
+        raise NeecoError(
+            f"{table.path}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker; "
+            "correct the unit in the header or in units.length"
+        )
     return positions, quats
+
+
+def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Unit quaternions wxyz [R, 4] of rotation columns [R, C], and bool [R] where they are rotations at all.
+
+    form: see `columns.FORMS`; matrices by rows, of 4x4 ones the first 9 rotation cells; convention: of Euler angles;
+    scale: of angles, to rad. Rows that are no rotation (or hold NaN) are NaN: scipy would take any numbers for one.
+    """
+    quats = np.full((len(cells), 4), np.nan)
+    finite = np.isfinite(cells).all(axis=1)
+    if form in (QUATERNION_WXYZ, QUATERNION_XYZW):
+        norms = np.linalg.norm(cells, axis=1)
+        good = finite & (np.abs(norms - 1) <= NORM_TOLERANCE)
+        wxyz = cells if form == QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
+        quats[good] = wxyz[good] / norms[good, None]
+        return quats, good
+    if form in (ROTATION_MATRIX, MATRIX):
+        matrices = cells.reshape(-1, 3, 3)
+        with np.errstate(all="ignore"):
+            good = finite & (rotation_error(matrices) <= ROUNDED_TOLERANCE)
+            good &= np.linalg.det(np.where(finite[:, None, None], matrices, 0)) > 0
+    else:
+        # beyond this, angles are something else (or the sine of them is noise)
+        good = finite & (np.abs(cells * scale) < 1e4).all(axis=1)
+    if good.any():
+        if form in (ROTATION_MATRIX, MATRIX):
+            rotations = Rotation.from_matrix(matrices[good])
+        elif form == EULER:
+            rotations = Rotation.from_euler(convention or "", cells[good] * scale)
+        else:
+            rotations = Rotation.from_rotvec(cells[good] * scale)
+        quats[good] = rotations.as_quat(scalar_first=True)
+    return quats, good
+
+
+def continuous(quats: np.ndarray) -> tuple[np.ndarray, int]:
+    """Quaternions [T, 4] with signs such that neighbours lie in one half space, and how often the sign flipped."""
+    flips = np.concatenate([[False], (quats[1:] * quats[:-1]).sum(axis=1) < 0])
+    signs = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
+    return quats * signs[:, None], int(flips.sum())
 
 
 def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
@@ -150,7 +239,7 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         if state.lower() not in good:
             by_state.setdefault(state[:20], []).append(row)
     for number, (state, members) in enumerate(by_state.items()):
-        if number < STATES_TOLD:
+        if number < LISTED_STATES:
             rows.drop(members, f"{name} is {state or 'empty'!r}")
         rows.keep[members] = False
     if not rows.keep.any():
@@ -160,7 +249,7 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         )
 
 
-def _times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised) -> np.ndarray:
+def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
     """Times [R] in s; rows without one are dropped."""
     table, names = rows.table, source.time or found.time
     if names is None:
@@ -185,7 +274,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: Recognised) ->
         rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
         likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
         hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * scale_of(str(table.path), names, "time", source.units.time, known.time_unit, hint)
+    return cells[:, 0] * scale_of(table.path, names, "time", source.units.time, known.time_unit, hint)
 
 
 def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
@@ -208,7 +297,7 @@ def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     return values
 
 
-def _rotation_columns(table: Table, source: PoseColumns, found: Recognised) -> tuple[str, tuple[str, ...]]:
+def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumns) -> tuple[str, tuple[str, ...]]:
     """Form and columns of the rotation."""
     rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
     if rotation is None or form is None:
@@ -216,11 +305,9 @@ def _rotation_columns(table: Table, source: PoseColumns, found: Recognised) -> t
             f"{table.path}: header: {_unclear(table, found.unclear, 'rotation', 'qw, qx, qy, qz columns')}"
         )
     if len(rotation) not in FORMS[form]:
-        raise NeecoError(
-            f"{table.path}: {form}: takes {' or '.join(map(str, FORMS[form]))} columns, not {len(rotation)}; "
-            "list them all"
-        )
-    if form == named.EULER and not source.euler_convention:
+        wanted = " or ".join(map(str, FORMS[form]))
+        raise NeecoError(f"{table.path}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
+    if form == EULER and not source.euler_convention:
         raise NeecoError(f"{table.path}: {', '.join(rotation)}: say their euler_convention in the recording (like XYZ)")
     return form, rotation
 
@@ -235,7 +322,7 @@ def _unclear(table: Table, unclear: dict[str, str], what: str, expected: str) ->
 
 def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] in the file's unit and rotation cells [R, C]."""
-    if form != named.MATRIX:
+    if form != MATRIX:
         return cells[:, :3], cells[:, 3:]
     rows = cells[:, :12].reshape(-1, 3, 4)
     if cells.shape[1] == 16:
@@ -247,16 +334,6 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
-def _check_range(table: Table, positions: np.ndarray, names: tuple[str, ...]) -> None:
-    """Refuse positions that no tracker of instruments gives, which is how a wrong unit shows."""
-    distance = np.median(np.linalg.norm(positions, axis=1)) if len(positions) else 0.0
-    if distance > FARTHEST_MM:
-        raise NeecoError(
-            f"{table.path}: {', '.join(names)}: half the samples are over {distance / 1000:.3g} m from the tracker; "
-            "correct the unit in the header or in units.length"
-        )
-
-
 def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
     table, kept = rows.table, np.flatnonzero(rows.keep)
@@ -265,27 +342,100 @@ def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
-    if len(order) < FEWEST:
+    if len(order) < MIN_SAMPLES:
         why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
             f"{table.path}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
             "record again or name the right columns"
         )
     if len(late):
-        rows.mended.append(f"{count_rows(len(late))} out of order in time; sorted ({listed(table.lines[late])})")
+        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({list_lines(table.lines[late])})")
     return times[order], order
 
 
-def _gaps(times: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Where samples are missing: steps longer than 4 usual ones and 0.15 s."""
+def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], ...], tuple[str, ...]]:
+    """Where samples are missing (steps longer than 4 usual ones and 0.15 s), and a note of it."""
     steps = np.diff(times)
     longest = max(GAP_STEPS * float(np.median(steps)), GAP_SECONDS)
-    return tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
-
-
-def _gap_notes(path: Path, gaps: tuple[tuple[float, float], ...]) -> tuple[str, ...]:
+    gaps = tuple((float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest))
     if not gaps:
-        return ()
+        return (), ()
     total = sum(end - start for start, end in gaps)
     first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
-    return (f"{path.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''}, {total:.2f} s in all ({first}); not bridged",)
+    count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
+    return gaps, (f"{table.path.name}: {count}, {total:.2f} s in all ({first}); not bridged",)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A joint sensor's table: counts [K] increasing, angles [K] rad, increasing or decreasing. Between its points PCHIP
+    (Fritsch & Carlson 1980) is as monotone as they are."""
+
+    path: Path
+    counts: np.ndarray
+    angles: np.ndarray
+
+
+def read_calibration(path: Path, angle_unit: str | None = None) -> Calibration:
+    """Read a table of two columns, counts and angle. The angle is the column with an angle's unit in its name, else
+    the second; its unit comes from there or from `angle_unit`. Raises NeecoError naming file, row and remedy."""
+    table = read_table(path)
+    names = [name for name in table.header if name]
+    angle_names = [name for name in names if split_unit(name, "angle")[1] or split_unit(name, "angle")[0] == "angle"]
+    if len(names) < 2 or (len(names) > 2 and len(angle_names) != 1):
+        raise NeecoError(f"{path}: header: expected two columns, counts and angle_rad (or angle_deg); repair the table")
+    angle_name = angle_names[0] if len(angle_names) == 1 else names[1]
+    count_name = next(name for name in names if name != angle_name)
+    unit = split_unit(angle_name, "angle")[1] or angle_unit
+    if unit is None:
+        raise NeecoError(
+            f"{path}: column {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg"
+        )
+    values, missing, bad = numbers(table, (count_name, angle_name))
+    wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
+    if wrong:
+        row, what = min(wrong)
+        raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
+    order = np.argsort(values[:, 0], kind="stable")
+    counts, angles, lines = values[order, 0], values[order, 1] * UNITS["angle"][unit], table.lines[order]
+    if len(counts) < 2:
+        raise NeecoError(f"{path}: has one point; a calibration table needs two or more")
+    same = np.flatnonzero(np.diff(counts) <= 0)
+    if len(same):
+        first, second = lines[same[0] : same[0] + 2]
+        raise NeecoError(
+            f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one of them"
+        )
+    turning = np.flatnonzero(np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
+    if len(turning):
+        first, second = lines[turning[0] : turning[0] + 2]
+        raise NeecoError(
+            f"{path}: lines {first} and {second}: the angle does not go on rising (or falling) with the counts, so a "
+            "count has no one angle; measure these points again"
+        )
+    if np.abs(angles).max() > TWO_TURNS:
+        raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
+    return Calibration(Path(path), counts, angles)
+
+
+def apply_calibration(
+    calibration: Calibration, table: Table, name: str, counts: np.ndarray, keep: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Angles [R] rad of counts [R]; bool [R] rows too far outside the table to be used; notes.
+
+    Readings outside by less than 5% of the table's range are read as its end.
+    """
+    low, high = calibration.counts[0], calibration.counts[-1]
+    counts = np.where(keep, counts, low)
+    excess = np.maximum(low - counts, counts - high)
+    outside = excess > CLAMPED * (high - low)
+    angles = PchipInterpolator(calibration.counts, calibration.angles)(np.clip(counts, low, high))
+    clamped = (excess > 0) & ~outside
+    if not clamped.any():
+        return angles, outside, ()
+    note = (
+        f"{table.path.name}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
+        f"{calibration.path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
+        f"read as its end ({list_lines(table.lines[clamped])})"
+    )
+    return angles, outside, (note,)

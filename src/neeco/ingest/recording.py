@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import difflib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from neeco.capture.documents import as_float, printable
+from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
-from neeco.ingest.columns import JointColumns, PoseColumns
-from neeco.ingest.sections import LARGEST, Section, close_match, joint_columns, pose_columns
+from neeco.ingest.columns import (
+    EULER,
+    FORMS,
+    MATRIX,
+    TRACKER_CLOCK,
+    UNITS,
+    JointColumns,
+    PoseColumns,
+    Units,
+    canonical_unit,
+    quaternion_form,
+)
 from neeco.ingest.video import VideoSource, open_images, open_video
 
-TRACKER_CLOCK = "em"
-FEWEST_FRAMES = 10  # that cameras can be found from
-_SUFFIX = "_minus_video_s"
+MIN_FRAMES = 10  # that cameras can be found from
+LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
+_OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
+_EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
 
 
 @dataclass(frozen=True)
@@ -33,13 +46,30 @@ class InstrumentLogs:
 @dataclass(frozen=True)
 class Splits:
     """How frames are split. test_every: every n-th (0: none); unseen_fraction: of the frames (0: none), the extreme of
-    `unseen_by` (a joint; None: of the whole state); or given: ranges (first, last) of video frames. None: as usual."""
+    `unseen_by` (a joint; None: of the whole state); or given: ranges (first, last) of video frames."""
 
-    test_every: int | None = None
-    unseen_fraction: float | None = None
+    test_every: int = 8
+    unseen_fraction: float = 0.15
     unseen_by: str | None = None
     test: tuple[tuple[int, int], ...] = ()
     unseen: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class IngestSettings:
+    """Numbers that decide what comes of a recording (`settings` in recording.yaml). All are above 0."""
+
+    max_frames: int = 400  # kept, unless the recording's `frames` says how many
+    min_sharpness: float = 0.5  # of the neighbouring frames' sharpness: a frame below is dropped as blurred
+    sfm_features: int = 1200  # SIFT features per image
+    sfm_keyframes: int = 80  # about so many frames are mapped; the others are placed among their points
+    shape_frames: int = 60  # from which an instrument's rough shape is carved
+    moving_px: float = 1.5  # optical flow that the still scene does not explain: the pixel moves
+    tracker_noise_mm: float = 0.25  # of a tracker's samples: where the robust loss begins to doubt one
+    tracker_noise_rad: float = 0.002
+    tracker_drift_mm: float = 0.3  # of a tracker over seconds
+    registration_steps: int = 40  # evaluations of the least-squares solver
+    scene_distance_mm: float = 100.0  # from the cameras to the tissue, where nothing measures it
 
 
 @dataclass(frozen=True)
@@ -60,6 +90,7 @@ class Recording:
     frames: int | None = None
     splits: Splits | None = None
     notes: tuple[str, ...] = ()
+    settings: IngestSettings = field(default_factory=IngestSettings)
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -77,16 +108,16 @@ class Recording:
 def read_recording(path: Path) -> Recording:
     """Read recording.yaml; paths in it are relative to it. Raises NeecoError naming file, key and remedy."""
     path = Path(path)
-    keys = ("video", "images", "intrinsics", "instruments", "laparoscope", "sync", "frames", "splits")
+    keys = ("video", "images", "intrinsics", "instruments", "laparoscope", "sync", "frames", "splits", "settings")
     top = Section(path, "", _load(path), keys)
     video, images, fps, times = _frames_from(top)
     instruments = _instruments(top)
     laparoscope = top.value.get("laparoscope")
-    scope = None if laparoscope is None else pose_columns(top, "laparoscope", laparoscope, TRACKER_CLOCK)
+    scope = None if laparoscope is None else _pose_columns(top, "laparoscope", laparoscope)
     sync, notes = _sync(top, _clocks(instruments, scope))
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
-        top.integer("frames", FEWEST_FRAMES), _splits(top, instruments), notes,
+        top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top),
     )  # fmt: skip
 
 
@@ -114,44 +145,136 @@ def recording_from_flags(
         raise NeecoError(f"--joint {twice}: given twice; give each joint once")
     if joints and instrument is None:
         raise NeecoError(f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to")
-    logs = {joint: JointColumns(Path(log), joint, calibration=_path(table)) for joint, log, table in joints}
-    instruments = (InstrumentLogs(name, PoseColumns(Path(instrument), TRACKER_CLOCK), logs),) if instrument else ()
-    scope = PoseColumns(Path(laparoscope), TRACKER_CLOCK) if laparoscope else None
-    values: Path | tuple[float, ...] | None
-    if intrinsics is None or isinstance(intrinsics, str | Path):
-        values = _path(intrinsics)
-    elif len(intrinsics) == 4:
+    logs = {joint: JointColumns(Path(log), joint, calibration=table and Path(table)) for joint, log, table in joints}
+    instruments = (InstrumentLogs(name, PoseColumns(Path(instrument)), logs),) if instrument else ()
+    scope = PoseColumns(Path(laparoscope)) if laparoscope else None
+    values: Path | tuple[float, ...] | None = None
+    if isinstance(intrinsics, str | Path):
+        values = Path(intrinsics)
+    elif intrinsics is not None:
         values = tuple(float(value) for value in intrinsics)
-    else:
-        raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(intrinsics)} numbers")
-    folder = Path(video).is_dir()
+        if len(values) != 4:
+            raise NeecoError(f"--intrinsics: takes FX FY CX CY, not {len(values)} numbers")
     options = Section(Path("--sync"), "", {"sync": str(Path(sync).resolve())} if sync else {}, ("sync",))
     offsets, notes = _sync(options, _clocks(instruments, scope))
     check_frames(frames)
     if fps is not None and not 0 < fps < 1e6:  # NaN compares false
         raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
-    return Recording(
-        Path(video), None if folder else Path(video), Path(video) if folder else None, fps, None, values, instruments,
-        scope, offsets, frames, None, notes,
-    )  # fmt: skip
+    video = Path(video)
+    film, folder = (None, video) if video.is_dir() else (video, None)
+    return Recording(video, film, folder, fps, None, values, instruments, scope, offsets, frames, None, notes)
 
 
 def check_frames(frames: int | None) -> None:
     """Raise NeecoError when the option asks for too few frames."""
-    if frames is not None and frames < FEWEST_FRAMES:
-        raise NeecoError(f"--frames: {frames} is too few; give {FEWEST_FRAMES} or more")
-
-
-def _path(text: str | Path | Any | None) -> Path | None:
-    return None if text is None else Path(text)
+    if frames is not None and frames < MIN_FRAMES:
+        raise NeecoError(f"--frames: {frames} is too few; give {MIN_FRAMES} or more")
 
 
 def _clocks(instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | None) -> tuple[str, ...]:
-    found = [laparoscope.clock] if laparoscope else []
+    logs: list[PoseColumns | JointColumns | None] = [laparoscope]
     for instrument in instruments:
-        found += [instrument.poses.clock] if instrument.poses else []
-        found += [joint.clock for joint in instrument.joints.values()]
-    return tuple(dict.fromkeys(found))
+        logs += [instrument.poses, *instrument.joints.values()]
+    return tuple(dict.fromkeys(log.clock for log in logs if log))
+
+
+class Section:
+    """A mapping in a file: what is absent reads as None, what is wrong raises NeecoError, as keys other than `keys`
+    do."""
+
+    def __init__(self, file: Path, place: str, value: Any, keys: Sequence[str]) -> None:
+        self.file, self.place = file, place
+        self.node = Node(value, str(file), place, RaisingReport())
+        if not isinstance(value, dict):
+            self.node.error(f"expected keys such as `{keys[0]}:`, found {printable(value)}", "write them as key: value")
+        self.value: dict[str, Any] = value
+        for key in value:
+            if key not in keys:
+                likely = _close_match(str(key), keys)
+                hint = f"did you mean {likely}?" if likely else f"the keys here are {', '.join(keys)}"
+                raise self.error(printable(key) if not isinstance(key, str) else key, f"unknown key; {hint}")
+
+    def error(self, key: str, message: str) -> NeecoError:
+        return NeecoError(" ".join(f"{self.file}: {self.at(key)}: {message}".split()))
+
+    def at(self, key: str) -> str:
+        """Where a key of this section stands in its file."""
+        return ".".join(part for part in (self.place, key) if part)
+
+    def section(self, key: str, keys: Sequence[str]) -> Section:
+        """The mapping under a key; empty when absent."""
+        value = self.value.get(key)
+        return Section(self.file, self.at(key), {} if value is None else value, keys)
+
+    def text(self, key: str) -> str | None:
+        """A name; YAML makes whole numbers of some."""
+        value = self.value.get(key)
+        if isinstance(value, int) and not isinstance(value, bool):
+            return str(value)
+        return None if value is None else self.node.child(key).text("put it in quotes if it is a name")
+
+    def required_text(self, key: str) -> str:
+        text = self.text(key)
+        if text is None:
+            raise self.error(key, "missing; give it")
+        return text
+
+    def path(self, key: str) -> Path | None:
+        """An existing file or folder, relative to this file."""
+        return None if self.text(key) is None else self.required_path(key)
+
+    def required_path(self, key: str) -> Path:
+        text = self.required_text(key)
+        try:
+            path = self.file.parent / Path(text).expanduser()
+            found = path.exists()
+        except (OSError, ValueError, RuntimeError):
+            found = False
+        if not found:
+            raise self.error(
+                key, f"no such file: {printable(text, 120)}; correct the path (relative to {self.file.name})"
+            )
+        return path
+
+    def number(
+        self, key: str, above: float | None = None, least: float | None = None, below: float = LARGEST
+    ) -> float | None:
+        return self.node.child(key).number(above, least, below) if self.node.has(key) else None
+
+    def integer(self, key: str, least: int) -> int | None:
+        return self.node.child(key).integer(least) if self.node.has(key) else None
+
+    def names(self, key: str, counts: tuple[int, ...]) -> tuple[str, ...] | None:
+        """Names of columns, as a list or, for one, alone."""
+        value = self.value.get(key)
+        if value is None:
+            return None
+        items = value if isinstance(value, list) else [value]
+        good = all(isinstance(item, str | int) and not isinstance(item, bool) for item in items)
+        if not good or len(items) not in counts:
+            wanted = "the name of a column" if counts == (1,) else f"{' or '.join(map(str, counts))} names of columns"
+            raise self.error(key, f"expected {wanted}, found {printable(value)}; list them")
+        if len({str(item) for item in items}) < len(items):
+            raise self.error(key, "names a column twice; list different columns")
+        return tuple(str(item) for item in items)
+
+    def ranges(self, key: str) -> tuple[tuple[int, int], ...]:
+        """Frame numbers and ranges such as "30-40", as (first, last)."""
+        value = self.value.get(key)
+        if value is None:
+            return ()
+        found = []
+        for item in value if isinstance(value, list) else [value]:
+            match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", str(item))
+            if match is None or int(match[2] or match[1]) < int(match[1]):
+                raise self.error(key, f"{printable(item)} is no range of frames; write 12 or 30-40")
+            found.append((int(match[1]), int(match[2] or match[1])))
+        return tuple(found)
+
+
+def _close_match(name: str, names: Iterable[str]) -> str | None:
+    """The name that a misspelt one probably means."""
+    return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=0.6)), None)
 
 
 class _Loader(yaml.SafeLoader):
@@ -161,19 +284,18 @@ class _Loader(yaml.SafeLoader):
         seen: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"{printable(key.value)} is given twice; keep one of them", key.start_mark
-                )
+                problem = f"{printable(key.value)} is given twice; keep one of them"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
             seen.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 
 def _load(path: Path) -> Any:
-    missing = "no such file; `neeco ingest --init` writes one by looking at the files"
-    text = read_text(path, "a recording as YAML", missing)
+    advice = "`neeco ingest --init` writes one by looking at the files"
+    text = read_text(path, "a recording as YAML", f"no such file; {advice}")
     document = parse_yaml(path, text, "repair it", _Loader)
     if document is None:
-        raise NeecoError(f"{path}: the file is empty; `neeco ingest --init` writes one by looking at the files")
+        raise NeecoError(f"{path}: the file is empty; {advice}")
     return document
 
 
@@ -187,7 +309,7 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     key, keys = ("video", ("file", "fps")) if images is None else ("images", ("folder", "fps", "times"))
     value = top.value[key]
     section = Section(top.file, key, value if isinstance(value, dict) else {keys[0]: value}, keys)
-    source = section.path(keys[0], required=True)
+    source = section.required_path(keys[0])
     fps = section.number("fps", above=0.0)
     if images is None:
         return source, None, fps, None
@@ -215,19 +337,18 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
     sections = [
         Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints")) for i, item in enumerate(value)
     ]
-    names = [section.text("name", required=True) for section in sections]
+    names = [section.required_text("name") for section in sections]
     joint_names = [joint for section in sections for joint in _joints_of(section)]
     found = []
     for section, name in zip(sections, names, strict=True):
-        assert name is not None
         if names.count(name) > 1:
             raise section.error("name", f"{printable(name)} names two instruments; give each its own")
         poses = section.value.get("poses")
-        columns = None if poses is None else pose_columns(section, "poses", poses, TRACKER_CLOCK)
+        columns = None if poses is None else _pose_columns(section, "poses", poses)
         joints = {}
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
-            joints[joint] = joint_columns(section, f"joints.{joint}", item, clock, columns)
+            joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns)
         found.append(InstrumentLogs(name, columns, joints))
     return tuple(found)
 
@@ -241,15 +362,77 @@ def _joints_of(section: Section) -> dict[str, Any]:
     return value
 
 
+def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
+    """A log of poses: a file's name, or a mapping."""
+    section, file = _log(parent, key, value)
+    keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
+    columns = section.section("columns", keys)
+    forms = [form for form in ("quaternion", *FORMS) if columns.value.get(form) is not None]
+    if len(forms) > 1:
+        raise columns.error(forms[1], f"the rotation is already given by {forms[0]}; keep one of them")
+    form, rotation = None, None
+    if forms:
+        rotation = columns.names(forms[0], FORMS.get(forms[0], (4,)))
+        assert rotation is not None
+        form = forms[0] if forms[0] in FORMS else quaternion_form(rotation)
+        if form is None:
+            raise columns.error("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
+    if form == MATRIX and columns.value.get("position") is not None:
+        raise columns.error("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
+    convention = columns.text("euler_convention")
+    if convention is not None and not _EULER.fullmatch(convention):
+        problem = f"{printable(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
+        raise columns.error("euler_convention", problem)
+    if form == EULER and convention is None:
+        raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
+    good = columns.value.get("good")
+    goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
+    return PoseColumns(
+        file, section.text("clock") or TRACKER_CLOCK, columns.names("time", (1, 2)), columns.names("position", (3,)),
+        rotation, form, convention, columns.text("state"), goods, _units(section), section.number("rate_hz", above=0.0),
+    )  # fmt: skip
+
+
+def _joint_columns(parent: Section, key: str, value: Any, clock: str, poses: PoseColumns | None) -> JointColumns:
+    """A log of a joint: a file's name, or a mapping. In the file of the poses it shares their clock."""
+    section, file = _log(parent, key, value, ("calibration", "limits"))
+    if poses is not None and file == poses.path:
+        clock = poses.clock
+    columns = section.section("columns", ("time", "value"))
+    names = columns.names("value", (1,))
+    limits = section.node.child("limits").range("rad") if section.node.has("limits") else None
+    return JointColumns(
+        file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
+        _units(section), section.number("rate_hz", above=0.0), section.path("calibration"), limits,
+    )  # fmt: skip
+
+
+def _log(parent: Section, key: str, value: Any, more: tuple[str, ...] = ()) -> tuple[Section, Path]:
+    """What the recording says of one log, and the log's file. more: keys that only this kind of log has."""
+    value = value if isinstance(value, dict) else {"file": value}
+    section = Section(parent.file, parent.at(key), value, ("file", "clock", "columns", "units", "rate_hz", *more))
+    return section, section.required_path("file")
+
+
+def _units(section: Section) -> Units:
+    given = section.section("units", ("length", "angle", "time"))
+    found: dict[str, str | None] = {}
+    for kind, units in UNITS.items():
+        text = given.text(kind)
+        found[kind] = None if text is None else canonical_unit(text)
+        if found[kind] is not None and found[kind] not in units:
+            raise given.error(kind, f"{printable(text)} is no unit of {kind}; use {', '.join(units)}")
+    return Units(**found)
+
+
 def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tuple[str, ...]]:
     """Offsets s by clock, from a mapping or a JSON file: {"clocks": {"em": 0.038}} or {"em_minus_video_s": 0.038}."""
     value = top.value.get("sync")
     if value is None:
         return {}, ()
-    source: Section = top
+    source = top
     if isinstance(value, str):
-        file = top.path("sync", required=True)
-        assert file is not None
+        file = top.required_path("sync")
         require_file(file, "clock offsets as JSON")
         value = read_json(file)
         if not isinstance(value, dict):
@@ -258,18 +441,17 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
     if not isinstance(value, dict):
         raise top.error("sync", "must name a JSON file or give offsets, as in `sync: {em: 0.038}`")
     if isinstance(value.get("clocks"), dict):
-        entries = {("clocks", key): number for key, number in value["clocks"].items()}
+        entries = {f"clocks.{key}": (key, number) for key, number in value["clocks"].items()}
     elif source is top:
-        entries = {("sync", key): number for key, number in value.items()}
+        entries = {f"sync.{key}": (key, number) for key, number in value.items()}
     else:
-        entries = {("", key): number for key, number in value.items() if str(key).endswith(_SUFFIX)}
+        entries = {key: (key, number) for key, number in value.items() if key.endswith(_OFFSET_SUFFIX)}
         if not entries:
             raise source.error("clocks", 'missing; give offsets, as in {"clocks": {"em": 0.038}}')
     offsets: dict[str, float] = {}
     notes = []
-    for (group, key), number in entries.items():
-        place = f"{group}.{key}" if group else str(key)
-        clock = _clock_of(source, place, str(key).removesuffix(_SUFFIX), clocks)
+    for place, (key, number) in entries.items():
+        clock = _clock_of(source, place, str(key).removesuffix(_OFFSET_SUFFIX), clocks)
         seconds = as_float(number)
         if seconds is None or not abs(seconds) < LARGEST:
             raise source.error(place, f"{printable(number)} is not an offset in seconds; t_log = t_video + offset")
@@ -287,7 +469,7 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
     longer = [clock for clock in clocks if clock.startswith(name + "_")]
     if len(longer) == 1:
         return longer[0]
-    likely = close_match(name, clocks)
+    likely = _close_match(name, clocks)
     if likely or len(longer) > 1:
         raise source.error(
             place, f"no log has the clock {printable(name)}; did you mean {likely or ' or '.join(longer)}?"
@@ -298,13 +480,24 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
 def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | None:
     if top.value.get("splits") is None:
         return None
-    keys = ("test_every", "unseen_fraction", "unseen_by", "test", "unseen")
-    section = Section(top.file, "splits", top.value["splits"], keys)
+    section = top.section("splits", tuple(vars(Splits())))
     by = section.text("unseen_by")
     joints = [joint for instrument in instruments for joint in instrument.joints]
     if by is not None and by not in joints:
         raise section.error(
             "unseen_by", f"no joint is called {printable(by)}; the joints are {', '.join(joints) or 'none'}"
         )
-    fraction = section.number("unseen_fraction", least=0.0, below=0.9)
-    return Splits(section.integer("test_every", 0), fraction, by, section.ranges("test"), section.ranges("unseen"))
+    fraction, every = section.number("unseen_fraction", least=0.0, below=0.9), section.integer("test_every", 0)
+    given: dict[str, Any] = {} if fraction is None else {"unseen_fraction": fraction}
+    given |= {} if every is None else {"test_every": every}
+    return Splits(unseen_by=by, test=section.ranges("test"), unseen=section.ranges("unseen"), **given)
+
+
+def _settings(top: Section) -> IngestSettings:
+    defaults = IngestSettings()
+    section = top.section("settings", tuple(vars(defaults)))
+    given: dict[str, Any] = {}
+    for name, default in vars(defaults).items():
+        value = section.integer(name, 1) if isinstance(default, int) else section.number(name, above=0.0)
+        given[name] = default if value is None else value
+    return replace(defaults, **given)

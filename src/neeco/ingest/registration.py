@@ -1,7 +1,8 @@
-"""Put SfM's cameras into the tracker's frame, from a laparoscope that is tracked too.
+"""Tie what was recorded apart: the logs' clocks to the video's, and SfM's cameras to the tracker's frame.
 
-SfM knows the cameras up to a similarity; the tracker knows a sensor on the scope, up to a constant hand-eye transform
-and the offset of its clock. All of it is solved at once, robustly:
+A clock's offset (t_log = t_video + offset) comes from motion that both saw. SfM knows the cameras up to a similarity;
+the tracker knows a sensor on the laparoscope, up to a constant hand-eye transform and its clock's offset. All of it is
+solved at once, robustly:
 
     world_from_sensor(t_i + offset)  =  similarity(world_from_camera_sfm_i) @ camera_from_sensor
 """
@@ -13,21 +14,144 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation, Slerp
 
 from neeco.errors import NeecoError
-from neeco.ingest.clocks import ClockOffset, offset_from_turning
 from neeco.ingest.interpolate import poses_at
 from neeco.ingest.logs import PoseLog
+from neeco.ingest.recording import IngestSettings
 
+STEP = 0.02  # s, of the coarse search for an offset
+STRIDE = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise
+MIN_CORRELATION = 0.6  # below which two motions are not the same
+MIN_LEAD = 0.08  # by how much the best offset must beat every other, apart from its own lobe
+LOBE = 0.3  # s
+MIN_OVERLAP = 0.6  # of the video that must lie on the log
+LONGEST = 24 * 3600.0  # s that a recording may last: a longer log or video has stray stamps
 MIN_FRAMES = 12
 MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
 MIN_TRAVEL = 3.0  # mm, spread of the scope's positions below which the scale is not determined
-POSITION_NOISE = 0.25  # mm, a tracker's sample-to-sample noise: where the robust loss begins to doubt a sample
-ROTATION_NOISE = 0.002  # rad
-DRIFT = 0.3  # mm, a tracker's slow drift
-DRIFT_KNOT = 2.5  # s
-FIXED = 14  # unknowns beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
+DRIFT_KNOT = 2.5  # s between the knots of the tracker's drift
+UNKNOWNS = 14  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """t_log = t_video + seconds, with one standard deviation and where it came from."""
+
+    seconds: float
+    sd: float
+    source: str
+
+
+def offset_from_turning(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog) -> float:
+    """Coarse offset s (to about 10 ms): how fast the cameras [N, 4, 4] turned, against how fast the sensor turned.
+
+    Speed of turning needs no calibration: it is the same for every point of a rigid scope. Raises NeecoError when the
+    two never fit, or fit at several offsets.
+    """
+    _check_span(log)
+    video_grid = np.arange(times[0] + STRIDE, times[-1] - STRIDE, STEP)
+    log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
+    if len(video_grid) < 50 or len(log_grid) < 50:
+        raise NeecoError(f"{log.path}: video or log is shorter than a second; give its clock offset in `sync`")
+    video = turning_speed(video_grid, times, Rotation.from_matrix(world_from_camera[:, :3, :3]))
+    sensor = turning_speed(log_grid, log.times, Rotation.from_quat(log.quats, scalar_first=True))
+    lags, scores = correlate(video, sensor)
+    return float(log_grid[0] - video_grid[0] + _peak(lags, scores, log) * STEP)
+
+
+def offset_from_instrument(motion: np.ndarray, times: np.ndarray, log: PoseLog) -> ClockOffset:
+    """Offset from how fast the picture of the instrument moved, against how fast its tracker did.
+
+    motion [M-1] px between frames at video `times` [M] s, beyond a still scene's. Raises NeecoError when the two never
+    fit, or fit at several offsets. The uncertainty is what halves of the video disagree by.
+    """
+    _check_span(log)
+    steps = np.diff(times)
+    middle, speed = (times[1:] + times[:-1]) / 2, motion / steps
+    grid = np.arange(middle[0], middle[-1], STEP)
+    log_grid = np.arange(log.times[0] + STRIDE, log.times[-1] - STRIDE, STEP)
+    if len(grid) < 100 or len(log_grid) < 100:
+        raise NeecoError(f"{log.path}: video or log is shorter than two seconds; give its clock offset in `sync`")
+    before, after = (poses_at(log, log_grid + side * STEP) for side in (-1, 1))
+    tracked = np.linalg.norm((after[0] - before[0])[:, :3, 3], axis=1) / (2 * STEP)
+    tracked = np.where(before[1] & after[1], tracked, np.nanmedian(tracked))
+    seen = np.sqrt(np.interp(grid, middle, speed))  # roots: a fast stroke must not outweigh all others
+    lags, scores = correlate(seen, np.sqrt(tracked))
+    best = _peak(lags, scores, log)
+    start = log_grid[0] - grid[0]
+    quarter = len(grid) // 4
+    halves = []
+    for part in (slice(0, 2 * quarter), slice(quarter, 3 * quarter), slice(2 * quarter, 4 * quarter)):
+        near, fit = correlate(seen[part], np.sqrt(tracked))
+        around = np.abs((near - part.start - best) * STEP) < LOBE
+        if around.any():
+            halves.append(_vertex(near[around] - part.start, fit[around]))
+    spread = float(np.std(halves)) * STEP if len(halves) > 1 else LOBE
+    return ClockOffset(float(start + _vertex(lags, scores) * STEP), max(spread, STEP / 4), "instrument motion")
+
+
+def _check_span(log: PoseLog) -> None:
+    """Raise NeecoError when stray stamps make a log too long to search."""
+    if log.times[-1] - log.times[0] > LONGEST:
+        raise NeecoError(
+            f"{log.path}: its times span {(log.times[-1] - log.times[0]) / 3600:.3g} h; remove rows with stray times, "
+            "or give its clock offset in `sync`"
+        )
+
+
+def _peak(lags: np.ndarray, scores: np.ndarray, log: PoseLog) -> int:
+    """The best lag. Raises NeecoError when it is no fit, or one of several."""
+    best = int(scores.argmax())
+    rivals = scores[np.abs(lags - lags[best]) * STEP > LOBE]
+    rival = float(rivals.max()) if len(rivals) else -1.0
+    if scores[best] < MIN_CORRELATION or scores[best] - rival < MIN_LEAD:
+        raise NeecoError(
+            f"{log.path}: its clock cannot be told from the images: the best offset fits with correlation "
+            f"{scores[best]:.2f}, another with {rival:.2f}; give it in `sync`, or shake what is tracked at the start "
+            "of the recording"
+        )
+    return int(lags[best])
+
+
+def _vertex(lags: np.ndarray, scores: np.ndarray) -> float:
+    """Lag of the parabola through the best score and its neighbours."""
+    best = int(scores.argmax())
+    if best in (0, len(scores) - 1):
+        return float(lags[best])
+    left, top, right = scores[best - 1 : best + 2]
+    bend = left - 2 * top + right
+    return float(lags[best] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
+
+
+def turning_speed(grid: np.ndarray, times: np.ndarray, turns: Rotation) -> np.ndarray:
+    """[G] rad/s at the grid's times s, over STRIDE, by chords between nearest-in-time interpolated rotations [T]."""
+    along = Slerp(times, turns)
+    before, after = (along(np.clip(grid + side * STRIDE / 2, times[0], times[-1])) for side in (-1, 1))
+    return (before.inv() * after).magnitude() / STRIDE
+
+
+def correlate(short: np.ndarray, long: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pearson correlation of two signals on one grid at every lag (`long` index of `short`'s first sample) where they
+    overlap by at least MIN_OVERLAP of the shorter. Returns lags and scores."""
+    least = int(MIN_OVERLAP * min(len(short), len(long)))
+    lags = np.arange(-(len(short) - least), len(long) - least + 1)
+    # without their means, which correlation does not see, less is lost to rounding
+    short, long = short - short.mean(), long - long.mean()
+    one = np.ones(len(short))
+    inside = np.ones(len(long))
+
+    def slide(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        full = fftconvolve(b, a[::-1])  # lag -(len(a) - 1) ... len(b) - 1
+        return full[lags + len(a) - 1]
+
+    count = slide(one, inside)
+    mean_short, mean_long = slide(short, inside) / count, slide(one, long) / count
+    covariance = slide(short, long) / count - mean_short * mean_long
+    spread = (slide(short**2, inside) / count - mean_short**2) * (slide(one, long**2) / count - mean_long**2)
+    return lags, covariance / np.sqrt(np.maximum(spread, 1e-18))
 
 
 @dataclass(frozen=True)
@@ -57,17 +181,20 @@ class Registration:
 
 
 def register_with_laparoscope(
-    world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, known_offset: float | None
+    world_from_camera: np.ndarray,
+    times: np.ndarray,
+    log: PoseLog,
+    known_offset: float | None,
+    settings: IngestSettings | None = None,
 ) -> Registration:
     """Similarity, hand-eye and clock offset from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
 
     The offset is estimated unless known; a known one is kept. Raises NeecoError when the scope moved too little.
     """
-    offset = known_offset
-    if offset is None:
-        offset = offset_from_turning(world_from_camera, times, log)
+    offset = offset_from_turning(world_from_camera, times, log) if known_offset is None else known_offset
     start = _closed_form(world_from_camera, times, log, offset)
-    return _refine(world_from_camera, times, log, start, offset, known_offset is not None)
+    keep_offset = known_offset is not None
+    return _refine(world_from_camera, times, log, start, offset, keep_offset, settings or IngestSettings())
 
 
 def _sensor_poses(times: np.ndarray, log: PoseLog, offset: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,12 +223,11 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
     camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
     middle = len(cameras) // 2
     steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
-    a = np.concatenate(
-        [(camera_turns[i].inv() * camera_turns[j]).as_rotvec() for i, j in steps]
-    )  # [3N, 3] camera frame
-    b = np.concatenate(
-        [(sensor_turns[i].inv() * sensor_turns[j]).as_rotvec() for i, j in steps]
-    )  # [3N, 3] sensor frame
+    # relative turns [3N, 3] in the camera's and in the sensor's frame
+    a, b = (
+        np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
+        for turns in (camera_turns, sensor_turns)
+    )
     spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
     if spread[1] < MIN_TURN:
         raise NeecoError(
@@ -123,7 +249,13 @@ def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog,
 
 
 def _refine(
-    world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, start: _Start, offset: float, keep_offset: bool
+    world_from_camera: np.ndarray,
+    times: np.ndarray,
+    log: PoseLog,
+    start: _Start,
+    offset: float,
+    keep_offset: bool,
+    settings: IngestSettings,
 ) -> Registration:
     """All unknowns at once under a soft-L1 loss, the tracker's slow drift among them.
 
@@ -164,17 +296,18 @@ def _refine(
 
     def residuals(x: np.ndarray) -> np.ndarray:
         position, turn, keep = errors(x)
-        drift = x[FIXED:].reshape(knots, 3)
+        drift = x[UNKNOWNS:].reshape(knots, 3)
         # a frame that slid off the log counts as wrong by the noise, so that sliding off is never a gain
         rows = [
-            np.where(keep[:, None], (position - hats @ drift) / POSITION_NOISE, 1.0)[valid],
-            np.where(keep[:, None], turn / ROTATION_NOISE, 1.0)[valid],
-            drift / DRIFT,
-            np.diff(drift, axis=0) / (0.5 * DRIFT),
+            np.where(keep[:, None], (position - hats @ drift) / settings.tracker_noise_mm, 1.0)[valid],
+            np.where(keep[:, None], turn / settings.tracker_noise_rad, 1.0)[valid],
+            drift / settings.tracker_drift_mm,
+            np.diff(drift, axis=0) / (0.5 * settings.tracker_drift_mm),
         ]
         return np.concatenate(rows).ravel()
 
-    solved = least_squares(residuals, np.zeros(FIXED + 3 * knots), loss="soft_l1", max_nfev=40)
+    unknowns = np.zeros(UNKNOWNS + 3 * knots)
+    solved = least_squares(residuals, unknowns, loss="soft_l1", max_nfev=settings.registration_steps)
     scale, rotation, origin, hand, lever, clock = unpack(solved.x)
     position, turn, keep = errors(solved.x)
     used = np.flatnonzero(keep)

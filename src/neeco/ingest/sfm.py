@@ -15,14 +15,12 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.lens import Lens
-from neeco.ingest.recording import FEWEST_FRAMES
-from neeco.ingest.requirements import require_installed
+from neeco.ingest.recording import MIN_FRAMES, IngestSettings
+from neeco.ingest.video import require_installed
 
-KEYFRAMES = 80  # about so many frames are mapped; the others are placed among their points
 KEY_NEIGHBOURS = (1, 2, 3, 4, 6, 8, 12, 16)  # keyframes a keyframe is matched with
 NEAR_KEYFRAMES = 3  # on each side of another frame, that it is matched with
 LOOP_STRIDE = 4  # every so many keyframes, one that is matched to all others of its kind: closes loops
-FEATURES = 1200  # per image
 # run by its path, not as a module of the package: nothing of ours may be loaded beside pycolmap
 WORKER = Path(__file__).with_name("_sfm_worker.py")
 
@@ -48,15 +46,9 @@ class SfmResult:
         return (self.lengths >= length) & (self.errors < error)
 
 
-def keyframes(count: int) -> list[int]:
-    """Indices of about KEYFRAMES images, evenly spread."""
-    return list(range(0, count, max(1, count // KEYFRAMES)))
-
-
-def image_pairs(count: int) -> list[tuple[int, int]]:
-    """Which images to match: keyframes with keyframes near in time, sparser farther off and in loops; every other
-    frame with the keyframes around it and the frame before."""
-    keys = keyframes(count)
+def image_pairs(count: int, keys: Sequence[int]) -> list[tuple[int, int]]:
+    """Which of `count` images to match: keyframes `keys` with keyframes near in time, sparser farther off and in loops;
+    every other frame with the keyframes around it and the frame before."""
     pairs = {(keys[i], keys[i + step]) for step in KEY_NEIGHBOURS for i in range(len(keys) - step)}
     anchors = keys[::LOOP_STRIDE]
     pairs |= {(a, b) for a in anchors for b in anchors if a < b}
@@ -86,10 +78,11 @@ class StructureFromMotion:
         folder: Path,
         names: Sequence[str],
         pinhole: Lens | None,
-        masks: Path | None = None,
+        masks: Path | None,
+        settings: IngestSettings,
     ) -> None:
         require_installed("pycolmap")
-        self.source, self.names, self.work = source, list(names), work
+        self.work, self.source, self.names, self.settings = work, source, list(names), settings
         self.job: dict[str, Any] = {
             "images": str(folder),
             "names": self.names,
@@ -97,18 +90,19 @@ class StructureFromMotion:
             "work": str(work),
             "camera_model": "PINHOLE" if pinhole else "OPENCV",
             "camera_params": [*pinhole.intrinsics] if pinhole else [],
-            "features": FEATURES,
+            "features": settings.sfm_features,
             "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         }
 
     def reconstruct(self, progress: StageProgress) -> SfmResult:
         """Cameras and points, not yet adjusted together.
 
-        Raises NeecoError when fewer than FEWEST_FRAMES images get a camera.
+        Raises NeecoError when fewer than MIN_FRAMES images get a camera.
         """
-        pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(len(self.names))]
-        keys = [self.names[index] for index in keyframes(len(self.names))]
-        return self._run(self.job | {"pairs": pairs, "keyframes": keys}, progress)
+        count = len(self.names)
+        keys = range(0, count, max(1, count // self.settings.sfm_keyframes))
+        pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(count, keys)]
+        return self._run(self.job | {"pairs": pairs, "keyframes": [self.names[index] for index in keys]}, progress)
 
     def adjust(self, found: SfmResult, doubtful: np.ndarray, progress: StageProgress) -> SfmResult:
         """The same after bundle adjustment without the observations marked in `doubtful` [Q]."""
@@ -165,22 +159,17 @@ def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
 def _load(path: Path, names: list[str], source: Path) -> SfmResult:
     with np.load(path) as saved:  # plain arrays; object arrays are refused by default
         found = [str(name) for name in saved["names"]]
-        if len(found) < FEWEST_FRAMES:
+        if len(found) < MIN_FRAMES:
             raise NeecoError(
-                f"{source}: a camera was found for only {len(found)} of {len(names)} frames (at least {FEWEST_FRAMES} "
+                f"{source}: a camera was found for only {len(found)} of {len(names)} frames (at least {MIN_FRAMES} "
                 "are needed); see docs/recording.md"
             )
         if len(saved["points"]) == 0:
             raise NeecoError(f"{source}: no tissue point could be found between the frames; see docs/recording.md")
         row = {name: index for index, name in enumerate(names)}
+        arrays = ("world_from_camera", "points", "colors", "errors", "lengths", "observations", "camera_params")
         return SfmResult(
-            np.array([row[name] for name in found]),
-            saved["world_from_camera"],
-            saved["points"],
-            saved["colors"],
-            saved["errors"],
-            saved["lengths"],
-            saved["observations"],
-            saved["camera_params"],
-            float(saved["reprojection"]),
+            indices=np.array([row[name] for name in found]),
+            reprojection_px=float(saved["reprojection"]),
+            **{name: saved[name] for name in arrays},
         )

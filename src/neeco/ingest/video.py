@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,13 +13,17 @@ import numpy as np
 
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
-from neeco.ingest.columns import recognise_time
-from neeco.ingest.requirements import require_installed
-from neeco.ingest.tables import numbers, read_table
-from neeco.ingest.units import scale_of
+from neeco.ingest.columns import recognise_time, scale_of
+from neeco.ingest.formats import numbers, read_table
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-FEWEST = 2
+MIN_IMAGES = 2
+
+
+def require_installed(name: str) -> None:
+    """Raise NeecoError saying what to install when `name` ("av", "pycolmap") is absent; imports nothing."""
+    if importlib.util.find_spec(name) is None:
+        raise NeecoError("ingest: needs PyAV and pycolmap; pip install 'neeco[ingest]'")
 
 
 @dataclass(frozen=True)
@@ -42,12 +47,10 @@ def open_video(path: Path, fps: float | None = None) -> VideoSource:
     path = Path(path)
     if not path.is_file():
         raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
-    scan = _Scan(path)
-    scan.run()
+    scan = _Scan(path).run()
     if scan.failure or scan.corrupt:
         # decoding frames in parallel, which of the damaged ones are given up differs from run to run
-        scan = _Scan(path, threads="SLICE")
-        scan.run()
+        scan = _Scan(path, threads="SLICE").run()
     return scan.finish(fps)
 
 
@@ -60,10 +63,8 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
             f"{folder}: {'is a file, expected a folder of images' if folder.exists() else 'no such folder'}"
         )
     folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
-    files = sorted(
-        (file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=lambda file: _natural(file.name)
-    )
-    if len(files) < FEWEST:
+    files = sorted((file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=_natural_order)
+    if len(files) < MIN_IMAGES:
         raise NeecoError(
             f"{folder}: holds {len(files)} images; expected a video's frames as {', '.join(IMAGES[:3])} files"
         )
@@ -73,7 +74,6 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
         stamps = np.arange(len(files)) / fps
     else:
         raise NeecoError(f"{folder}: when were the images taken? Give fps, or a CSV file of times, in the recording")
-    notes: list[str] = []
     size, usable, bad = None, [], []
     for index, file in enumerate(files):
         try:
@@ -87,11 +87,10 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
             )
         size = found
         usable.append(index)
-    if size is None or len(usable) < FEWEST:
+    if size is None or len(usable) < MIN_IMAGES:
         raise NeecoError(f"{folder}: {len(usable)} of {len(files)} images can be read; replace the damaged files")
-    if bad:
-        notes.append(f"{folder.name}: {len(bad)} images cannot be read and are left out ({', '.join(bad[:3])})")
-    return _Images(folder, size, tuple(notes), stamps[usable], tuple(files[i] for i in usable))
+    note = f"{folder.name}: {len(bad)} images cannot be read and are left out ({', '.join(bad[:3])})"
+    return _Images(folder, size, (note,) if bad else (), stamps[usable], tuple(files[i] for i in usable))
 
 
 @dataclass(frozen=True)
@@ -181,23 +180,22 @@ class _Scan:
                     else:
                         yield frame
 
-    def run(self) -> None:
+    def run(self) -> _Scan:
+        """Decode all frames. Raises NeecoError when the file cannot be opened or its frames differ in size."""
         for frame in self.decoded():
-            self.add(frame)
-
-    def add(self, frame: Any) -> None:
-        size = (frame.width, frame.height)
-        if self.size is not None and size != self.size:
-            raise NeecoError(
-                f"{self.path}: changes from {self.size} to {size} pixels midway; cut it into one video each"
-            )
-        self.size = size
-        self.stamps.append(frame.pts)
-        self.interlaced |= bool(frame.interlaced_frame)
-        self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
+            size = (frame.width, frame.height)
+            if self.size not in (None, size):
+                raise NeecoError(
+                    f"{self.path}: changes from {self.size} to {size} pixels midway; cut it into one video each"
+                )
+            self.size = size
+            self.stamps.append(frame.pts)
+            self.interlaced |= bool(frame.interlaced_frame)
+            self.turned = self.turned or int(getattr(frame, "rotation", 0) or 0)
+        return self
 
     def finish(self, fps: float | None) -> _Video:
-        if self.size is None or len(self.stamps) < FEWEST:
+        if self.size is None or len(self.stamps) < MIN_IMAGES:
             why = f" ({self.failure})" if self.failure else ""
             raise NeecoError(f"{self.path}: {len(self.stamps)} frames can be decoded{why}; give an intact video file")
         notes = self._notes()
@@ -246,9 +244,9 @@ def _reason(error: BaseException) -> str:
     return " ".join(str(text).split())[:100] or type(error).__name__
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def _natural_order(file: Path) -> list[tuple[int, int, str]]:
     """Sorts frame2 before frame10."""
-    parts = re.split(r"(\d+)", name.lower())
+    parts = re.split(r"(\d+)", file.name.lower())
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
@@ -259,7 +257,7 @@ def _image_times(folder: Path, files: list[Path], table_path: Path) -> tuple[lis
     column = found.time[0] if found.time else table.header[0] if len(table.header) == 1 else None
     if column is None:
         raise NeecoError(f"{table_path}: header: no column of times found; call one t_s")
-    scale = scale_of(str(table_path), (column,), "time", None, found.time_unit, "")
+    scale = scale_of(table_path, (column,), "time", None, found.time_unit, "")
     values, missing, bad = numbers(table, (column,))
     wrong = [*[row for row, _ in bad], *np.flatnonzero(missing)]
     if wrong:

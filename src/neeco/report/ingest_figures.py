@@ -10,8 +10,8 @@ from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
-from neeco.evaluation.difference import outline
-from neeco.ingest.moving import RoughShape
+from neeco.evaluation.image_metrics import outline
+from neeco.ingest.motion import RoughShape
 from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes

@@ -11,7 +11,7 @@ import numpy as np
 
 from neeco.capture import read_capture
 from neeco.capture.model import Capture
-from neeco.ingest.result import IngestResult
+from neeco.ingest.pipeline import IngestResult
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import (
     SPLIT_COLORS,

@@ -17,7 +17,7 @@ from torch import Tensor
 import neeco
 from neeco.capture.model import Capture
 from neeco.errors import NeecoError
-from neeco.evaluation.difference import difference_map
+from neeco.evaluation.image_metrics import difference_map
 from neeco.files import write_text
 
 REPORT_FILE = "report.html"

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import torch
 
 from neeco.capture.model import Capture, Frame, State
-from neeco.evaluation.difference import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
-from neeco.evaluation.truth import load_reference
+from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
+from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.report.charts import SMALL, Series, line_chart, short

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from neeco.capture.model import Capture, Frame
-from neeco.ingest.result import IngestResult
+from neeco.ingest.pipeline import IngestResult
 
 # Where the page begins to doubt: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5

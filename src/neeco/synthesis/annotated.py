@@ -22,7 +22,7 @@ from torch import Tensor
 from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
-from neeco.evaluation.align import AlignConfig, Fit, fit_frame, moves
+from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
 from neeco.files import own_folder, write_json
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
@@ -140,7 +140,7 @@ class _Annotator:
             "frame": frame.name,
             "recorded_split": frame.split,
             "trust": trust.to_json(),
-            "moved": moves(frame, fit.state, fit.camera),
+            "moved": pose_changes(frame, fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
         labels = annotate(self.scene, drawing, self.labeller.names)

@@ -219,15 +219,20 @@ class GeneratorSpec:
     device: str = "cpu"
     instrument_scenes: tuple[Path, ...] = ()
 
-    def open(self, threads: int) -> SampleGenerator:
-        """The generator, in a process of its own whose kernels may use `threads` threads. Raises NeecoError."""
-        set_threads(threads)
-        torch.set_num_threads(1)
-        keep_freed_memory()
+    def open(self) -> SampleGenerator:
+        """The generator. Raises NeecoError where a file cannot be read or does not fit."""
         device = torch.device(self.device)
         paths = (self.scene, *self.instrument_scenes)
         scene, *others = (gaussian_scene(load_scene(path).to(device), VERB) for path in paths)
         return SampleGenerator.of(scene, self.settings, others)
+
+
+def limit_threads(threads: int) -> None:
+    """In a process of its own that draws: kernels use `threads` threads, torch one; freed memory is kept for the next
+    sample."""
+    set_threads(threads)
+    torch.set_num_threads(1)
+    keep_freed_memory()
 
 
 def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Record:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.evaluation.resize import resize_camera
+from neeco.evaluation.image_metrics import resize_camera
 from neeco.labels.annotation import working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from neeco.capture.model import evenly_spaced
-from neeco.evaluation.difference import outline
+from neeco.evaluation.image_metrics import outline
 from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED, SKELETON
 from neeco.synthesis.writers.folder import Record

@@ -26,7 +26,7 @@ from neeco.cluster import joined
 from neeco.errors import NeecoError
 from neeco.files import read_bytes, write_atomically
 from neeco.raster.devices import readable_failures
-from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS
 from neeco.synthesis.writers.folder import Record, files_of, load_record, record_path
@@ -148,7 +148,8 @@ def _work(spec: GeneratorSpec, output: Path, threads: int, connection: Connectio
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
         with readable_failures():
-            generator = spec.open(threads)
+            limit_threads(threads)
+            generator = spec.open()
             with contextlib.suppress(EOFError):
                 while True:
                     for index in connection.recv():
@@ -187,7 +188,12 @@ class PackedSpec:
         content = b"".join(hashlib.sha256(files[name]).digest() for name in sorted(files))
         return cls(spec, files, hashlib.sha256(content + repr(spec.settings).encode()).hexdigest())
 
-    def unpacked(self, folder: Path) -> GeneratorSpec:
+    def open(self) -> SampleGenerator:
+        """The generator, from the files' content."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self._unpacked(Path(folder)).open()
+
+    def _unpacked(self, folder: Path) -> GeneratorSpec:
         """The same spec, its files in `folder`."""
         for name, content in self.files.items():
             (folder / name).write_bytes(content)
@@ -265,5 +271,5 @@ def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[R
 @lru_cache(maxsize=1)
 def _opened(packed: PackedSpec) -> SampleGenerator:
     """Opened once in a worker, whatever number of tasks it gets."""
-    with tempfile.TemporaryDirectory() as folder:
-        return packed.unpacked(Path(folder)).open(threads=1)
+    limit_threads(1)
+    return packed.open()

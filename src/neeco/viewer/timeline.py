@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import torch
 
-from neeco.evaluation.image_metrics import psnr
+from neeco.evaluation.image_metrics import psnr, resize_camera
+from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
-from neeco.evaluation.resize import resize_camera
-from neeco.evaluation.truth import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.viewer.source import Loaded

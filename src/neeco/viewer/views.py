@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import State
-from neeco.evaluation.difference import Pixels, difference_map, overlay_parts
+from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize

@@ -33,8 +33,8 @@ from neeco.experiments.downstream.samples import (
     recorded_samples,
     synthetic_samples,
 )
-from neeco.experiments.machine import machine
-from neeco.experiments.study import JobEvent, check_output, check_workers, run_and_record, threads_per_worker
+from neeco.experiments.machine import machine, threads_per_worker
+from neeco.experiments.study import JobEvent, check_output, check_workers, run_and_record
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 

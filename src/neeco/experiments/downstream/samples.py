@@ -15,9 +15,8 @@ import numpy as np
 from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth
+from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file
 from neeco.evaluation.mask_metrics import TRUTH_PARTS
-from neeco.evaluation.truth import truth_file
 from neeco.files import read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]

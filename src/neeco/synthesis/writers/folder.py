@@ -20,7 +20,7 @@ import torch
 from neeco.capture.images import write_image, write_labels, write_png
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.errors import NeecoError
-from neeco.files import read_text, write_atomically, write_text
+from neeco.files import read_text, require_like, write_atomically, write_text
 from neeco.labels.annotation import InstrumentLabel
 from neeco.labels.drawing import LayeredDrawing, to_numpy
 
@@ -34,6 +34,17 @@ CHECKSUM = "sha256"  # of the rest of a record
 PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
 MAX_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
 FOLDERS = (*PIXELS, RECORDS)
+PUBLIC = {  # what every line of states.jsonl holds, among others
+    "index": int,
+    "split": str,
+    "width": int,
+    "height": int,
+    "time": float,
+    "instruments": [{"name": str, "pose": [[float]], "joints": {str: float}}],
+    "camera": [[float]],
+    "intrinsics": {"fl_x": float, "fl_y": float, "cx": float, "cy": float},
+    "labels": [{"name": str, "area": int, "keypoints": {str: [float]}, "camera_from_instrument": [[float]]}],
+}
 VALIDATION_EVERY = 5  # every fifth image is for validation
 
 
@@ -167,6 +178,19 @@ def write_states(root: Path, records: list[Record]) -> None:
         line["labels"] = [_without_polygons(label) for label in record["labels"]]
         lines.append(json.dumps(line, allow_nan=False))
     write_text(root / "states.jsonl", "".join(f"{line}\n" for line in lines))
+
+
+def read_public_records(root: Path) -> list[Record]:
+    """The lines of states.jsonl. Raises NeecoError naming the line that is not as `write_states` writes it."""
+    path, records = root / "states.jsonl", []
+    for number, line in enumerate(read_text(path, "one JSON object per image").splitlines(), 1):
+        place = f"{path}: line {number}"
+        try:
+            value = json.loads(line)
+        except (ValueError, RecursionError):
+            raise NeecoError(f"{place}: not valid JSON; write the data set anew") from None
+        records.append(require_like(value, PUBLIC, place, "write the data set anew"))
+    return records
 
 
 def public_record(record: Record) -> dict[str, Any]:

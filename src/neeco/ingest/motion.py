@@ -20,12 +20,11 @@ from scipy.spatial import QhullError
 from neeco.ingest.lens import Lens
 from neeco.ingest.sfm import SfmResult
 from neeco.raster.pinhole import project, project_world
+from neeco.raster.types import Camera
 
 STEP = 4  # px between the places where flow is compared
 NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
 PATCH = 0.04  # of the image: about what an instrument's front takes
-MOVED = 1.5  # px of flow the still scene does not explain
-FRAMES = 60  # that shape is carved from
 CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid
 COVERED = 0.85  # of the best point's evidence, for a point to belong to the instrument: flow bleeds over edges
@@ -43,32 +42,35 @@ class RoughShape:
     agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
 
 
-def moving_pixels(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens, rows: np.ndarray) -> np.ndarray:
+def moving_pixels(
+    load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens, rows: np.ndarray, moving_px: float
+) -> np.ndarray:
     """[R, h, w] share of neighbours, at every STEP-th pixel, against which the pixel moved otherwise than tissue would.
 
-    load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted.
+    load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted; moving_px: residual flow from which
+    a pixel counts as moving.
     """
-    flow = _Flow(load, sfm, pinhole)
+    flow = _ResidualFlow(load, sfm, pinhole)
     evidence = []
     for row in rows.tolist():
         others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(sfm.indices)]
-        moved = sum((motion > MOVED for motion in flow.beyond_still(row, others)), np.zeros(flow.u.shape))
+        moved = sum((motion > moving_px for motion in flow.residuals(row, others)), np.zeros(flow.u.shape))
         evidence.append(moved / max(len(others), 1))
     return np.stack(evidence)
 
 
 def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> np.ndarray:
     """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
-    flow = _Flow(load, sfm, pinhole)
+    flow = _ResidualFlow(load, sfm, pinhole)
     patch = max(1, round(PATCH * flow.u.size))
     motion = np.zeros(len(sfm.indices) - 1)
     for row in range(len(motion)):
-        (left,) = flow.beyond_still(row, [row + 1])
+        (left,) = flow.residuals(row, [row + 1])
         motion[row] = np.sort(left, axis=None)[-patch:].mean()
     return motion
 
 
-class _Flow:
+class _ResidualFlow:
     """Optical flow at every STEP-th pixel, and what of it a still scene does not explain."""
 
     def __init__(self, load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> None:
@@ -78,8 +80,8 @@ class _Flow:
         height, width = self.grey(0).shape
         self.v, self.u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
 
-    def beyond_still(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
-        """[h, w] px by which pixels of a row of `sfm` move otherwise to each of the others than still ones would."""
+    def residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
+        """[h, w] px by which the flow from a row of `sfm` to each of the others differs from a still scene's."""
         cameras = self.sfm.world_from_camera
         depth = _still_depth(self.sfm, row, self.pinhole, self.u, self.v)
         for other in others:
@@ -101,7 +103,7 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # [G, 3]
     total, seen = np.zeros(len(grid)), np.zeros(len(grid))
     for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
-        x, y, inside = _project(grid, pose, pinhole, pixels.shape)
+        x, y, inside = _raster_cells(grid, pose, pinhole.intrinsics, pixels.shape)
         total[inside] += pixels[y[inside], x[inside]]
         seen += inside
     enough = seen > 0.3 * len(evidence)
@@ -114,27 +116,42 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     return RoughShape(grid[belongs], float(axis[1] - axis[0]), best) if belongs.any() else None
 
 
-def project_mask(
-    shape: RoughShape, camera_from_instrument: np.ndarray, pinhole: Lens, size: tuple[int, int]
-) -> np.ndarray:
-    """[H, W] bool: pixels the shape may cover in a frame of `size` (width, height), with a margin."""
-    width, height = size
-    small = (height // STEP + 1, width // STEP + 1)
-    x, y, inside = _project(shape.points, camera_from_instrument, pinhole, small)
+def project_mask(shape: RoughShape, camera_from_instrument: np.ndarray, camera: Camera) -> np.ndarray:
+    """[H, W] bool: pixels the shape may cover in the camera's image, with a margin."""
+    small = (camera.height // STEP + 1, camera.width // STEP + 1)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    x, y, inside = _raster_cells(shape.points, camera_from_instrument, intrinsics, small)
     mask = np.zeros(small, dtype=bool)
     mask[y[inside], x[inside]] = True
     depth = float(camera_from_instrument[2, 3])
-    cell = shape.spacing * pinhole.fl_x / max(depth, 1.0)  # px between neighbouring points
+    cell = shape.spacing * camera.fx / max(depth, 1.0)  # px between neighbouring points
     mask = binary_dilation(mask, iterations=max(1, round((MARGIN + cell / 2) / STEP)))
-    return np.kron(mask, np.ones((STEP, STEP), dtype=bool))[:height, :width]
+    return mask.repeat(STEP, axis=0).repeat(STEP, axis=1)[: camera.height, : camera.width]
 
 
-def _project(
-    points: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens, shape: tuple[int, ...]
+def observations_on(
+    shape: RoughShape, camera_from_instrument: np.ndarray, sfm: SfmResult, row: int, points: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """bool [Q]: observations of a row of `sfm` that lie on the shape. points [P, 3] mm: its points in the world."""
+    mask = project_mask(shape, camera_from_instrument, camera)
+    mine = np.flatnonzero(sfm.observations[:, 0] == row)
+    pixels, _ = project_world(points[sfm.observations[mine, 1].astype(int)], camera, nearest=camera.near)
+    x = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
+    y = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+    on = np.zeros(len(sfm.observations), dtype=bool)
+    on[mine] = mask[y, x]
+    return on
+
+
+def _raster_cells(
+    points: np.ndarray,
+    camera_from_instrument: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    shape: tuple[int, ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Column, row and insideness [K] of points on the STEP-spaced raster of `shape` (rows, columns)."""
     camera = points @ camera_from_instrument[:3, :3].T + camera_from_instrument[:3, 3]
-    x, y = (np.floor(place / STEP) for place in project(camera, *pinhole.intrinsics, nearest=NEAREST))
+    x, y = (np.floor(place / STEP) for place in project(camera, *intrinsics, nearest=NEAREST))
     inside = (camera[:, 2] > NEAREST) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
 
@@ -143,16 +160,16 @@ def _still_depth(sfm: SfmResult, row: int, pinhole: Lens, u: np.ndarray, v: np.n
     """[h, w] depth of the still scene at pixels u, v: between the points this frame sees, nearest beyond them."""
     seen = sfm.observations[:, 0] == row
     points = sfm.points[sfm.observations[seen, 1].astype(int)]
-    spots, depth = project_world(points, pinhole.camera(sfm.world_from_camera[row]), nearest=TINY)
+    pixels, depth = project_world(points, pinhole.camera(sfm.world_from_camera[row]), nearest=TINY)
     near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
     keep = (depth > 0.3 * near) & (depth < 3 * near)
-    spots, inverse = spots[keep], 1 / depth[keep]
-    if len(spots) == 0:
+    pixels, inverse = pixels[keep], 1 / depth[keep]
+    if len(pixels) == 0:
         return np.full(u.shape, np.nan)  # nothing is known, so nothing is seen to move
     places = np.stack([u + 0.5, v + 0.5], -1)
-    nearest = NearestNDInterpolator(spots, inverse)(places)
+    nearest = NearestNDInterpolator(pixels, inverse)(places)
     try:
-        between = LinearNDInterpolator(spots, inverse)(places)
+        between = LinearNDInterpolator(pixels, inverse)(places)
     except QhullError:  # fewer than three, or all on one line
         return np.asarray(1 / nearest)
     return np.asarray(1 / np.where(np.isnan(between), nearest, between))

@@ -1,0 +1,449 @@
+"""Run the ablations: one job per distinct variant, whatever tables it stands in; then the tables from the jobs."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neeco import __version__
+from neeco.capture import Capture
+from neeco.capture.check import read_checked
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import held_out_splits
+from neeco.experiments.ablations import (
+    ABLATIONS,
+    CHECKPOINTS,
+    OURS,
+    PAPER,
+    PHASE_1_PSNR,
+    PHASE_1_SHARE,
+    PHASE_1_STEPS,
+    PUBLISHED_STEPS,
+    Ablation,
+    AblationPlan,
+    Comparison,
+    Entry,
+    Variant,
+)
+from neeco.experiments.derived import derive_capture
+from neeco.experiments.machine import machine
+from neeco.experiments.masks import LabelScores, score_label_ways
+from neeco.experiments.study import JobEvent, Result, check_workers, run_jobs
+from neeco.experiments.tables import UNKNOWN, Cell, Column, Row, Table, csv_text, latex_table, markdown_table
+from neeco.experiments.training_job import (
+    CURVE_FILE,
+    Budget,
+    TrainingJob,
+    check_settings,
+    read_json_lines,
+    settings_for,
+)
+from neeco.files import own_folder, read_json, write_json, write_text
+from neeco.raster.devices import device_of
+from neeco.scene.methods import method_settings
+from neeco.training.config import TrainConfig
+from neeco.training.options import training_config
+from neeco.training.run import open_run
+from neeco.training.schedule import CLOSEST_RESETS
+from neeco.training.train import ROW_INTERVAL
+
+SCHEMA = "neeco-ablation/1"
+LABELS_FILE = "label_ways.json"
+REST_STEPS = 100  # of the network, where its usual share of a short run is less: an empty image throws it out of sight
+LONGEST_REST = 0.25  # of the run
+INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
+KINEMATIC_LEAST = 1_000  # steps: the shaft starts to spin and hinges to learn after 600
+EVEN_DB = 0.1  # smaller differences do not count as a direction
+FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
+HEADINGS = {
+    "phase_1_psnr": "phase-1 training PSNR",
+    "psnr": "PSNR",
+    "psnr_instrument": "instrument PSNR",
+    "mask_iou": "mask IoU",
+}
+CSV_COLUMNS = ("table", "comparison", "setting", "run", "measure", "paper", "ours", "difference", "agrees")
+
+Values = dict[str, float | None]  # by measure
+
+
+def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
+    """Train and score every variant of the chosen tables, write DIR/ablation.json and return what it holds.
+
+    Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
+    on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
+    for unknown tables and settings, a capture without instruments, or an output that holds other runs.
+    """
+    device = device_of(plan.device)
+    check_workers(plan.workers, device)
+    chosen = chosen_ablations(plan.tables)
+    variants = distinct_variants(chosen)
+    capture = _open_capture(plan, variants)
+    splits = held_out_splits(capture)
+    with own_folder(plan.output):
+        jobs = [_job(plan, variant) for variant in variants]
+        for job in jobs:
+            job.check()
+        for job, variant in zip(jobs, variants, strict=True):
+            if variant.derived is not None:
+                derive_capture(capture, plan.transforms, variant.derived, plan.seed, job.capture)
+        results = run_jobs(jobs, plan.workers, progress, {plan.capture: capture})
+    finished = {job.name: result for job, result in zip(jobs, results, strict=True) if "error" not in result}
+    failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
+    folders = {job.name: job.folder for job in jobs if job.name in finished}
+    methods = [method for method in ("neeco", "kinematic") if any(v.method == method for v in variants)]
+    labels, unscored = _label_scores(chosen, folders, capture, splits, device)
+    ablation = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "capture": str(plan.capture.absolute()),
+        "seed": plan.seed,
+        "iterations": {method: _steps(plan, method) for method in sorted(methods)},
+        "machine": machine(device),
+        "settings": list(plan.settings),
+        "splits": list(splits),
+        "tables": [table_of(table, folders, finished, labels, splits) for table in chosen],
+        "runs": [finished[name] for name in finished],
+        "failures": failures + unscored,
+        "notes": [note for method in methods for note in _shortcomings(method, _steps(plan, method))],
+    }
+    write_json(plan.output / "ablation.json", ablation)
+    return ablation
+
+
+def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
+    """The tables behind `paper`, `ours` or their own names, each once. Raises NeecoError for an unknown name."""
+    chosen: dict[str, Ablation] = {}
+    groups = {"paper": PAPER, "ours": OURS}
+    for name in names:
+        if name not in groups and name not in ABLATIONS:
+            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(ABLATIONS)}")
+        chosen |= {ablation.name: ablation for ablation in groups.get(name) or (ABLATIONS[name],)}
+    if not chosen:
+        raise NeecoError("--tables: names none; leave it out for all of them")
+    return tuple(chosen.values())
+
+
+def distinct_variants(chosen: Sequence[Ablation]) -> list[Variant]:
+    """Every run that the tables need, once."""
+    return list(dict.fromkeys(entry.variant for entry in _entries(chosen)))
+
+
+def _entries(chosen: Sequence[Ablation]) -> list[Entry]:
+    return [entry for table in chosen for comparison in table.comparisons for entry in comparison.entries]
+
+
+def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
+    """The capture. Raises NeecoError for what no run could be made of."""
+    for name, value in (("iterations", plan.iterations), ("kinematic-iterations", plan.kinematic_iterations)):
+        if value is not None and value < 1:
+            raise NeecoError(f"--{name}: {value} is no training; give at least 1")
+    check_settings(plan.settings, dict.fromkeys(variant.method for variant in variants), "--seed")
+    capture = read_checked(plan.capture, plan.transforms)
+    if not capture.instruments:
+        raise NeecoError(f"{plan.capture}: instruments: no states are recorded; every ablation needs them")
+    return capture
+
+
+def _steps(plan: AblationPlan, method: str) -> int:
+    """Iterations of a run of `method`."""
+    if method == "neeco":
+        return plan.iterations
+    return plan.kinematic_iterations or max(KINEMATIC_LEAST, plan.iterations)
+
+
+def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
+    """The job of one variant. Settings: its method's, then the user's, then what the variant is about."""
+    steps, capture = _steps(plan, variant.method), plan.capture
+    values = {"iterations": steps, "seed": plan.seed, "transforms": plan.transforms}
+    given = settings_for(variant.method, plan.settings)
+    common = _paper_settings(steps) if variant.method == "neeco" else ()
+    config = training_config(variant.method, values, [*common, *given, *variant.settings])
+    if variant.method == "neeco":
+        config = _with_room_to_grow(config)
+    if variant.derived is not None:
+        capture = plan.output / "captures" / variant.derived.name
+        config = replace(config, transforms="transforms.json")
+    folder = plan.output / "runs" / variant.name
+    return TrainingJob(variant.name, plan.seed, capture, folder, config, Budget(None, steps), device=plan.device)
+
+
+def _paper_settings(iterations: int) -> tuple[str, ...]:
+    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network rests for its usual
+    share of the run or REST_STEPS, whichever is longer."""
+    rest = max(method_settings("neeco", {}).warm_up, min(LONGEST_REST, REST_STEPS / iterations))
+    return (
+        f"schedule.published_steps={PUBLISHED_STEPS}",
+        f"schedule.earliest={PHASE_1_STEPS}",
+        f"deformation.warm_up={round(rest, 4)}",
+    )
+
+
+def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
+    """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
+    if config.initial_points is not None:
+        return config
+    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+
+
+def _shortcomings(method: str, steps: int) -> list[str]:
+    """What runs of so many steps are too short to show."""
+    notes = []
+    if method == "neeco" and PHASE_1_SHARE * steps < ROW_INTERVAL:
+        notes.append(
+            f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
+            f"({ROW_INTERVAL} steps); give --iterations {math.ceil(ROW_INTERVAL / PHASE_1_SHARE)} or more"
+        )
+    if method == "neeco" and TrainConfig().density_stop * steps <= CLOSEST_RESETS:
+        notes.append(
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {CLOSEST_RESETS}, and density "
+            "control ends half-way), so P_oi changes nothing here"
+        )
+    if method == "kinematic" and steps < KINEMATIC_LEAST:
+        notes.append(
+            f"kinematic: {steps} steps are few: hinges begin to learn and the shaft to spin after 600, labels to "
+            f"sharpen after 1,000; give --kinematic-iterations {KINEMATIC_LEAST} or more"
+        )
+    return notes
+
+
+def _label_scores(
+    chosen: Sequence[Ablation],
+    folders: Mapping[str, Path],
+    capture: Capture,
+    splits: tuple[str, ...],
+    device: torch.device,
+) -> tuple[dict[str, LabelScores], list[dict[str, str]]]:
+    """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
+    scores: dict[str, LabelScores] = {}
+    failures = []
+    for name in dict.fromkeys(entry.variant.name for entry in _entries(chosen) if entry.label_way):
+        if name not in folders:
+            continue
+        file = folders[name] / LABELS_FILE
+        stored = read_json(file) if file.exists() else None
+        if stored is None or stored["splits"] != list(splits):
+            try:
+                with open_run(folders[name], device) as run:
+                    scored = score_label_ways(run, capture, splits)
+            except NeecoError as error:
+                failures.append({"run": name, "error": f"label ways: {error}"})
+                continue
+            stored = {"splits": list(splits), "mask_iou": scored}
+            write_json(file, stored)
+        scores[name] = stored["mask_iou"]
+    return scores, failures
+
+
+def table_of(
+    table: Ablation,
+    folders: Mapping[str, Path],
+    results: Mapping[str, Result],
+    labels: Mapping[str, LabelScores],
+    splits: tuple[str, ...],
+) -> dict[str, Any]:
+    """One table as ablation.json has it: {name, group, title, question, judged, measures, rows, curves}.
+
+    A row: {comparison, label, reference (bool), run, values, paper, paper_direction, difference, agrees}; values,
+    paper, difference and agrees by measure. `difference` is to the comparison's reference. `agrees` says of each judged
+    measure whether ours differs in the paper's direction: "yes", "no", or "even" below EVEN_DB. A run that failed has
+    None for values. folders, results: of the runs that finished; labels: of those that are labelled both ways.
+    """
+    primary = primary_split(splits)
+    judged = [measure.format(split=primary) for measure in table.judged]
+    rows, curves = [], []
+    for comparison in table.comparisons:
+        values = {entry.label: _values(entry, folders, results, labels, splits) for entry in comparison.entries}
+        for entry in comparison.entries:
+            rows.append(_row(comparison, entry, values, judged, primary))
+            names, folder = {"comparison": comparison.title, "label": entry.label}, folders.get(entry.variant.name)
+            if table.group == "paper" and folder is not None:
+                points = [row for row in read_json_lines(folder / CURVE_FILE) if row["split"] == primary]
+                curves += [names | {key: row[key] for key in ("iteration", "progress", "psnr")} for row in points]
+    known = dict.fromkeys(key for row in rows for key, value in row["values"].items() if value is not None)
+    final = FINAL_SCORES if table.group == "ours" else ("psnr",)
+    return {
+        "name": table.name,
+        "group": table.group,
+        "title": table.title,
+        "question": table.question,
+        "judged": judged,
+        "measures": [*judged, *(key for key in known if key not in judged and key.partition(".")[0] in final)],
+        "rows": rows,
+        "curves": curves,
+    }
+
+
+def primary_split(splits: Sequence[str]) -> str:
+    """The held-out split that the paper's test numbers are set beside."""
+    return "test" if "test" in splits else splits[0]
+
+
+def _row(
+    comparison: Comparison, entry: Entry, values: Mapping[str, Values], judged: list[str], primary: str
+) -> dict[str, Any]:
+    reference = next(item for item in comparison.entries if item.label == comparison.reference)
+    ours, base = values[entry.label], values[reference.label]
+    paper = {key.format(split=primary): value for key, value in entry.paper.items()}
+    paper_base = {key.format(split=primary): value for key, value in reference.paper.items()}
+    difference: Values = {}
+    agrees: dict[str, str | None] = {}
+    if entry is not reference:
+        for key, value in ours.items():
+            other = base.get(key)
+            difference[key] = None if value is None or other is None else round(value - other, 4)
+        for key in judged:
+            expected = paper[key] - paper_base[key] if key in paper else float(entry.expected)
+            agrees[key] = direction(difference.get(key), expected)
+    return {
+        "comparison": comparison.title,
+        "label": entry.label,
+        "reference": entry is reference,
+        "run": entry.variant.name,
+        "values": ours,
+        "paper": paper,
+        "paper_direction": "" if entry is reference or not entry.expected else "worse",
+        "difference": difference,
+        "agrees": agrees,
+    }
+
+
+def direction(ours: float | None, paper: float) -> str | None:
+    """Whether two differences point the same way: "yes", "no", "even" when ours is below EVEN_DB, None unknown."""
+    if ours is None:
+        return None
+    if abs(ours) < EVEN_DB:
+        return "even"
+    return "yes" if (ours > 0) == (paper > 0) else "no"
+
+
+def _values(
+    entry: Entry,
+    folders: Mapping[str, Path],
+    results: Mapping[str, Result],
+    labels: Mapping[str, LabelScores],
+    splits: tuple[str, ...],
+) -> Values:
+    """Every number of one entry by measure; empty when its run failed."""
+    name = entry.variant.name
+    if entry.label_way is not None:
+        ways = labels.get(name, {})
+        return {f"mask_iou.{split}": ways[entry.label_way][split] for split in splits} if ways else {}
+    if name not in results:
+        return {}
+    folder, result = folders[name], results[name]
+    values: Values = {}
+    if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
+        values[PHASE_1_PSNR] = phase_1_psnr(folder, int(result["iterations"]))
+        curve, split = read_json_lines(folder / CURVE_FILE), primary_split(splits)
+        for percent in CHECKPOINTS:
+            values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)
+    return values | {f"{score}.{split}": result["splits"][split][score] for score in FINAL_SCORES for split in splits}
+
+
+def phase_1_psnr(folder: Path, iterations: int) -> float | None:
+    """Mean training PSNR (dB) over the rows of metrics.jsonl in the last quarter of phase 1, its last row at least.
+
+    A row averages 50 steps; None when phase 1, or the whole run, was shorter than that.
+    """
+    end = PHASE_1_SHARE * iterations
+    rows = [row for row in read_json_lines(folder / "metrics.jsonl") if row["iteration"] <= end]
+    late = [row["psnr"] for row in rows if row["iteration"] > 0.75 * end or row is rows[-1]]
+    return round(sum(late) / len(late), 4) if late else None
+
+
+def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> float | None:
+    """Held-out PSNR (dB) when `share` of the run was done; None where the curve has no row so near as 5 % of it."""
+    rows = [row for row in curve if row["split"] == split and abs(row["progress"] - share) < 0.05]
+    return min(rows, key=lambda row: abs(row["progress"] - share))["psnr"] if rows else None
+
+
+def write_tables(output: Path, ablation: Mapping[str, Any]) -> list[Path]:
+    """Write DIR/tables/NAME.csv, .md and .tex for every table; the files written."""
+    written = []
+    for table in ablation["tables"]:
+        latex = latex_table(grid(table), table["title"])
+        for suffix, text in (("csv", ablation_csv(table)), ("md", markdown(table)), ("tex", latex)):
+            written.append(output / "tables" / f"{table['name']}.{suffix}")
+            write_text(written[-1], text)
+    return written
+
+
+def heading(measure: str) -> str:
+    """A measure in words, e.g. `test PSNR at 40 %`."""
+    score, _, split = measure.partition(".")
+    if score.startswith("psnr_at_"):
+        return f"{split} PSNR at {score.removeprefix('psnr_at_')} %"
+    return f"{split} {HEADINGS[score]}".strip()
+
+
+def formatted(measure: str, value: float | None, *, signed: bool = False) -> str:
+    """A number as the tables show it: dB with two digits, IoU with three; `-` when not known."""
+    if value is None:
+        return UNKNOWN
+    digits = 3 if measure.startswith("mask_iou") else 2
+    return f"{value:{'+' if signed else ''}.{digits}f}"
+
+
+def grid(table: Mapping[str, Any]) -> Table:
+    """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
+
+    What is compared has a column of its own where it is not the same in all rows.
+    """
+    judged = table["judged"]
+    several = len({row["comparison"] for row in table["rows"]}) > 1
+    columns = []
+    for measure in table["measures"]:
+        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
+        columns += [Column(measure, title) for title in titles]
+    rows = []
+    for row in table["rows"]:
+        keys = (row["comparison"], row["label"]) if several else (row["label"],)
+        cells = [Cell(text) for measure in table["measures"] for text in _cells(row, measure, measure in judged)]
+        rows.append(Row(keys, tuple(cells), reference=row["reference"]))
+    return Table(table["title"], ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+
+
+def _cells(row: Mapping[str, Any], measure: str, judged: bool) -> list[str]:
+    """Our number with its difference from the reference; where judged, after the paper's and before the verdict."""
+    ours = formatted(measure, row["values"].get(measure))
+    if (difference := row["difference"].get(measure)) is not None:
+        ours += f" ({formatted(measure, difference, signed=True)})"
+    if not judged:
+        return [ours]
+    number = row["paper"].get(measure)
+    paper = (row["paper_direction"] or UNKNOWN) if number is None else formatted(measure, number)
+    return [paper, ours, "" if row["reference"] else row["agrees"].get(measure) or UNKNOWN]
+
+
+def agreement(table: Mapping[str, Any]) -> str:
+    """How many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
+    counts = Counter(agrees for row in table["rows"] for agrees in row["agrees"].values())
+    if not counts:
+        return ""
+    parts = [f"{counts['yes']} of {counts.total()} as in the paper"]
+    words = {"even": "even", "no": "the other way", None: "not known"}
+    return ", ".join([*parts, *(f"{counts[key]} {text}" for key, text in words.items() if counts[key])])
+
+
+def ablation_csv(table: Mapping[str, Any]) -> str:
+    """One line per setting and measure: every number in full."""
+    lines = []
+    for row in table["rows"]:
+        entry = {"table": table["name"], "setting": row["label"], **{key: row[key] for key in ("comparison", "run")}}
+        for measure in dict.fromkeys([*table["measures"], *row["values"]]):
+            numbers = {"paper": row["paper"], "ours": row["values"], **{k: row[k] for k in ("difference", "agrees")}}
+            lines.append({**entry, "measure": measure, **{key: of.get(measure) for key, of in numbers.items()}})
+    return csv_text(CSV_COLUMNS, lines)
+
+
+def markdown(table: Mapping[str, Any]) -> str:
+    """A Markdown table under its title."""
+    title, empty, *lines = markdown_table(grid(table))
+    directions = ["", f"Directions: {agreement(table)}."] if table["judged"] else []
+    return "\n".join([title, empty, table["question"], "", *lines, *directions]) + "\n"

@@ -1,0 +1,153 @@
+"""Which frames of a recording are kept, and which of them train, test what was seen, and test what was not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neeco.ingest.recording import Splits
+
+NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
+STILL = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
+STILL_MM, STILL_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
+THUMBNAIL = 64  # px, width
+UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
+MIN_RANGE = 0.1  # rad a joint's readings must span to be split by
+LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
+
+
+@dataclass(frozen=True)
+class FrameFeatures:
+    """What is kept of every frame while reading the video once."""
+
+    sharpness: np.ndarray  # [N]
+    thumbnails: np.ndarray  # [N, h, w] grey in [0, 1]
+
+
+def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
+    """Sharpness and a thumbnail of every image [H, W, 3] uint8."""
+    sharpness, thumbnails = [], []
+    for image in images:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        # at half size, or sensor noise is taken for detail
+        half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        sharpness.append(float(cv2.Laplacian(half, cv2.CV_32F).var()))
+        size = (THUMBNAIL, max(1, round(THUMBNAIL * image.shape[0] / image.shape[1])))
+        thumbnails.append(cv2.resize(half, size, interpolation=cv2.INTER_AREA))
+    return FrameFeatures(np.array(sharpness), np.array(thumbnails))
+
+
+def choose_frames(
+    features: FrameFeatures, usable: np.ndarray, states: np.ndarray, count: int | None, min_sharpness: float = 0.5
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Keep sharp frames that differ, `count` of them at most, spread over states and views: which, and why not others.
+
+    usable [N] bool: frames with a known state (the others are dropped); states [N, 6+J]: position mm, rotation vector
+    rad, joints rad of the instrument; min_sharpness: of the neighbours' median.
+    """
+    dropped = {int(i): "no instrument state at its time" for i in np.flatnonzero(~usable)}
+    for i in np.flatnonzero(usable).tolist():
+        around = features.sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1]
+        if features.sharpness[i] < min_sharpness * np.median(around):
+            dropped[i] = f"blurred: {features.sharpness[i] / np.median(around):.0%} of its neighbours' sharpness"
+    last: int | None = None
+    for i in range(len(usable)):
+        if i in dropped:
+            continue
+        if last is not None and _same(features, states, last, i):
+            dropped[i] = f"the same as frame {last}: neither picture nor state changed"
+        else:
+            last = i
+    kept = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
+    if count is not None and len(kept) > count:
+        chosen = kept[_farthest_points(_embedding(features, states)[kept], count)]
+        dropped |= {int(i): f"not among the {count} that cover states and views best" for i in set(kept) - set(chosen)}
+        kept = np.sort(chosen)
+    return kept, dropped
+
+
+def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
+    moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
+    change = np.abs(features.thumbnails[a] - features.thumbnails[b]).mean()
+    return bool(change < STILL and moved < STILL_MM and turned < STILL_RAD)
+
+
+def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:
+    """[N, D] state, main components of the view, and time (SfM needs neighbours), each of unit spread."""
+    pictures = features.thumbnails.reshape(len(states), -1)
+    pictures = pictures - pictures.mean(0)
+    basis = np.linalg.svd(pictures[:: max(1, len(pictures) // 400)], full_matrices=False)[2][:3]
+    columns = np.concatenate([states, pictures @ basis.T, np.arange(len(states))[:, None]], 1)
+    spread = columns.std(0)
+    return columns[:, spread > 1e-9] / spread[spread > 1e-9]
+
+
+def _farthest_points(rows: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` rows [N, D], each the farthest from those before it, first and last in time among them."""
+    chosen = [0, len(rows) - 1]
+    distance = np.minimum(*(np.linalg.norm(rows - rows[i], axis=1) for i in chosen))
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(rows - rows[chosen[-1]], axis=1))
+    return np.array(chosen[:count])
+
+
+def assign_splits(
+    frames: np.ndarray, poses: np.ndarray, joints: dict[str, np.ndarray], rule: Splits
+) -> tuple[np.ndarray, str]:
+    """Splits [N] (LEFT_OUT: too close to an unseen frame to train on) of video frames [N] (their numbers), and the rule
+    in words. poses [N, 4, 4] of the instrument and readings [N] rad per joint: what unseen frames are chosen by."""
+    splits = np.full(len(frames), "train", dtype=object)
+    if rule.test:
+        splits[_inside(frames, rule.test)] = "test"
+        words = "test: video frames " + _ranges(rule.test)
+    elif every := rule.test_every:
+        splits[frames % every == every // 2] = "test"
+        words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
+    else:
+        words = "test: none"
+    if rule.unseen:
+        splits[_inside(frames, rule.unseen)] = "unseen"
+        return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
+    if rule.unseen_fraction == 0:
+        return splits, f"{words}; unseen: none"
+    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
+    if not unseen.any():
+        return splits, f"{words}; unseen: none, as nothing moves"
+    splits[unseen] = "unseen"
+    splits[~unseen & (np.abs(frames[:, None] - frames[unseen]).min(1) <= UNSEEN_MARGIN)] = LEFT_OUT
+    left_out = f"frames within {UNSEEN_MARGIN} of an unseen one are left out of the capture"
+    return splits, f"{words}; unseen: {why}; {left_out}"
+
+
+def _inside(frames: np.ndarray, ranges: tuple[tuple[int, int], ...]) -> np.ndarray:
+    return np.any([(frames >= first) & (frames <= last) for first, last in ranges], axis=0)
+
+
+def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:
+    return ", ".join(f"{first}-{last}" for first, last in ranges)
+
+
+def _extremes(
+    poses: np.ndarray, joints: dict[str, np.ndarray], fraction: float, by: str | None
+) -> tuple[np.ndarray, str]:
+    """The far end of one joint, of the instrument's turn from its mean direction, or half of each."""
+    moving = [name for name, values in joints.items() if np.ptp(values) > MIN_RANGE]
+    joint = by or (moving[0] if moving else None)
+    share = fraction if by or joint is None else fraction / 2
+    unseen, words = np.zeros(len(poses), dtype=bool), []
+    if joint is not None:
+        limit = float(np.quantile(joints[joint], 1 - share))
+        unseen |= joints[joint] > limit
+        words.append(f"{joint} above {np.degrees(limit):.0f} deg")
+    if by is None:
+        turn = Rotation.from_matrix(poses[:, :3, :3])
+        away = (turn.mean().inv() * turn).magnitude()
+        limit = float(np.quantile(away, 1 - share))
+        unseen |= away > limit
+        words.append(f"instrument turned more than {np.degrees(limit):.0f} deg from its mean direction")
+    return unseen, " or ".join(words)

@@ -1,0 +1,335 @@
+"""Labelled images as torch data sets: drawn on the fly, or read from a folder that `neeco synthesize` wrote.
+
+A sample is a dict; H x W is the image's size, I the number of instruments that it shows, K that of keypoint names:
+
+    image      float32 [3, H, W] in [0, 1], RGB
+    parts      uint8 [H, W], part ids: 0 tissue, else `dataset.part_names[id - 1]`
+    masks      bool [I, H, W], one per instrument
+    labels     int64 [I], `dataset.classes[label - 1]`; 0 is left for the background, as in torchvision
+    boxes      float32 [I, 4] px: left, top, right, bottom
+    keypoints  float32 [I, K, 3]: x, y px, and 2 visible, 1 occluded, 0 absent; named `dataset.keypoint_names`
+    poses      float32 [I, 4, 4] camera_from_instrument, mm, OpenCV axes (x right, y down, z forward)
+    depth      float32 [H, W] mm along the optical axis, 0 = none
+    ignore     bool [H, W], pixels that a loss had better ignore: uncertain edges, and what no training frame saw
+    state      State: poses world_from_instrument (mm) and joints (rad)
+    camera     Camera: intrinsics (px) and world_from_camera (mm, OpenCV axes)
+    index      int
+
+Teach a segmenter on images that are drawn while it learns, nothing written:
+
+    import neeco
+    from torch.utils.data import DataLoader
+
+    if __name__ == "__main__":
+        images = neeco.LabelledImages("runs/liver", 1000, states="extrapolate")
+        for batch in DataLoader(images, batch_size=8, num_workers=2, collate_fn=images.collate):
+            loss = segmenter_loss(batch["image"], batch["parts"], ~batch["ignore"])
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from neeco.capture.images import open_image, read_image, read_labels
+from neeco.capture.model import InstrumentState, State, swap_camera_axes
+from neeco.errors import NeecoError
+from neeco.files import read_json, require_inside, require_like
+from neeco.labels.annotation import keypoint_names
+from neeco.labels.labelled_image import LabelledImage
+from neeco.labels.labellers import instruments_of
+from neeco.raster.native import torch_threads
+from neeco.raster.types import Camera
+from neeco.scene import Drawable
+from neeco.scene.io import load_scene, save_scene
+from neeco.scene.scene import Scene, gaussian_scene
+from neeco.settings import with_fields
+from neeco.synthesis.dataset import INFO, SCENE_FILE
+from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, StatesRefused, limit_threads
+from neeco.synthesis.samplers import make_sampler
+from neeco.synthesis.settings import PATH_PREFIX, LabelWay, Settings, Views
+from neeco.synthesis.workers import PackedSpec
+from neeco.synthesis.writers.folder import read_public_records, stem
+from neeco.training.run import Run, load_run
+
+Sample = dict[str, Any]
+Transform = Callable[[Sample], Sample]
+SceneLike = Run | Scene | Path | str
+STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the rest are lists
+RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
+MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
+ASKED_BY = "LabelledImages"  # in error messages
+READ = ("images", "parts", "ignore", "depth")  # folders of the files that a sample is made of
+REMEDY = "give a folder that `neeco synthesize` wrote"
+INFO_LIKE = {
+    "ids": [{"id": int, "part": str}],
+    "keypoints": [str],
+    "depth": {"mm_per_count": float},
+    "ignore": {"ignored": int},
+}
+
+
+def collate(samples: Sequence[Sample]) -> dict[str, Any]:
+    """A batch of B samples, for `DataLoader(collate_fn=...)`: image [B, 3, H, W], parts, depth and ignore [B, H, W] are
+    stacked; everything else, which differs in size from image to image, is a list of B. Images must be of one size."""
+    return {
+        key: torch.stack([sample[key] for sample in samples]) if key in STACKED else [sample[key] for sample in samples]
+        for key in samples[0]
+    }
+
+
+def sample_states(
+    scene: SceneLike,
+    count: int,
+    *,
+    seed: int = 0,
+    states: str = Settings.states,
+    views: Views = Settings.views,
+    margin: float = Settings.margin,
+) -> list[tuple[State, Camera]]:
+    """`count` instrument states, each with a camera to see it from, as `neeco synthesize` draws them at first.
+
+    scene: a run, its folder, a scene, or its file. states: interpolate, extrapolate, grid, path:FILE.jsonl or
+    FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is drawn, so none is refused for what the
+    image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
+
+        for state, camera in sample_states("runs/liver", 3, states="extrapolate"):
+            print(state.instruments["grasper"].joints, camera.width, camera.height)
+    """
+    settings = Settings(count, seed, states, margin, views)
+    settings.check()
+    sampler = make_sampler(_opened(scene)[0], settings.states, margin, views, count)
+    return [sampler(index, np.random.default_rng(np.random.SeedSequence([seed, index]))) for index in range(count)]
+
+
+class _Generated:
+    """What draws the samples of a data set. To another process it goes as the scene's file where there is one, else as
+    the file's bytes, and is opened there when the first sample is drawn."""
+
+    collate = staticmethod(collate)
+
+    def __init__(
+        self, scene: SceneLike, instruments: Sequence[SceneLike], settings: Settings, transform: Transform | None
+    ) -> None:
+        settings.check()
+        self.transform = transform
+        opened = [_opened(given) for given in (scene, *instruments)]
+        first, *others = (found for found, _ in opened)
+        with torch_threads(1):
+            generator = SampleGenerator.of(first, settings, others)
+        self.part_names = generator.labeller.names  # (instrument, part) of part id 1, 2, ...
+        self.classes = instruments_of(self.part_names)
+        self.keypoint_names = keypoint_names(generator.scene)
+        self._settings = settings
+        self._opened = opened
+        self._spec: GeneratorSpec | PackedSpec | None = None
+        self._generator: SampleGenerator | None = generator
+        self._limited = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        spec = self._spec or _spec(self._opened, self._settings)
+        return vars(self) | {"_opened": [], "_spec": spec, "_generator": None, "_limited": False}
+
+    def _draw(self, index: int) -> Sample:
+        if get_worker_info() is not None and not self._limited:
+            limit_threads(1)
+            self._limited = True
+        with torch_threads(1):
+            if self._generator is None:
+                assert self._spec is not None
+                self._generator = self._spec.open()
+            sample = self._generator.draw(index)
+            drawing = sample.drawing
+            labelled = LabelledImage.from_drawing(drawing, sample.labels, self.part_names, self.keypoint_names)
+            found = labelled.targets() | {"state": drawing.state, "camera": drawing.camera, "index": index}
+        return found if self.transform is None else self.transform(found)
+
+
+class LabelledImages(_Generated, Dataset[Sample]):
+    """A map-style data set of `count` labelled images, drawn when they are asked for: nothing is written.
+
+    scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
+    drawn over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
+    FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
+    `settings`: any other field of `neeco.synthesis.settings.Settings`. transform: sample -> sample, such as an
+    augmentation. Samples are described in this module's docstring.
+
+    Sample `index` is what `neeco synthesize` draws as image `index` for the same settings and seed, before its pixels
+    are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
+    worker uses one thread; it opens the scene's file when it draws its first sample (a scene without a file is sent to
+    it). Drawing on a GPU needs spawned workers, or none.
+
+    Raises NeecoError for a scene or settings that do not fit, and, when a sample is drawn, StatesRefused (a NeecoError)
+    where no state is acceptable.
+
+        images = LabelledImages("runs/liver", 100, seed=1)
+        sample = images[0]
+        sample["image"].shape, [images.classes[k - 1] for k in sample["labels"]]
+    """
+
+    def __init__(
+        self,
+        scene: SceneLike,
+        count: int,
+        *,
+        seed: int = 0,
+        states: str = Settings.states,
+        views: Views = Settings.views,
+        labels: LabelWay = Settings.labels,
+        camera_effects: str | Path | None = None,
+        instruments: Sequence[SceneLike] = (),
+        transform: Transform | None = None,
+        **settings: Any,
+    ) -> None:
+        effects = None if camera_effects is None else str(camera_effects)
+        given = {"states": states, "views": views, "labels": labels, "camera_effects": effects} | settings
+        super().__init__(scene, instruments, with_fields(Settings(count, seed), given), transform)
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Sample:
+        if not -self.count <= index < self.count:
+            raise IndexError(f"index {index} is out of range: the data set has {self.count} images")
+        return self._draw(int(index) % self.count)
+
+
+class LabelledStream(_Generated, IterableDataset[Sample]):
+    """An endless stream of the samples `start`, `start` + 1, ... of `LabelledImages`, which see for the arguments.
+
+    The workers of a DataLoader share the indices: of W workers the k-th draws start + k, start + k + W, ...; `shard` =
+    (rank, world size) shares them among processes in the same way first. So no sample is drawn twice, and each is the
+    same whoever draws it. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
+    for a stream.
+
+        stream = LabelledStream("runs/liver", seed=1)
+        for batch in DataLoader(stream, batch_size=8, num_workers=2, collate_fn=stream.collate):
+            ...
+    """
+
+    def __init__(
+        self,
+        scene: SceneLike,
+        *,
+        start: int = 0,
+        shard: tuple[int, int] = (0, 1),
+        seed: int = 0,
+        states: str = Settings.states,
+        views: Views = Settings.views,
+        labels: LabelWay = Settings.labels,
+        camera_effects: str | Path | None = None,
+        instruments: Sequence[SceneLike] = (),
+        transform: Transform | None = None,
+        **settings: Any,
+    ) -> None:
+        if states.startswith(PATH_PREFIX):
+            raise NeecoError(f"states: {states}: a path has an end; use LabelledImages, which has a count")
+        if start < 0 or not 0 <= shard[0] < shard[1]:
+            raise NeecoError(
+                f"start, shard: {start}, {shard}: give start >= 0 and shard (rank, size), 0 <= rank < size"
+            )
+        effects = None if camera_effects is None else str(camera_effects)
+        given = {"states": states, "views": views, "labels": labels, "camera_effects": effects} | settings
+        super().__init__(scene, instruments, with_fields(Settings(1, seed), given), transform)
+        self.start, self.shard = start, shard
+
+    def __iter__(self) -> Iterator[Sample]:
+        worker = get_worker_info()
+        number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        (rank, size), refused = self.shard, 0
+        for index in itertools.count(self.start + rank + size * number, size * workers):
+            try:
+                sample = self._draw(index)
+            except StatesRefused:
+                refused += 1
+                if self._settings.states in RANDOM or refused == MAX_REFUSED:
+                    raise
+                continue
+            refused = 0
+            yield sample
+
+
+class StoredImages(Dataset[Sample]):
+    """A map-style data set of the images in a folder that `neeco synthesize` or `neeco annotate` wrote.
+
+    Samples have the same keys as those of `LabelledImages`, and the pixels and numbers of the files. split: train, val,
+    or None for both. Raises NeecoError for a folder that is no such data set, and for a file that is damaged.
+
+        images = StoredImages("dataset", split="train")
+        loader = DataLoader(images, batch_size=8, num_workers=2, collate_fn=images.collate)
+    """
+
+    collate = staticmethod(collate)
+
+    def __init__(
+        self, folder: str | Path, *, split: Literal["train", "val"] | None = None, transform: Transform | None = None
+    ) -> None:
+        self.folder, self.transform = Path(folder), transform
+        info = require_like(read_json(self.folder / INFO), INFO_LIKE, str(self.folder / INFO), REMEDY)
+        self.part_names = tuple((item.get("instrument", ""), item["part"]) for item in info["ids"] if item["id"])
+        self.classes = instruments_of(self.part_names)
+        self.keypoint_names = tuple(info["keypoints"])
+        self._mm_per_count = float(info["depth"]["mm_per_count"])
+        self._ignored = info["ignore"]["ignored"]
+        records = read_public_records(self.folder)
+        self._records = [record for record in records if split in (None, record["split"])]
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __getitem__(self, index: int) -> Sample:
+        record = self._records[index]
+        name, size = f"{stem(record['index'])}.png", (record["width"], record["height"])
+        files = {folder: require_inside(self.folder / folder / name, self.folder) for folder in READ}
+        depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
+        labelled = LabelledImage.of(
+            read_image(files["images"], size),
+            torch.from_numpy(depth),
+            read_labels(files["parts"], size),
+            read_labels(files["ignore"], size) == self._ignored,
+            record["labels"],
+            self.part_names,
+            self.keypoint_names,
+        )
+        state = State(
+            {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]}, record["time"]
+        )
+        lens = record["intrinsics"]
+        world_from_camera = torch.from_numpy(swap_camera_axes(np.array(record["camera"], np.float64)))
+        camera = Camera(world_from_camera, lens["fl_x"], lens["fl_y"], lens["cx"], lens["cy"], *size)
+        found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
+        return found if self.transform is None else self.transform(found)
+
+
+def _opened(given: SceneLike) -> tuple[Scene, Path | None]:
+    """The scene, and the file that holds it where there is one. Raises NeecoError."""
+    if isinstance(given, str | Path):
+        path = Path(given)
+        if not path.is_dir():
+            return gaussian_scene(load_scene(path), ASKED_BY), path
+        given = load_run(path)
+    folder = getattr(given, "path", None)  # a run has one
+    drawable: Drawable = getattr(given, "scene", given)  # type: ignore[arg-type]
+    scene = gaussian_scene(drawable, ASKED_BY)
+    return scene, None if folder is None else Path(folder) / SCENE_FILE
+
+
+def _spec(opened: Sequence[tuple[Scene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:
+    """The generator of these scenes, for another process."""
+    device = str(opened[0][0].center.device)
+    paths = [path for _, path in opened if path is not None]
+    if len(paths) == len(opened):
+        return GeneratorSpec(paths[0], settings, device, tuple(paths[1:]))
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{k}.safetensors" for k in range(len(opened))]
+        for (scene, _), path in zip(opened, paths, strict=True):
+            save_scene(scene, path)
+        return PackedSpec.of(GeneratorSpec(paths[0], settings, device, tuple(paths[1:])))
