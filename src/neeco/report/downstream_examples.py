@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from PIL import Image, ImageDraw, ImageFont
 
 from neeco.capture.images import read_labels
@@ -47,11 +48,13 @@ def example_sections(experiment: Experiment, capture: Capture, output: Path) -> 
             shown, scores = _sections_of(model, split, jobs, samples[split], output)
             sections += shown
             rows += scores
-    colors = PART_COLORS.astype(int).tolist()
-    tints = [f"{name} #{''.join(f'{part:02x}' for part in colors[k])}" for k, name in enumerate(experiment["classes"])]
-    text = (
+    swatch = Markup('<i style="background: {}"></i>{} ').format
+    colors = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in PART_COLORS.astype(int).tolist()]
+    names = [*zip(colors, experiment["classes"], strict=False), ("#ff0", "truth")]
+    text = Markup('{} <span class="key">{}</span>').format(
         "Frames where synthetic images gain most over labelled frames alone, and where they gain least or lose, of one "
-        f"fold, with each prediction's score. Colours: {', '.join(tints)}; truth yellow."
+        "fold; under each prediction its score.",
+        Markup().join(swatch(color, name) for color, name in names),
     )
     table = csv_text(["model", "split", "fold", "frame", "why", "condition", "real", "score"], rows)
     title = "The same frame, trained otherwise"
@@ -135,7 +138,9 @@ def _sections_of(
             sections.append(Section(title=f"{model['name']}, {split}: {name}, {why}", level=3, images=images))
     if sections:
         title = "IoU" if model["answers"] == "masks" else "IoU of the most confident box with the true one"
-        against = f"{best.title} against {reference.title}" if best is not reference else f"{best.title}, best and worst"
+        against = (
+            f"{best.title} against {reference.title}" if best is not reference else f"{best.title}, best and worst"
+        )
         text = f"{against}; fold {jobs[0]['fold']}; {title}."
         sections.insert(0, Section(title=f"{model['name']}, {split}", split=split, level=3, text=text))
     return sections, rows

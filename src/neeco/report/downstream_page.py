@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
+from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.evaluation.mask_metrics import mean_of
@@ -47,8 +48,8 @@ from neeco.report.study_pages import Figure, Section
 
 FALSE_POSITIVES = round(1 / (1 - CONFIDENCE))  # of so many comparisons without a difference, one shows one
 QUESTIONS = {  # what a paired difference answers, as `question` finds it
-    "beside": "synthetic images beside labelled frames, against the same frames alone",
-    "augmented": "synthetic images beside labelled frames, against these frames with classical augmentation",
+    "beside": "synthetic images beside labelled frames, against these frames alone",
+    "augmented": "the same, against these frames with classical augmentation",
     "alone": "synthetic images alone, against the most labelled frames alone",
     "sets": "one set against another",
     "use": "one way of using a set against the plain one",
@@ -141,9 +142,7 @@ def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
         sentences.append("One fold: whether synthetic images help cannot be told from chance; give --folds 5.")
     else:
         verbs = dict(zip(VERDICTS, ("help", "hurt", "show no difference"), strict=True))
-        parts = [
-            Markup("{} in {}").format(verbs[word], counts[word]) for word in VERDICTS if counts[word]
-        ]
+        parts = [Markup("{} in {}").format(verbs[word], counts[word]) for word in VERDICTS if counts[word]]
         sentence = f"{', '.join(parts)} of {sum(counts.values())} comparisons."
         kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
         lead = "Beside the same labelled frames, synthetic images"
@@ -278,38 +277,35 @@ def _differences(experiment: Experiment, files: Mapping[str, str]) -> list[Secti
 
 @page_style()
 def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
-    """Every paired difference with its interval, by the question it answers; arrows where one reaches further."""
+    """Every paired difference with its interval, by the question it answers; arrows where an interval goes on."""
     rows = main_differences(experiment, model, split)
-    groups = [(words, [row for row in rows if question(row, experiment) == key]) for key, words in QUESTIONS.items()]
-    lines: list[str | Row] = [line for words, some in groups if some for line in (words, *some)]
     ends = [abs(row[end]) for row in rows for end in ("difference", "low", "high") if row[end] is not None]
     reach = min(max(ends), MAX_REACH * max(abs(row["difference"]) for row in rows)) or 1.0
-    axes = new_axes((900, 40 + 20 * len(lines)), 420, 20, 10, 30)
+    groups = {key: [row for row in rows if question(row, experiment) == key] for key in QUESTIONS}
+    lines = [(key, row) for key, some in groups.items() if some for row in (None, *some)]
+    axes = new_axes((560, 45 + 20 * len(lines)), 300, 20, 5, 40)
     axes.set(xlim=(-reach, reach), ylim=(len(lines) - 0.5, -0.5), yticks=[])
     axes.set_xlabel(f"difference of {TITLES[MAIN[model['answers']]]}")
-    axes.axvline(0, color=PALETTE["soft"], linewidth=1)
-    for y, row in enumerate(lines):
-        if isinstance(row, str):
-            axes.annotate(row, (0, y), (-400, 0), **_TEXT, color=PALETTE["accent"])
-            continue
-        color = PALETTE[{HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")]
-        against = title_of(row["against"], row["against_real"])
-        label = f"{title_of(row['condition'], row['real'])} − {against}"
-        axes.annotate(label if len(label) <= 70 else f"{label[:69]}…", (0, y), (-400, 0), **_TEXT)
-        if row["low"] is not None:
-            shown = np.clip([row["low"], row["high"]], -reach, reach)
-            axes.plot(shown, [y, y], color=color, linewidth=2)
-            for end, marker, place in ((row["low"], "<", shown[0]), (row["high"], ">", shown[1])):
-                axes.plot(place, y, color=color, marker="|" if end == place else marker, markersize=7)
-        axes.plot(row["difference"], y, color=color, marker="o", markersize=7, gid=verdict(row).split(" ")[0] or None)
-    return inline_svg(axes, f"differences, {model['name']}, {split}")
+    for y, (key, row) in enumerate(lines):
+        name, color = QUESTIONS[key], "accent"
+        if row is not None:
+            reference = f" − {row['against']}" if key in ("sets", "use") else ""
+            name = (title_of(row["condition"], row["real"]) + reference)[:45]
+            color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
+            _draw_interval(axes, y, row, reach, PALETTE[color])
+        place = axes.get_yaxis_transform()
+        axes.annotate(name, (0, y), (-290, 0), place, "offset points", va="center", color=PALETTE[color])
+    return inline_svg(axes, f"differences of {model['name']} on {split}")
 
 
-_TEXT: dict[str, Any] = {  # of a line's name, left of the axes
-    "xycoords": ("axes fraction", "data"),
-    "textcoords": "offset points",
-    "va": "center",
-}
+def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> None:
+    axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
+    if row["low"] is not None:
+        low, high = np.clip([row["low"], row["high"]], -reach, reach)
+        axes.plot([low, high], [y, y], color=color, linewidth=2)
+        axes.plot(low, y, color=color, marker="|" if low == row["low"] else "<", markersize=7)
+        axes.plot(high, y, color=color, marker="|" if high == row["high"] else ">", markersize=7)
+    axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
 
 
 def signed(value: float) -> str:
@@ -348,7 +344,17 @@ def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section
         )
     if not rows:
         return []
-    head = ["model, trained on", "labelled frames", "steps", "input", "batch", "best step", "still rising", "s", "CPU s"]
+    head = [
+        "model, trained on",
+        "labelled frames",
+        "steps",
+        "input",
+        "batch",
+        "best step",
+        "still rising",
+        "s",
+        "CPU s",
+    ]
     charts = [chart for model in experiment["models"] for chart in validation_charts(experiment, model)]
     text = (
         f"{budget_text(experiment)}. Each keeps the weights that scored best on held-out images, one in "
@@ -453,7 +459,8 @@ def _set_words(entry: Row) -> str:
     scene = f", synthesized from {made['scene']}" if made["scene"] else ""
     settings = made["settings"] or {}
     known = [f"{key} {settings[key]}" for key in ("states", "views", "labels", "seed") if settings.get(key) is not None]
-    return f"{images}{scene}{f' ({', '.join(known)})' if known else ''}; dataset.json sha256 {entry['sha256'][:12]}"
+    how = f" ({', '.join(known)})" if known else ""
+    return f"{images}{scene}{how}; dataset.json sha256 {entry['sha256'][:12]}"
 
 
 def _set_listings(experiment: Experiment) -> list[tuple[str, str]]:
