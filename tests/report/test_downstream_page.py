@@ -157,7 +157,9 @@ def test_the_answer_comes_first(output, experiment, capture):
     text, _ = page_of(output, experiment, capture)
     body = text.partition("</header>")[2]
     assert body.index("synthetic images help in 8 of 8 comparisons") < body.index("<table")
-    assert text.count('<b><span class="yes">helps</span></b>') == 16  # against them alone and augmented, per model, split and count
+    assert (
+        text.count('<b><span class="yes">helps</span></b>') == 16
+    )  # against them alone and augmented, per model, split and count
     order = ["In words", "Score over labelled frames", "Differences", "Numbers", "The same frame", "Training", "Notes"]
     places = [body.index(f"<h2>{title}") for title in order]
     assert places == sorted(places)

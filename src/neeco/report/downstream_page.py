@@ -165,16 +165,15 @@ def _glance(experiment: Experiment) -> list[Section]:
         line[row["real"]] = Markup("<br>").join(shown)
     if not lines:
         return []
-    judged = any(verdict(row) for row in rows)
     text = (
         "What synthetic images add to the score of the same labelled frames alone, mean over folds. “As good as about "
         "50”: as 50 labelled frames alone, read between the numbers tried."
-    ) + (
-        " “Helps” and “hurts”: the 95 % interval of the difference leaves out 0. Of "
-        f"{FALSE_POSITIVES} comparisons that differ in nothing about one is called so all the same."
-        if judged
-        else ""
     )
+    if any(verdict(row) for row in rows):
+        text += (
+            " “Helps” and “hurts”: the 95 % interval of the difference leaves out 0. Of "
+            f"{FALSE_POSITIVES} comparisons that differ in nothing about one is called so all the same."
+        )
     table = [
         [Markup("<b>{}</b><br><small>{}, {}</small>").format(*key), *(cells.get(count, "–") for count in counts)]
         for key, cells in lines.items()
@@ -359,12 +358,12 @@ def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section
     text = (
         f"{budget_text(experiment)}. Each keeps the weights that scored best on held-out images, one in "
         f"{experiment['held_back_every']} of what it learns from; where none can be held out, the last."
-    ) + (
-        " The curves are scores on these images over steps, of the first fold. The images differ between conditions, so "
-        "a curve is to be read by its shape. A set alone has the colour it has beside labelled frames."
-        if charts
-        else ""
     )
+    if charts:
+        text += (
+            " The curves are scores on these images over steps, of the first fold. The images differ between "
+            "conditions, so a curve is to be read by its shape. A set alone has the colour it has beside labelled frames."
+        )
     key = legend(families(experiment), families(experiment))
     figures = [Figure(chart, key) for chart in charts]
     listed = {"validation.csv": files["validation.csv"]}
