@@ -362,7 +362,7 @@ def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section
     if charts:
         text += (
             " The curves are scores on these images over steps, of the first fold. The images differ between "
-            "conditions, so a curve is to be read by its shape. A set alone has the colour it has beside labelled frames."
+            "conditions: read a curve by its shape. A set alone has the colour that it has beside labelled frames."
         )
     key = legend(families(experiment), families(experiment))
     figures = [Figure(chart, key) for chart in charts]
