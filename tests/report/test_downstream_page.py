@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import json
-from html import unescape
 
 import numpy as np
 import pytest
@@ -20,12 +19,10 @@ from neeco.experiments.downstream.samples import CLASSES, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_examples import draw_boxes, example_sections
 from neeco.report.downstream_page import (
-    command_of,
     difference_chart,
     families,
     question,
     score_chart,
-    signed,
     write_downstream_report,
 )
 
@@ -80,6 +77,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
     done = [job for job in jobs if "error" not in job]
     made = {
         "schema": "neeco-downstream/1", "version": "0.1.0", "complete": True, "capture": str(capture.root),
+        "command": f"neeco downstream --classes {classes}",
         "machine": {"cpu": "a <processor>", "cores": 2, "threads": 1, "torch_threads": 2, "workers": 1, "gpu": None,
                     "threads_per_worker": None, "python": "3.11", "torch": "2.13"},
         "teaching": {"sets": [{"name": name, "path": f"/sets/{name}", "count": None} for name in sets],
@@ -157,11 +155,8 @@ def test_the_answer_comes_first(output, experiment, capture):
     text, _ = page_of(output, experiment, capture)
     body = text.partition("</header>")[2]
     assert body.index("synthetic images help in 8 of 8 comparisons") < body.index("<table")
-    assert (
-        text.count('<b><span class="yes">helps</span></b>') == 16
-    )  # against them alone and augmented, per model, split and count
-    order = ["In words", "Score over labelled frames", "Differences", "Numbers", "The same frame", "Training", "Notes"]
-    places = [body.index(f"<h2>{title}") for title in order]
+    assert text.count('<b class="yes">helps</b>') == 16  # against them alone and augmented, per model, split and count
+    places = [body.index(f"<h2>{title}") for title in ("Results", "The same frame", "Training", "Notes")]
     assert places == sorted(places)
     assert "at least as good as 20" in body
 
@@ -177,7 +172,7 @@ def test_no_difference_and_harm_stand_as_plainly(capture, output):
     experiment["answers"] = findings(experiment)
     text, _ = page_of(output, experiment, capture)
     assert "synthetic images show no difference in 2 of 2 comparisons" in text
-    assert '<b><span class="soft">no difference shown</span></b>' in text
+    assert '<b class="soft">no difference shown</b>' in text
 
 
 def test_one_fold_is_no_answer(capture, output):
@@ -194,7 +189,7 @@ def test_without_labelled_frames_sets_stand_alone(capture, output):
     assert "No condition has synthetic images beside labelled frames" in text
     assert "one set against another" in text
     assert "best and worst; fold 0" in text
-    assert "Score over labelled frames" not in text
+    assert 'over labelled frames"' not in text
     assert len(images(page)) == 2 * (3 + 2) * (1 + 2)
 
 
@@ -205,19 +200,6 @@ def test_without_sets_classical_augmentation_is_compared(capture, output):
     assert "The same frame" not in text
     assert not images(page)
     assert "--sets" not in text
-
-
-def test_as_good_as_is_read_over_the_same_folds(capture, output):
-    jobs = jobs_of(capture, output, models=("unet",), conditions=("real", "kinematic+real"), counts=(5, 20))
-    for job, value in zip(jobs, (0.2, 0.4, 0.3, 0.3, 0.8, 0.9, 0.0, 0.0), strict=True):
-        job["splits"]["test"]["iou"] = value
-    first = [job for job in jobs if job["fold"] == 0 or job["condition"] == "real"]
-    text, _ = page_of(output, experiment_of(capture, first), capture)
-    assert text.count("<small>as good as about 10</small>") == 2  # halfway from 5 to 20 on a logarithmic axis
-    for job in jobs:
-        job["splits"]["test"]["iou"] = 0.0
-    glance = page_of(output, experiment_of(capture, jobs), capture)[0].partition("In words")[0]
-    assert glance.count("<small>at least as good as 20</small>") == 2  # of the other split alone
 
 
 def test_failed_trainings_are_told_and_the_rest_is_shown(capture, output):
@@ -245,14 +227,14 @@ def test_an_experiment_where_everything_failed_says_so(capture, output, experime
     assert f"{len(jobs)} trainings failed" in text
     assert "all of it" in text
     assert not images(page)
-    assert "Score over labelled frames" not in text
+    assert 'over labelled frames"' not in text
 
 
 def test_answers_that_are_gone_are_left_out(capture, output):
     text, page = page_of(output, experiment_of(capture, jobs_of(capture, output, kept=False)), capture)
     assert not images(page)
     assert "The same frame" not in text
-    assert "Differences" in text
+    assert "differences of IoU" in text
 
 
 def test_parts_are_told_apart(capture, output):
@@ -318,7 +300,6 @@ def test_differences_go_by_what_they_answer(experiment):
     assert question({"condition": "a+soft+real", "against": "a+real"}, sets) == "use"
     assert verdict({"low": 0.0, "high": 0.1}) == "no difference shown"
     assert verdict({"low": -0.2, "high": -0.1}) == "hurts"
-    assert signed(-0.0001) == "0.000"
     chart = difference_chart(experiment, experiment["models"][0], "test")
     assert "var(--good)" in chart
     asked = ("beside labelled frames, against these", "with classical augmentation", "the most labelled frames alone")
@@ -343,20 +324,6 @@ def test_a_logarithmic_axis_has_the_points_as_ticks():
     assert "level of it" in line_chart("t", "x", single, levels=[Level("level of it", 1, 0.3)], over_logarithmic=True)
 
 
-def test_the_command_makes_the_same_experiment(experiment):
-    told = command_of(experiment)
-    assert told.startswith("neeco downstream ")
-    assert (
-        "--sets kinematic=/sets/kinematic --models unet dfine --num-real 0 5 all --folds 2 --splits test unseen" in told
-    )
-    assert "--conditions" not in told
-    experiment["jobs"][0]["condition"] = "kinematic+soft"
-    assert "--conditions kinematic+soft real real+augment kinematic kinematic+real" in command_of(experiment)
-    experiment["jobs"] = [job for job in experiment["jobs"] if job["condition"] in ("real", "kinematic+real")]
-    assert "--num-real 5 all" in command_of(experiment)
-    assert "--conditions real kinematic+real" in command_of(experiment)
-
-
 def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp_path, output, noon):
     capture = world.make_capture(tmp_path / HOSTILE, world.TinyScene(), ("train", "test", "unseen"))
     jobs = jobs_of(capture, output, conditions=("real", HOSTILE, f"{HOSTILE}+real"), folds=1)
@@ -366,4 +333,3 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp
     experiment["machine"]["cpu"] = HOSTILE
     experiment["sets"][0]["made_by"]["settings"]["states"] = HOSTILE
     check_hostile_names(lambda: page_of(output, experiment, capture)[0], VOID)
-    assert "numbers" in unescape(page_of(output, experiment, capture)[0])

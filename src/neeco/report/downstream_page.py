@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,24 +14,23 @@ from matplotlib.axes import Axes
 
 from neeco.capture.model import Capture
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.job import AUGMENT, REAL, default_conditions
+from neeco.experiments.downstream.job import AUGMENT, REAL
 from neeco.experiments.downstream.results import (
     CONFIDENCE,
     HELPS,
     HURTS,
     MAIN,
+    NONE_SHOWN,
     TITLES,
     VERDICTS,
     arms_of,
     budget_text,
     data_files,
     differences_table,
-    equivalent,
     failed_jobs,
     findings_of,
     main_differences,
     models_and_splits,
-    real_curve,
     scores_by_fold,
     scores_table,
     summary_text,
@@ -78,19 +76,10 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
         f"synthetic images, and on both, always in as many steps; tested on {_tested(experiment, capture)}, recorded, "
         "which no training saw."
     )
-    failed, notes = failed_jobs(experiment), experiment["notes"]
-    sections = [
-        *_glance(experiment),
-        *_findings(experiment),
-        *_score_curves(experiment, files),
-        *_differences(experiment, files),
-        *_numbers(experiment, files),
-        *images,
-        *_trainings(experiment, files),
-        Section(title="What failed", notes=failed),
-        Section(title="Notes", notes=[note for note in notes if not note.startswith("failed: ")]),  # shown above
-        Section(title="How it was made", facts=_facts(experiment, capture), listings=_set_listings(experiment)),
-    ]
+    failed = failed_jobs(experiment)
+    notes = [note for note in experiment["notes"] if not note.startswith("failed: ")]  # which stand apart
+    lists = [Section(title=title, notes=lines) for title, lines in (("What failed", failed), ("Notes", notes)) if lines]
+    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=_set_listings(experiment))
     return write_page(
         output / REPORT_FILE,
         "study.html",
@@ -100,8 +89,8 @@ def write_downstream_report(output: Path, experiment: Experiment, capture: Captu
         version=experiment["version"],
         stamps=[machine_words(experiment["machine"], "torch_threads")],
         intro=[intro],
-        findings=[("", sentence) for sentence in _headlines(experiment, failed)],
-        sections=[section for section in sections if section.title not in ("What failed", "Notes") or section.notes],
+        findings=[*(("", line) for line in _headlines(experiment, failed)), *_findings(experiment)],
+        sections=[*_results(experiment, files), *images, *_trainings(experiment, files), *lists, made],
     )
 
 
@@ -119,93 +108,39 @@ def question(row: Row, experiment: Experiment) -> str:
     return "augmented" if AUGMENT in others else "beside"
 
 
-def _beside(experiment: Experiment) -> list[Row]:
-    """The differences that the study is about: synthetic images beside labelled frames against these alone."""
-    rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
-    return [row for row in rows if question(row, experiment) == "beside"]
-
-
-def _colored(word: str) -> Markup:
-    """A verdict in its colour."""
-    return Markup('<span class="{}">{}</span>').format({HELPS: "yes", HURTS: "no"}.get(word, "soft"), word)
-
-
 def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
-    """What all differences together say, in a sentence, and what is missing."""
-    sentences = []
-    if not experiment["complete"]:
-        sentences.append("Not all trainings are finished: these are the numbers so far.")
-    counts = Counter(verdict(row) for row in _beside(experiment))
+    """Whether synthetic images beside labelled frames help, over all differences to these alone; what is missing."""
+    sentences = [] if experiment["complete"] else ["Not all trainings are finished: these are the numbers so far."]
+    rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
+    counts = Counter(verdict(row) for row in rows if question(row, experiment) == "beside")
     if not counts:
         sentences.append("No condition has synthetic images beside labelled frames to compare with these frames alone.")
     elif set(counts) == {""}:
         sentences.append("One fold: whether synthetic images help cannot be told from chance; give --folds 5.")
     else:
-        verbs = dict(zip(VERDICTS, ("help", "hurt", "show no difference"), strict=True))
-        parts = [Markup("{} in {}").format(verbs[word], counts[word]) for word in VERDICTS if counts[word]]
-        sentence = f"{', '.join(parts)} of {sum(counts.values())} comparisons."
+        verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
+        parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]
         kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
-        lead = "Beside the same labelled frames, synthetic images"
-        sentences.append(Markup('<b class="{}">{} {}</b>').format(kind, lead, sentence))
+        sentence = "Beside the same labelled frames, synthetic images {} of {} comparisons."
+        text = Markup(f'<b class="{{}}">{sentence}</b>').format(kind, ", ".join(parts), sum(counts.values()))
+        sentences.append(text)
     if failed:
         sentences.append(f"{len(failed)} training{'s' if len(failed) > 1 else ''} failed; they are listed below.")
     return sentences
 
 
-def _glance(experiment: Experiment) -> list[Section]:
-    """Whether synthetic images beside labelled frames help: a line per model, split and condition, a cell per count."""
-    rows = _beside(experiment)
-    counts = sorted({row["real"] for row in rows})
-    lines: dict[tuple[str, str, str], dict[int, Markup]] = {}
-    for row in rows:
-        word, as_many = verdict(row), _as_many(row, experiment)
-        parts = [escape(signed(row["difference"])), _colored(word), Markup("<small>{}</small>").format(as_many)]
-        shown = [part for part, text in zip(parts, ("difference", word, as_many), strict=True) if text]
-        line = lines.setdefault((row["condition"], row["model"], row["split"]), {})
-        line[row["real"]] = Markup("<br>").join(shown)
-    if not lines:
-        return []
-    text = (
-        "What synthetic images add to the score of the same labelled frames alone, mean over folds. “As good as about "
-        "50”: as 50 labelled frames alone, read between the numbers tried."
-    )
-    if any(verdict(row) for row in rows):
-        text += (
-            " “Helps” and “hurts”: the 95 % interval of the difference leaves out 0. Of "
-            f"{FALSE_POSITIVES} comparisons that differ in nothing about one is called so all the same."
-        )
-    table = [
-        [Markup("<b>{}</b><br><small>{}, {}</small>").format(*key), *(cells.get(count, "–") for count in counts)]
-        for key, cells in lines.items()
-    ]
-    head = ["trained on", *(f"{count:,} labelled" for count in counts)]
-    return [Section(title="At a glance", text=text, head=head, rows=table)]
-
-
-def _as_many(row: Row, experiment: Experiment) -> str:
-    """`as good as about 55`: how many labelled frames alone do as well as the first of a difference, over the folds
-    that all of these finished; "" where that cannot be read: of one number of frames only, or scores all 0."""
-    scores = scores_by_fold(experiment["jobs"], row["model"], row["split"], row["metric"])
-    key = row["condition"], row["real"]
-    curve = real_curve(scores, key)
-    if len(curve) < 2 or not any(score for _, score in curve):
-        return ""
-    return equivalent(curve, mean_of(list(scores[key].values())))
-
-
-def _findings(experiment: Experiment) -> list[Section]:
-    """The sentences of each model and split, verdicts in their colours."""
-    sections = []
+def _findings(experiment: Experiment) -> list[tuple[str, Markup]]:
+    """(model and split, sentence) of all that the numbers say, verdicts in their colours."""
+    found = []
     for model, split in models_and_splits(experiment):
-        notes = []
         for sentence in findings_of(experiment, model, split):
             text = escape(sentence)
             for word in VERDICTS:
-                text = text.replace(Markup(f"; {word} against"), Markup("; <b>{}</b> against").format(_colored(word)))
-            notes.append(text)
-        if notes:
-            sections.append(Section(title=f"{model['name']}, {split}", split=split, level=3, notes=notes))
-    return [Section(title="In words"), *sections] if sections else []
+                kind = {HELPS: "yes", HURTS: "no"}.get(word, "soft")
+                colored = Markup('; <b class="{}">{}</b> against').format(kind, word)
+                text = text.replace(Markup(f"; {word} against"), colored)
+            found.append((f"{model['name']}, {split}", text))
+    return found
 
 
 def _family(condition: str) -> str:
@@ -226,17 +161,29 @@ def _order(condition: str, experiment: Experiment) -> int:
     return [_family(name) for name in families(experiment)].index(_family(condition))
 
 
-def _score_curves(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
+def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
+    """For every model and split its scores, as a table and over labelled frames, and their differences."""
     known = families(experiment)
     key = legend(known, [name for name in known if REAL in name.split("+")])
-    charts = [score_chart(experiment, model, split) for model, split in models_and_splits(experiment)]
+    sections = []
+    for model, split in models_and_splits(experiment):
+        scores, differences = scores_table(experiment, model, split), differences_table(experiment, model, split)
+        figures = [Figure(chart, key)] if (chart := score_chart(experiment, model, split)) else []
+        if differences.rows:
+            figures.append(Figure(difference_chart(experiment, model, split), []))
+        title = f"{model['name']}, {split}"
+        sections.append(Section(title=title, split=split, level=3, results=scores, figures=figures))
+        if differences.rows:
+            sections.append(Section(title=differences.title, level=3, results=differences))
     text = (
-        "Bold: mean over folds; thin: each fold. Dashed from side to side: a set alone, without any labelled frame, in "
-        "the colour it has beside labelled frames."
+        "Scores: mean ± standard deviation over folds; the best is bold. Curves: bold the mean over folds, thin each "
+        "fold, dashed from side to side a set alone, without any labelled frame, in the colour it has beside labelled "
+        "frames. Differences are of the same folds, with the interval that holds their mean with 95 % confidence "
+        "(Student's t over folds): one that reaches 0 shows no difference, green is better than its reference, red is "
+        f"worse. Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
     )
-    figures = [Figure(chart, key) for chart in charts if chart]
-    listed = {name: files[name] for name in ("scores.csv", "summary.csv")}
-    return [Section(title="Score over labelled frames", text=text, figures=figures, files=listed)] if figures else []
+    listed = ("summary.csv", "scores.csv", "paired.csv", "frames.csv", "jobs.csv")
+    return [Section(title="Results", text=text, files={name: files[name] for name in listed}), *sections]
 
 
 def score_chart(experiment: Experiment, model: Row, split: str) -> str:
@@ -257,21 +204,6 @@ def score_chart(experiment: Experiment, model: Row, split: str) -> str:
         series.append(Series(condition, order, means, faint, means))
     title = f"{TITLES[metric]}: {model['name']}, {split}"
     return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True)
-
-
-def _differences(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
-    sections = []
-    for model, split in models_and_splits(experiment):
-        rows, table = main_differences(experiment, model, split), differences_table(experiment, model, split)
-        if rows:
-            name, chart = f"{model['name']}, {split}", difference_chart(experiment, model, split)
-            sections.append(Section(title=name, split=split, level=3, results=table, figures=[Figure(chart, [])]))
-    text = (
-        "Of the same folds, with the interval in which the mean lies with 95 % (Student's t over folds). An interval "
-        "that reaches 0 shows no difference; green is better than its reference, red is worse."
-    )
-    listed = {"paired.csv": files["paired.csv"]}
-    return [Section(title="Differences", text=text, files=listed), *sections] if sections else []
 
 
 @page_style()
@@ -305,21 +237,6 @@ def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> 
         axes.plot(low, y, color=color, marker="|" if low == row["low"] else "<", markersize=7)
         axes.plot(high, y, color=color, marker="|" if high == row["high"] else ">", markersize=7)
     axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
-
-
-def signed(value: float) -> str:
-    """A difference with its sign, a true minus; none of what rounds to 0."""
-    return f"{value:+.3f}".replace("-", "−") if round(value, 3) else "0.000"
-
-
-def _numbers(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
-    tables = [(split, scores_table(experiment, model, split)) for model, split in models_and_splits(experiment)]
-    sections = [
-        Section(title=table.title, split=split, level=3, results=table) for split, table in tables if table.rows
-    ]
-    listed = {name: files[name] for name in ("jobs.csv", "frames.csv")}
-    text = "Mean ± standard deviation over folds; the best is bold."
-    return [Section(title="Numbers", text=text, files=listed), *sections] if sections else []
 
 
 def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
@@ -396,49 +313,13 @@ def _tested(experiment: Experiment, capture: Capture) -> str:
     return " and ".join(counts)
 
 
-def command_of(experiment: Experiment) -> str:
-    """The command that makes this study."""
-    given, jobs = experiment["teaching"], experiment["jobs"]
-    counts = sorted({job["real"] for job in jobs})
-    conditions = list(dict.fromkeys(job["condition"] for job in jobs))
-    usual = {
-        name
-        for name in default_conditions([entry["name"] for entry in given["sets"]])
-        if any(bool(count) == (REAL in name.split("+")) for count in counts)
-    }
-    limit = {entry["name"]: "" if entry["count"] is None else f":{entry['count']}" for entry in given["sets"]}
-    options: dict[str, Sequence[Any]] = {
-        "sets": [f"{entry['name']}={entry['path']}{limit[entry['name']]}" for entry in given["sets"]],
-        "models": [model["name"] for model in experiment["models"]],
-        "num-real": ["all" if count and count == experiment["labelled"] else count for count in counts],
-        "folds": [experiment["folds"]],
-        "conditions": [] if set(conditions) == usual else conditions,
-        "labels": [given["labels"]],
-        "classes": [given["classes"]] if given["classes"] != "instrument" else [],
-        "frame-selection": [given["pick"]] if given["pick"] != "spread" else [],
-        "splits": experiment["splits"],
-        "steps": [given["steps"]],
-        "size": [given["side"]],
-        "batch": [given["batch"]],
-        "weights": [f"{model['name']}={model['weights']}" for model in experiment["models"] if model["weights"]],
-        "transforms": [given["transforms"]] if given["transforms"] != "transforms.json" else [],
-        "device": [given["device"]] if given["device"] != "auto" else [],
-    }
-    words = ["neeco", "downstream", experiment["capture"]]
-    for option, values in options.items():
-        known = [str(value) for value in values if value is not None]
-        words += [word for value in known for word in (f"--{option}", value)] if option == "weights" else []
-        words += [f"--{option}", *known] if known and option != "weights" else []
-    return shlex.join([*words, "--output", "DIR"])
-
-
 def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
     machine, given = experiment["machine"], experiment["teaching"]
     labels = given["labels"] or "the capture's truth"
     chosen = "spread over the recording, others in every fold" if given["pick"] == "spread" else "the first of it"
     labelled = f"of {experiment['labelled']:,}, {chosen}; labels: {labels}" if experiment["labelled"] else "none"
     return [
-        ("command", command_of(experiment)),
+        ("command", experiment["command"]),
         ("capture", experiment["capture"]),
         ("frames", split_counts(capture)),
         ("labelled frames", labelled),
@@ -456,10 +337,7 @@ def _set_words(entry: Row) -> str:
     if made is None:
         return f"{images}; how they were made is not known: it has no dataset.json"
     scene = f", synthesized from {made['scene']}" if made["scene"] else ""
-    settings = made["settings"] or {}
-    known = [f"{key} {settings[key]}" for key in ("states", "views", "labels", "seed") if settings.get(key) is not None]
-    how = f" ({', '.join(known)})" if known else ""
-    return f"{images}{scene}{how}; dataset.json sha256 {entry['sha256'][:12]}"
+    return f"{images}{scene}; dataset.json sha256 {entry['sha256'][:12]}"
 
 
 def _set_listings(experiment: Experiment) -> list[tuple[str, str]]:
