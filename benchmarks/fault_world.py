@@ -50,13 +50,10 @@ def still_the_clocks() -> None:
 
 
 def prepare() -> None:
-    """Import what the verbs need, and make their intervals fit runs of some dozen steps."""
+    """Import what the verbs need, and make their intervals fit short recordings."""
     import torch
 
-    from neeco.training import train
-
     torch.set_num_threads(1)
-    train.ROW_INTERVAL, train.CHECKPOINT_INTERVAL = 5, 20
     hasten_ingest()
     still_the_clocks()
 
@@ -67,7 +64,8 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
         work / "capture", frames=8, sizes=((32, 24),)
     )
     run = work / "run"
-    settings = ("--iterations", str(STEPS), "--set", "density_start=10", "--set", "tissue_budget=200")
+    settings = ("--iterations", str(STEPS), "--set", "density_start=10", "--set", "max_tissue_gaussians=200")
+    settings += ("--set", "log_interval=5", "--set", "checkpoint_interval=20")
     train = ("train", str(capture), *settings)
     if {"synthesize", "annotate", "workers"} & set(names):
         ended = Child((*train, "--output", str(run)), work).wait()

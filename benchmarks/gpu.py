@@ -1,7 +1,7 @@
 """What a GPU does: frames and training steps a second, by backend and by stage, and whole verbs beside the CPU.
 
     python benchmarks/gpu.py [--device cuda:0] [--workload 25000,320x256 ...] [--repeats 30] [--output FOLDER]
-                             [--train CAPTURE [--iterations N]] [--synthesize RUN [--count N]]
+                             [--train CAPTURE [--iterations N] [--set NAME=VALUE]] [--synthesize RUN [--count N]]
 
 Method `kinematic`, random Gaussians on a closed surface, a fifth of them the instrument's: `frame` poses and draws
 them, `step` poses, draws, takes the photometric loss and its gradients and one step of Adam; `draw` and `draw+backward`
@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -48,11 +48,11 @@ from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import open_run
 
 WORKLOADS = ("25000,320x256", "300000,960x540", "1000000,1920x1080")
@@ -211,12 +211,14 @@ def measure(workload: Workload, device: torch.device, repeats: int, peak: dict[s
     return {"workload": asdict(workload), "title": str(workload), "ms": rows, "stages": stages, "memory_bytes": most}
 
 
-def train_both(capture: Path, device: torch.device, iterations: int) -> list[dict[str, Any]]:
+def train_both(
+    capture: Path, device: torch.device, iterations: int, settings: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     """`kinematic` from the same seed there and on the CPU: seconds, and PSNR and mask IoU of held-out frames."""
     rows = []
     for where in dict.fromkeys((str(device), "cpu")):
         with tempfile.TemporaryDirectory() as folder:
-            config = training_config("kinematic", {})
+            config = training_config("kinematic", {}, settings)
             job = TrainingJob(
                 "kinematic", 0, capture, Path(folder) / "run", config, Budget(None, iterations), device=where
             )
@@ -311,7 +313,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
     result: dict[str, Any] = {"hardware": hardware(device), "peak": peak, "repeats": arguments.repeats}
     result["workloads"] = [measure(workload, device, arguments.repeats, peak) for workload in workloads]
     if arguments.train is not None:
-        result["train"] = train_both(arguments.train, device, arguments.iterations)
+        result["train"] = train_both(arguments.train, device, arguments.iterations, arguments.set)
     if arguments.synthesize is not None:
         result["synthesize"] = synthesize_some(arguments.synthesize, device, arguments.count)
     return result
@@ -326,6 +328,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, metavar="FOLDER")
     parser.add_argument("--train", type=Path, metavar="CAPTURE")
     parser.add_argument("--iterations", type=int, default=2000, help="of --train")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="of --train; repeatable")
     parser.add_argument("--synthesize", type=Path, metavar="RUN")
     parser.add_argument("--count", type=int, default=100, help="images of --synthesize")
     arguments = parser.parse_args(words)

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from neeco.capture import Capture
 from neeco.capture.check import read_checked
 from neeco.raster.native import keep_freed_memory, set_threads
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.train import train
 
 ASPECT = 4 / 3

@@ -32,7 +32,7 @@ from neeco.files import write_text
 from neeco.raster.native import set_threads
 from neeco.scene import Drawable
 from neeco.scene.training_session import Session
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 

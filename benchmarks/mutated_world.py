@@ -85,7 +85,7 @@ def make_world(desk: Path, wanted: set[str]) -> None:
         for folder in (capture / "truth" / "masks", desk / "predicted", desk / "truth"):
             Image.fromarray(np.roll(ids, k, 1)).save(folder / name)
     (capture / "transforms.json").write_text(json.dumps(document))
-    settings = ["--iterations", "20", "--set", "density_start=5", "--set", "tissue_budget=200"]
+    settings = ["--iterations", "20", "--set", "density_start=5", "--set", "max_tissue_gaussians=200"]
     say = ["train", "capture", *settings, "--output"]
     run([*say, "run"], desk)
     shutil.copytree("run", "cut")

@@ -69,7 +69,7 @@ RECORDING = (
     "recording/sync.json",
     "recording/video.mp4",
 )
-STEPS = ["--iterations", "3", "--set", "tissue_budget=200"]
+STEPS = ["--iterations", "3", "--set", "max_tissue_gaussians=200"]
 
 
 def out(*words: str) -> Callable[[random.Random], list[str]]:

@@ -39,7 +39,7 @@ def prune(path: Path, count: int) -> None:
     """Print the rows of one run, scored on `count` frames of each held-out split."""
     with open_run(path) as run:
         scene, capture = gaussian_scene(run.scene, "pruning"), thinned(run.capture(), count)
-    canonical, seen = scene.canonical, scene.seen().sum(1)  # [N]
+    canonical, seen = scene.canonical, scene.visibility().sum(1)  # [N]
     for share in SHARES:
         scene.canonical = kept(canonical, seen.argsort().argsort() >= round(share * len(canonical)))
         cells, began, drawn = [], time.process_time(), 0

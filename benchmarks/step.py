@@ -26,9 +26,8 @@ from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as steps
-from neeco.training.checkpoint import read_checkpoint, restore_session
 from neeco.training.initial import begin_session
-from neeco.training.run import read_config, stored_config
+from neeco.training.run import read_checkpoint, read_config, restore_session, stored_config
 
 PARTS: list[tuple[Any, str, str]] = [
     (steps.Scene, "at", "Scene.at beside posing"),

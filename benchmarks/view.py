@@ -15,7 +15,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from neeco.viewer.server import Viewer
+from neeco.viewer.server import ViewerServer
 
 PAGES = ((640, 400), (964, 400))
 SETTLED_MS, BETWEEN_MS = 4000, 900
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=30)
     arguments = parser.parse_args()
     options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with Viewer([arguments.run]) as viewer, sync_playwright() as driver:
+    with ViewerServer([arguments.run]) as viewer, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=options)
         for width, height in PAGES:
             found = delays(browser, viewer.address, width, height, arguments.times)

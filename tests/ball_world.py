@@ -11,7 +11,7 @@ from rod_world import CAMERA, WALL_MM, FakeRun
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.io import save_scene
 
 RADIUS = 6.0  # mm, of a ball

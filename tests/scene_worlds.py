@@ -9,16 +9,21 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.deformations.kinematic import PART_LOGITS
+from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
-from neeco.scene.nerfies.scene import NerfScene
-from neeco.scene.nerfies.settings import NerfiesSettings
+from neeco.scene.nerfies.field import NerfiesSettings, NerfScene
 
 TISSUE, INSTRUMENT = 20, 40
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.5)})
-SMALL = {"4dgs": {"resolution": 8, "channels": 4, "moments": 5, "width": 16}, "deformable-3dgs": {"width": 32}}
+SMALL = {"4dgs": {"resolution": 8, "channels": 4, "time_resolution": 5, "width": 16}, "deformable-3dgs": {"width": 32}}
 SURE = 30.0  # a part logit that leaves no doubt
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=61.0, cx=32.0, cy=24.0, width=64, height=48)
+
+
+def rounding(scale: float, products: int) -> float:
+    """By how much two float32 sums of `products` terms may differ where a library adds them in another order, as it
+    does for tensors of another shape: errors of eps * `scale` (the largest sum) each, most of which cancel."""
+    return 4 * torch.finfo(torch.float32).eps * products**0.5 * scale
 
 
 def pose_of(*vector: float) -> Tensor:

@@ -10,6 +10,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src"
 ROOMS = (  # from the top down; rooms of one line do not know each other
     ("cli",),
+    ("api",),
     ("viewer", "report"),
     ("experiments",),
     ("synthesis",),
@@ -114,7 +115,8 @@ def test_a_room_imports_only_from_rooms_below() -> None:
 
 
 def test_no_circle_between_modules() -> None:
-    assert circles(graph()) == []
+    lazy = "neeco"  # its names are imported when they are first used; others take the version from it
+    assert circles({module: others - {lazy} for module, others in graph().items()}) == []
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.drawable import Learned
-from neeco.scene.hinges import PART_LOGITS
+from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.io import save_scene
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.training.config import TrainConfig

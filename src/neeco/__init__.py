@@ -1,3 +1,51 @@
-"""neeco: labelled images of surgical instruments in states nobody recorded."""
+"""Labelled images of surgical instruments in states nobody recorded, by deformable 3D Gaussian splatting.
 
-__version__ = "0.1.0"
+The names below are imported when they are first used, so that `import neeco` takes no PyTorch and under 0.1 s.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neeco.api import Scene, check, load, train
+    from neeco.capture import Camera, State, read_capture
+    from neeco.errors import NeecoError
+    from neeco.synthesis.torch_datasets import LabelledImages, LabelledStream, StoredImages, sample_states
+
+__version__ = "0.2.0"
+__all__ = [
+    "Camera",
+    "LabelledImages",
+    "LabelledStream",
+    "NeecoError",
+    "Scene",
+    "State",
+    "StoredImages",
+    "check",
+    "load",
+    "read_capture",
+    "sample_states",
+    "train",
+]
+
+_MODULES = {
+    "neeco.api": ("Scene", "check", "load", "train"),
+    "neeco.capture": ("Camera", "State", "read_capture"),
+    "neeco.errors": ("NeecoError",),
+    "neeco.synthesis.torch_datasets": ("LabelledImages", "LabelledStream", "StoredImages", "sample_states"),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'neeco' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,7 +18,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import Camera, rasterize
 from neeco.scene.io import load_scene
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 
@@ -63,7 +63,7 @@ def test_the_cameras_see_the_balls_where_they_are(script: ModuleType, folder: Pa
 
 
 def test_such_a_folder_is_learned_on_its_white_scored_and_drawn(folder: Path, tmp_path: Path) -> None:
-    config = training_config("3dgs", {"iterations": 60}, ["tissue_budget=2000"])
+    config = training_config("3dgs", {"iterations": 60}, ["max_tissue_gaussians=2000"])
     run_path = train(folder, tmp_path / "run", config)
     scene = load_scene(run_path / "scene.safetensors")
     assert scene.background == 1.0

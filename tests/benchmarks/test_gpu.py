@@ -114,14 +114,22 @@ def test_a_tile_is_walked_until_its_last_pixel_is_full(script: ModuleType) -> No
 
 
 @pytest.mark.parametrize("device", SLOW_ON_CPU)
-def test_training_and_synthesis_are_timed_too(
-    device: str, quick: ModuleType, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_training_and_synthesis_are_timed_too(device: str, quick: ModuleType, tmp_path: Path, capsys) -> None:
     scene = grasper_scene()
     capture = write_photographs(scene, tmp_path / "capture")
     run = write_run(scene, tmp_path / "run", capture)
-    monkeypatch.setattr("neeco.training.instruments.discovery.TISSUE_STEPS", 5)
-    words = ["--train", str(capture), "--iterations", "4", "--synthesize", str(run), "--count", "3"]
+    words = [
+        "--train",
+        str(capture),
+        "--iterations",
+        "4",
+        "--set",
+        "search.tissue_steps=5",
+        "--synthesize",
+        str(run),
+        "--count",
+        "3",
+    ]
     assert quick.main([*SMALL, "--device", device, *words, "--output", str(tmp_path / "out")]) == 0
     result = json.loads((tmp_path / "out" / "gpu.json").read_text())
     assert [row["device"] for row in result["train"]] == list(dict.fromkeys((device, "cpu")))

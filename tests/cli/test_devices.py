@@ -18,7 +18,7 @@ from neeco.raster import devices
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import StepResult
 from neeco.scene.training_views import TrainingViews
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
 from neeco.training.train import train
 

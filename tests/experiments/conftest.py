@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neeco.experiments.training_job import Budget, TrainingJob
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 
 
 @pytest.fixture(autouse=True)

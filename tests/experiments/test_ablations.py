@@ -29,14 +29,14 @@ from neeco.experiments.ablation_study import (
     table_of,
     write_tables,
 )
-from neeco.experiments.ablations import ABLATIONS, CHECKPOINTS, NEECO, PAPER, AblationPlan, Derived
+from neeco.experiments.ablations import CHECKPOINTS, AblationPlan, Derived, Variant, all_ablations
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.tables import latex_table
 from neeco.report.study_pages import write_ablation_report
-from neeco.training import train as train_module
+from neeco.settings import plain
 from neeco.training.run import read_config
 
-SMALL = ("deformation.width=8", "deformation.depth=2", "tissue_budget=120")
+SMALL = ("deformation.width=8", "deformation.depth=2", "max_tissue_gaussians=120")
 
 
 @pytest.fixture(autouse=True)
@@ -45,10 +45,10 @@ def no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def plan(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AblationPlan:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 2)
+def plan(capture: Path, tmp_path: Path) -> AblationPlan:
+    settings = (*SMALL, "log_interval=2")
     return AblationPlan(
-        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=SMALL, device="cpu"
+        capture, tmp_path / "out", ("uniform-motion", "density-off"), 12, 12, settings=settings, device="cpu"
     )
 
 
@@ -56,27 +56,25 @@ def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_sa
     told: set[str] = set()
     ablation = run_ablations(plan, progress=lambda news: told.add(news.job.name))
     names = ["neeco-no-uniform-motion", "neeco", "neeco-no-density"]
-    assert [run["name"] for run in ablation["runs"]] == names
+    assert [run["name"] for run in ablation.runs] == names
     assert told == set(names)
     configs = {name: read_config(plan.output / "runs" / name) for name in names}
     for config in configs.values():
         assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
         assert config["deformation"]["warm_up"] == 0.25
-        assert (config["iterations"], config["initial_points"], config["tissue_budget"]) == (12, 30, 120)
+        assert (config["iterations"], config["initial_points"], config["max_tissue_gaussians"]) == (12, 30, 120)
     changed = {key for key, value in configs["neeco-no-uniform-motion"].items() if value != configs["neeco"][key]}
     assert changed == {"schedule"}
     schedule = configs["neeco-no-uniform-motion"]["schedule"]
     assert {key for key in schedule if schedule[key] != configs["neeco"]["schedule"][key]} == {"frame_order"}
-    assert json.loads((plan.output / "ablation.json").read_text()) == ablation
-    uniform = ablation["tables"][0]
-    off, on = uniform["rows"]
-    assert (off["paper"], on["paper"]) == ({"psnr.test": 22.26}, {"psnr.test": 28.31})
-    assert off["difference"]["psnr.test"] == pytest.approx(
-        off["values"]["psnr.test"] - on["values"]["psnr.test"], abs=1e-4
-    )
-    assert off["values"]["psnr.test"] == ablation["runs"][0]["splits"]["test"]["psnr"]
-    assert off["agrees"]["psnr.test"] == direction(off["difference"]["psnr.test"], 22.26 - 28.31)
-    assert {row["label"] for row in uniform["curves"]} == {"off", "on"}
+    assert json.loads((plan.output / "ablation.json").read_text()) == plain(ablation)
+    uniform = ablation.tables[0]
+    off, on = uniform.rows
+    assert (off.paper, on.paper) == ({"psnr.test": 22.26}, {"psnr.test": 28.31})
+    assert off.difference["psnr.test"] == pytest.approx(off.values["psnr.test"] - on.values["psnr.test"], abs=1e-4)
+    assert off.values["psnr.test"] == ablation.runs[0]["splits"]["test"]["psnr"]
+    assert off.agrees["psnr.test"] == direction(off.difference["psnr.test"], 22.26 - 28.31)
+    assert {row["label"] for row in uniform.curves} == {"off", "on"}
 
 
 def test_a_second_start_trains_nothing_and_says_the_same(plan: AblationPlan, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,24 +93,23 @@ def test_a_run_that_fails_leaves_its_cells_empty(plan: AblationPlan, monkeypatch
 
     monkeypatch.setattr(training_job, "train", fails)
     ablation = run_ablations(plan)
-    assert ablation["failures"] == [{"run": "neeco-no-density", "error": "the loss became nan"}]
-    off, on = ablation["tables"][1]["rows"]
-    assert (off["values"], off["agrees"]) == ({}, {"psnr.test": None})
-    assert on["values"]["psnr.test"] > 5
-    assert "| off | worse | - | - |" in markdown(ablation["tables"][1])
+    assert ablation.failures == [{"run": "neeco-no-density", "error": "the loss became nan"}]
+    off, on = ablation.tables[1].rows
+    assert (off.values, off.agrees) == ({}, {"psnr.test": None})
+    assert on.values["psnr.test"] > 5
+    assert "| off | worse | - | - |" in markdown(ablation.tables[1])
 
 
 def test_runs_too_short_for_a_row_of_metrics_leave_the_first_phase_unknown(
-    plan: AblationPlan, monkeypatch: pytest.MonkeyPatch
+    plan: AblationPlan,
 ) -> None:
-    monkeypatch.setattr(train_module, "ROW_INTERVAL", 50)
-    ablation = run_ablations(replace(plan, tables=("uniform-motion",)))
+    ablation = run_ablations(replace(plan, tables=("uniform-motion",), settings=SMALL))
     assert not (plan.output / "runs" / "neeco" / "metrics.jsonl").exists()
-    assert ablation["failures"] == []
-    assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation["notes"])
-    for row in ablation["tables"][0]["rows"]:
-        assert row["values"]["phase_1_psnr"] is None
-        assert row["values"]["psnr.test"] > 5
+    assert ablation.failures == []
+    assert any(note.startswith("phase-1 PSNR: not known, phase 1 of 12 steps") for note in ablation.notes)
+    for row in ablation.tables[0].rows:
+        assert row.values["phase_1_psnr"] is None
+        assert row.values["psnr.test"] > 5
     assert write_ablation_report(plan.output, ablation).is_file()
 
 
@@ -125,14 +122,14 @@ def test_label_ways_are_scored_once_for_each_run(plan: AblationPlan, monkeypatch
 
     labels = AblationPlan(plan.capture, plan.output, ("labels",), 12, 12, settings=SMALL, device="cpu")
     monkeypatch.setattr(ablation_study, "run_jobs", lambda made, *_: [job.run() for job in made if _neeco(job)])
-    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [NEECO])
+    monkeypatch.setattr(ablation_study, "distinct_variants", lambda chosen: [Variant("neeco")])
     monkeypatch.setattr(ablation_study, "score_label_ways", score)
     for _ in range(2):
-        table = run_ablations(labels)["tables"][0]
+        table = run_ablations(labels).tables[0]
     assert asked == ["neeco"]
-    assert table["rows"][0]["values"] == {"mask_iou.test": 0.6, "mask_iou.unseen": 0.6}
-    assert table["rows"][0]["difference"]["mask_iou.test"] == pytest.approx(-0.3)
-    assert table["rows"][2]["values"] == {}  # the run that is not there
+    assert table.rows[0].values == {"mask_iou.test": 0.6, "mask_iou.unseen": 0.6}
+    assert table.rows[0].difference["mask_iou.test"] == pytest.approx(-0.3)
+    assert table.rows[2].values == {}  # the run that is not there
 
 
 def _neeco(job) -> bool:
@@ -172,14 +169,14 @@ def test_another_length_asks_for_another_output(plan: AblationPlan) -> None:
 
 
 def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_meanings() -> None:
-    for table in ABLATIONS.values():
+    for table in all_ablations().values():
         for comparison in table.comparisons:
             labels = [entry.label for entry in comparison.entries]
             assert comparison.reference in labels
             assert len(set(labels)) == len(labels)
     variants = distinct_variants(chosen_ablations(("paper", "ours")))
     assert len({variant.name for variant in variants}) == len(variants) == 26
-    published = [entry.paper for table in PAPER for item in table.comparisons for entry in item.entries]
+    published = [entry.paper for table in chosen_ablations(["paper"]) for entry in table.entries]
     assert sum(map(len, published)) == 9 + 4 * len(CHECKPOINTS) + 2
 
 
@@ -207,13 +204,15 @@ def test_a_checkpoint_is_the_nearest_row_of_its_split() -> None:
 
 
 def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> None:
-    table = table_of(ABLATIONS["sh-compensation"], {}, {}, {}, ("test",))
-    for row, psnr in zip(table["rows"], (20.0, 21.0, 23.0, 22.0), strict=True):
-        row["values"] = {key: psnr for key in table["judged"]}
-        if not row["reference"]:
-            row["difference"] = {key: psnr - 22.0 for key in table["judged"]}
-            row["agrees"] = {key: direction(psnr - 22.0, -1.0) for key in table["judged"]}
-    table["measures"] = table["judged"]
+    table = table_of(all_ablations()["sh-compensation"], {}, {}, {}, ("test",))
+    rows = []
+    for row, psnr in zip(table.rows, (20.0, 21.0, 23.0, 22.0), strict=True):
+        filled = replace(row, values=dict.fromkeys(table.judged, psnr))
+        if not row.reference:
+            agrees = dict.fromkeys(table.judged, direction(psnr - 22.0, -1.0))
+            filled = replace(filled, difference=dict.fromkeys(table.judged, psnr - 22.0), agrees=agrees)
+        rows.append(filled)
+    table = replace(table, rows=rows, measures=table.judged)
     assert agreement(table) == "8 of 12 as in the paper, 4 the other way"
     rows = list(csv.DictReader(io.StringIO(ablation_csv(table))))
     assert len(rows) == 4 * 4
@@ -229,9 +228,9 @@ def test_tables_are_written_for_programs_pages_and_papers(tmp_path: Path) -> Non
         "agrees": "yes",
     }
     assert "\n| both | 16.82 | 22.00 |  |" in markdown(table)
-    assert r"test PSNR at 20 \%: paper" in latex_table(grid(table), table["title"])
-    written = write_tables(tmp_path, {"tables": [table]})
-    assert [path.suffix for path in written] == [".csv", ".md", ".tex"]
+    assert r"test PSNR at 20 \%: paper" in latex_table(grid(table), table.title)
+    write_tables(tmp_path, [table])
+    assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv", ".md", ".tex"}
 
 
 def test_fewer_frames_are_spread_over_the_recording_and_all_others_stay(capture: Path, tmp_path: Path) -> None:

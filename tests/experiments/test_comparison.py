@@ -36,7 +36,7 @@ def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
 
 
 def compared(spec: ComparisonSpec, **told):
-    return compare(plan_comparison(spec), **told)
+    return plain(compare(plan_comparison(spec), **told))
 
 
 def without_times(value):
@@ -248,19 +248,19 @@ def test_a_method_that_needs_states_is_refused_on_a_capture_without(spec: Compar
 
 
 def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None:
-    given = ("tissue_budget=70", "deformation.width=16")
+    given = ("max_tissue_gaussians=70", "deformation.width=16")
     result = compared(replace(spec, methods=("3dgs", "neeco"), seeds=1, assignments=given))
     configs = {
         name: yaml.safe_load((spec.output / "runs" / f"{name}-seed0" / "config.yaml").read_text())
         for name in ("3dgs", "neeco")
     }
-    assert [configs[name]["tissue_budget"] for name in configs] == [70, 70]
+    assert [configs[name]["max_tissue_gaussians"] for name in configs] == [70, 70]
     assert configs["neeco"]["deformation"] == plain(method_settings("neeco", {"width": 16}))
     assert configs["3dgs"]["deformation"] == {}
     assert result["settings"] == list(given)
 
 
-@pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.moments=4", "no_such_field=1"])
+@pytest.mark.parametrize("given", ["seed=3", "iterations=5", "deformation.time_resolution=4", "no_such_field=1"])
 def test_a_setting_that_cannot_be_shared_is_refused(spec: ComparisonSpec, given: str) -> None:
     with pytest.raises(NeecoError, match="--set"):
         compared(replace(spec, assignments=(given,)))

@@ -24,7 +24,7 @@ from neeco.experiments.study import check_workers, run_jobs
 from neeco.experiments.training_job import UNLIMITED, Budget, HeldOutFrames
 from neeco.raster.native import set_threads
 from neeco.training import train as train_module
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
@@ -143,8 +143,8 @@ def test_a_damaged_curve_is_told_by_its_line(make_job) -> None:
 
 
 def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_module, "CHECKPOINT_INTERVAL", 5)
-    whole, cut = make_job(folder=tmp_path / "whole"), make_job(folder=tmp_path / "cut")
+    config = training_config("3dgs", {}, ["checkpoint_interval=5"])
+    whole, cut = (make_job(folder=tmp_path / name, config=config) for name in ("whole", "cut"))
     expected = whole.run()
     step = GaussianSession.step
 
@@ -238,7 +238,10 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
             {"budget": Budget(None, 12, "processor")},
             "budget: this run has 12 iterations, not 12 iterations, CPU time",
         ),
-        ({"config": training_config("3dgs", {"tissue_budget": 99})}, "tissue_budget: this run has 20000, not 99"),
+        (
+            {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
+            "max_tissue_gaussians: this run has 20000, not 99",
+        ),
     ],
 )
 def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, told, monkeypatch) -> None:

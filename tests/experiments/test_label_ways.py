@@ -8,7 +8,7 @@ import pytest
 
 from neeco.capture.writer import write_capture
 from neeco.experiments.masks import score_label_ways
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 

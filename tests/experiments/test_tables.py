@@ -13,10 +13,10 @@ from neeco.cli._output import fitted
 from neeco.experiments.comparison import (
     RUN_METRICS,
     SPLIT_METRICS,
+    ComparisonResult,
     comparison_csv,
-    latex_text,
-    markdown_text,
     summarise,
+    table_texts,
     tables_of,
 )
 from neeco.experiments.study import spread
@@ -31,20 +31,29 @@ def job(name: str, seed: int, psnr: float) -> dict[str, Any]:
 
 
 @pytest.fixture
-def comparison() -> dict[str, Any]:
+def comparison() -> ComparisonResult:
     jobs = [job(name, seed, value) for name, values in PSNR.items() for seed, value in enumerate(values)]
     jobs.append({"name": "lost", "method": "3dgs", "seed": 0, "error": "loss is 100% nan_", "splits": {}})
-    return {
-        "capture": "/data/my_capture",
-        "budget": {"minutes": 2.5, "iterations": None, "clock": "processor"},
-        "seeds": [0, 1],
-        "splits": ["test"],
-        "methods": [{"name": name, "method": "3dgs", "source": "train", "folder": "runs"} for name in PSNR],
-        "jobs": jobs,
-        "summary": summarise(list(PSNR), ["test"], jobs),
-        "machine": {"cpu": "C & U_1", "cores": 2, "threads": 2, "torch": "2", "workers": 1, "threads_per_worker": None},
-        "notes": ["lpips: a note with 5% in it"],
-    }
+    return ComparisonResult(
+        schema="neeco-comparison/1",
+        version="0.1.0",
+        complete=True,
+        capture="/data/my_capture",
+        machine={"cpu": "C & U_1", "cores": 2, "threads": 2, "torch": "2", "workers": 1, "threads_per_worker": None},
+        budget={"minutes": 2.5, "iterations": None, "clock": "processor"},
+        transforms="transforms.json",
+        settings=[],
+        seeds=[0, 1],
+        splits=["test"],
+        methods=[{"name": name, "method": "3dgs", "source": "train", "folder": "runs"} for name in PSNR],
+        jobs=jobs,
+        summary=summarise(list(PSNR), ["test"], jobs),
+        curves=[],
+        distance=[],
+        speed={"rows": []},
+        masks=[],
+        notes=["lpips: a note with 5% in it"],
+    )
 
 
 def test_spread_is_the_mean_and_the_sample_standard_deviation() -> None:
@@ -65,7 +74,7 @@ def test_equal_means_are_both_best_and_lower_lpips_is_better(comparison) -> None
 
 
 def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
-    page = markdown_text(comparison)
+    page = table_texts(comparison)["md"]
     assert "| a\\_b | **21.00** ± 1.41 | **0.100** ± 0.000 |" in page
     assert "| c\\|d | **21.00** ± 0.71 | 0.200 ± 0.000 |" in page
     assert "| lost | failed: loss is 100% nan\\_ |" in page
@@ -74,7 +83,7 @@ def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
 
 
 def test_latex_escapes_everything_and_stays_balanced(comparison) -> None:
-    text = latex_text(comparison)
+    text = table_texts(comparison)["tex"]
     assert r"a\_b & \textbf{21.00} $\pm$ 1.41 & \textbf{0.100} $\pm$ 0.000 \\" in text
     assert r"c\textbar{}d & " in text
     assert r"lost & failed &  \\" in text
@@ -106,7 +115,7 @@ def test_csv_keeps_every_digit_and_leaves_unknown_empty(comparison) -> None:
 
 
 @pytest.mark.parametrize("width", [40, 200])
-def test_the_terminal_shows_every_number_whole(comparison: dict[str, Any], width: int) -> None:
+def test_the_terminal_shows_every_number_whole(comparison: ComparisonResult, width: int) -> None:
     console = Console(width=width, record=True, file=io.StringIO())
     tables = tables_of(comparison)
     parts = [part for table in tables for part in fitted(table, width)]

@@ -19,15 +19,10 @@ from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.scene.deformations import kinematic
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.methods import METHODS
-from neeco.scene.nerfies.render import Rays
+from neeco.scene.nerfies.field import Rays
 from neeco.scene.scene import Scene
-from neeco.training import train as module
-from neeco.training.config import TrainConfig
-from neeco.training.instruments import discovery
-from neeco.training.options import training_config
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
@@ -36,13 +31,21 @@ STEPS = 40
 SMALL = {
     "neeco": ["deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
-    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.moments=5"],
+    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.time_resolution=5"],
     "nerfies": [
         f"deformation.{size}"
         for size in ("rays=64", "coarse_samples=6", "width=16", "depth=2", "warp_width=8", "warp_depth=2")
     ],
     # all that a long run does happens within 40 iterations
-    "kinematic": ["density_start=10", "refine.start=8", "schedule.plain_density.interval=15"],
+    "kinematic": [
+        "search.tissue_steps=60",
+        "density_start=10",
+        "refine.start=8",
+        "schedule.plain_density.interval=15",
+        "deformation.hinge_start=12",
+        "deformation.shadow_at=[10]",
+        "deformation.label_sharpness_start=14",
+    ],
 }
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
 # what three seeds differ by on the CPU, twice: on another device the frames that are drawn and the noise are others
@@ -53,15 +56,6 @@ USUALLY_DB = 1.0
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_photographs(grasper_scene(), tmp_path_factory.mktemp("gpu") / "capture")
-
-
-@pytest.fixture
-def early(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The instrument is looked for, moves and casts its shadow from the beginning."""
-    monkeypatch.setattr(discovery, "TISSUE_STEPS", 60)
-    monkeypatch.setattr(Kinematic, "learns_from", 12)
-    monkeypatch.setattr(kinematic, "SHADOW_AT", (10,))
-    monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
 
 
 def close(there: Tensor, here: Tensor, tolerance: float = 1e-3) -> bool:
@@ -105,7 +99,7 @@ def test_a_field_is_the_same_there(device: torch.device) -> None:
         scene = make_nerf(fine_samples=0).requires_grad_(True).to(where)
         directions = torch.nn.functional.normalize(torch.ones(7, 3), dim=-1).to(where)
         times = torch.zeros(7, dtype=torch.float64, device=where)
-        drawn = scene.trace(Rays(torch.zeros(7, 3, device=where), directions, times))
+        drawn = scene.render_rays(Rays(torch.zeros(7, 3, device=where), directions, times))
         drawn.coarse.color.square().sum().backward()
         return [drawn.coarse.color, *(p.grad for p in scene.parameters() if p.grad is not None)]
 
@@ -120,32 +114,27 @@ def psnr_of(run: Path) -> float:
 
 
 def config_of(method: str) -> TrainConfig:
-    return training_config(method, {"iterations": STEPS, "tissue_budget": 1000}, SMALL.get(method, []))
+    return training_config(method, {"iterations": STEPS, "max_tissue_gaussians": 1000}, SMALL.get(method, []))
 
 
 @slowly
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.usefixtures("early")
 def test_a_method_learns_there_as_well_as_here(
     method: str, device: torch.device, capture: Path, tmp_path: Path
 ) -> None:
     here = psnr_of(train(capture, tmp_path / "here", config_of(method)))
     there = psnr_of(train(capture, tmp_path / "there", config_of(method), device=device))
-    untrained = training_config(method, {"iterations": 1, "tissue_budget": 1000}, SMALL.get(method, []))
+    untrained = training_config(method, {"iterations": 1, "max_tissue_gaussians": 1000}, SMALL.get(method, []))
     assert here > psnr_of(train(capture, tmp_path / "untrained", untrained))
     assert there == pytest.approx(here, abs=LIKE_DB.get(method, USUALLY_DB))
 
 
 @slowly
-@pytest.mark.usefixtures("early")
-def test_an_instrument_is_found_there_and_an_interrupted_run_goes_on(
-    device: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_instrument_is_found_there_and_an_interrupted_run_goes_on(device: torch.device, tmp_path: Path) -> None:
     """Carving, the search for the hinge, its wrist and the shadow; on the CPU with the same bits."""
-    monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
-    monkeypatch.setattr(module, "ROW_INTERVAL", 1)
     capture = write_grasper(tmp_path / "capture", sizes=((80, 64), (64, 72)))
-    config = training_config("kinematic", {"iterations": STEPS}, SMALL["kinematic"])
+    settings = [*SMALL["kinematic"], "search.tissue_steps=100", "log_interval=1"]
+    config = training_config("kinematic", {"iterations": STEPS}, settings)
 
     def interrupt(row: ProgressRow) -> None:
         if row.iteration == 23 and not row.note:

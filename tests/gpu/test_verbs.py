@@ -17,10 +17,9 @@ from viewer_world import grasper_scene, write_photographs, write_run
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.scene import Scene
-from neeco.viewer.drawing import draw_run, scored
-from neeco.viewer.steering import Wishes
-from neeco.viewer.studio import Studio
-from neeco.viewer.views import IMAGE, views_of
+from neeco.viewer.controls import Controls
+from neeco.viewer.runs import ViewedRuns
+from neeco.viewer.views import IMAGE, render_run, scored, views_of
 
 slowly = pytest.mark.parametrize("word", SLOW_ON_CPU, indirect=True)
 Call = Callable[..., None]
@@ -137,12 +136,12 @@ def test_export_and_the_page_as_a_file(verb: Call, run: str) -> None:
 
 
 def test_the_viewer_draws_every_view(run: str, device: torch.device) -> None:
-    here, there = (Studio([Path(run)], where) for where in (torch.device("cpu"), device))
+    here, there = (ViewedRuns([Path(run)], where) for where in (torch.device("cpu"), device))
     loaded = there.loaded[0]
     assert loaded.scene.center.device.type == device.type
-    camera, wishes = loaded.recorded.cameras[2], Wishes(2.0)
+    camera, controls = loaded.recorded.cameras[2], Controls(2.0)
     for view in views_of(loaded.scene, bool(loaded.frames)):
-        drawn, expected = (draw_run(studio, 0, wishes, camera, 2, view) for studio in (there, here))
+        drawn, expected = (render_run(runs, 0, controls, camera, 2, view) for runs in (there, here))
         difference = np.abs(drawn.picture.pixels.astype(float) - expected.picture.pixels)
         assert (difference > 2).mean() < 0.01, view
     score = scored(there, 0, drawn).score
@@ -154,13 +153,13 @@ def test_the_viewer_says_that_a_gpu_failed_and_goes_on(run: str, monkeypatch: py
     def full(*words: object, **named: object) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB.")
 
-    studio = Studio([Path(run)])
-    camera, wishes = studio.loaded[0].recorded.cameras[2], Wishes(2.0)
+    runs = ViewedRuns([Path(run)])
+    camera, controls = runs.loaded[0].recorded.cameras[2], Controls(2.0)
     with monkeypatch.context() as patch:
         patch.setattr(Scene, "at", full)
         with pytest.raises(NeecoError, match=r"2\.50 GiB more were asked for"):
-            draw_run(studio, 0, wishes, camera, 2, IMAGE)
-    assert draw_run(studio, 0, wishes, camera, 2, IMAGE).picture.pixels.any()
+            render_run(runs, 0, controls, camera, 2, IMAGE)
+    assert render_run(runs, 0, controls, camera, 2, IMAGE).picture.pixels.any()
 
 
 @slowly

@@ -6,12 +6,13 @@ import base64
 import csv
 import io
 from contextlib import nullcontext
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 from html_page import HOSTILE, Page, check_hostile_names
 
-from neeco.experiments.comparison import summarise
+from neeco.experiments.comparison import ComparisonResult, summarise
 from neeco.report import study_pages
 from neeco.report.charts import Series, binned, legend, line_chart
 from neeco.report.study_pages import command_of, findings, leader, median_frame, write_comparison_report
@@ -45,32 +46,32 @@ def comparison_of(capture, jobs, seeds=(0, 1)):
     names = list(dict.fromkeys(entry["name"] for entry in jobs))
     done = [entry for entry in jobs if "error" not in entry]
     held_out = [(split, frame.name) for split in ("test", "unseen") for frame in capture.split(split)]
-    return {
-        "schema": "neeco-comparison/1",
-        "version": "0.1.0",
-        "complete": True,
-        "capture": str(capture.root),
-        "machine": {"cpu": "a <processor>", "cores": 2, "threads": 1, "workers": 1, "threads_per_worker": None,
+    return ComparisonResult(
+        schema="neeco-comparison/1",
+        version="0.1.0",
+        complete=True,
+        capture=str(capture.root),
+        machine={"cpu": "a <processor>", "cores": 2, "threads": 1, "workers": 1, "threads_per_worker": None,
                     "python": "3.11", "torch": "2.13", "backend": "cpu"},
-        "budget": {"minutes": None, "iterations": 60, "clock": "wall"},
-        "transforms": "transforms.json",
-        "settings": ["tissue_budget=500"],
-        "seeds": list(seeds),
-        "splits": ["test", "unseen"],
-        "methods": [{"name": name, "method": name, "source": "train", "folder": "runs"} for name in names],
-        "jobs": jobs,
-        "summary": summarise(names, ("test", "unseen"), jobs),
-        "curves": [
+        budget={"minutes": None, "iterations": 60, "clock": "wall"},
+        transforms="transforms.json",
+        settings=["max_tissue_gaussians=500"],
+        seeds=list(seeds),
+        splits=["test", "unseen"],
+        methods=[{"name": name, "method": name, "source": "train", "folder": "runs"} for name in names],
+        jobs=jobs,
+        summary=summarise(names, ("test", "unseen"), jobs),
+        curves=[
             {"name": entry["name"], "seed": entry["seed"], "seconds": 30.0 * k, "iteration": k, "split": split,
              "psnr": 10.0 + k + entry["seed"]}
             for entry in done for split in ("test", "unseen") for k in range(1, 11)
         ],
-        "distance": [
+        distance=[
             {"name": entry["name"], "seed": entry["seed"], "split": split, "frame": frame, "distance": 0.25 * index,
              "psnr": entry["splits"]["test"]["psnr"] - index, "psnr_instrument": 12.0 - index, "mask_iou": None}
             for entry in done for index, (split, frame) in enumerate(held_out)
         ],
-        "speed": {
+        speed={
             "rows": [
                 {"name": entry["name"], "seed": entry["seed"], "method": entry["name"], "backend": "cpu", "fps": 40.0,
                  "milliseconds": 25.0, "draws": 21, "num_gaussians": 1234}
@@ -78,8 +79,9 @@ def comparison_of(capture, jobs, seeds=(0, 1)):
             ],
             "image": [48, 40], "how": "1 / median",
         },
-        "notes": [],
-    }  # fmt: skip
+        masks=[],
+        notes=[],
+    )  # fmt: skip
 
 
 FAILED = {"name": "4dgs", "method": "4dgs", "seed": 0, "error": "config.yaml: <field>: wrong", "splits": {}}
@@ -123,7 +125,7 @@ def test_every_figures_data_is_in_the_page_and_beside_it(tmp_path, comparison, c
         (split, name, "0") for split in ("test", "unseen") for name in ("kinematic", "3dgs")
     ]
     assert float(frames[0]["psnr"]) > 40  # the scene drew the photographs itself
-    assert len(list(csv.DictReader(io.StringIO(beside["curves.csv"])))) == len(comparison["curves"])
+    assert len(list(csv.DictReader(io.StringIO(beside["curves.csv"])))) == len(comparison.curves)
 
 
 def test_means_spreads_the_best_and_what_is_missing_are_shown(tmp_path, comparison, capture):
@@ -155,10 +157,11 @@ def test_a_comparison_where_everything_failed_says_so(tmp_path, capture):
 
 
 def test_masks_of_others_stand_in_a_table_of_their_own(tmp_path, comparison, capture):
-    comparison["methods"].append({"name": "SAM2", "method": None, "source": "masks", "folder": "/masks/sam2"})
+    comparison.methods.append({"name": "SAM2", "method": None, "source": "masks", "folder": "/masks/sam2"})
     masks = [{"name": "SAM2", "split": "test", "iou": 0.7, "challenge_iou": 0.65, "dice": 0.8, "boundary_f": 0.9}]
-    names = [entry["name"] for entry in comparison["methods"]]
-    comparison["summary"] = summarise(names, comparison["splits"], comparison["jobs"], (), masks)
+    names = [entry["name"] for entry in comparison.methods]
+    summary = summarise(names, comparison.splits, comparison.jobs, (), masks)
+    comparison = replace(comparison, summary=summary)
     text, _ = page_of(tmp_path / "out", comparison, capture)
     assert "split test: masks" in text
     assert "split unseen: masks" not in text
@@ -168,7 +171,7 @@ def test_masks_of_others_stand_in_a_table_of_their_own(tmp_path, comparison, cap
 
 
 def test_a_comparison_that_goes_on_says_so(tmp_path, comparison, capture):
-    text, _ = page_of(tmp_path / "out", comparison | {"complete": False}, capture)
+    text, _ = page_of(tmp_path / "out", replace(comparison, complete=False), capture)
     assert "the numbers so far" in text
 
 
@@ -176,7 +179,7 @@ def test_the_frame_shown_is_the_median_over_all_methods(comparison, capture):
     shown = median_frame(comparison, capture, "test")
     assert shown is not None
     assert shown.name == capture.split("test")[1].name
-    comparison["distance"] = []
+    comparison = replace(comparison, distance=[])
     assert median_frame(comparison, capture, "unseen") == capture.split("unseen")[0]
     assert median_frame(comparison, capture, "novel_view") is None
 
@@ -201,20 +204,21 @@ def test_sentences_call_first_only_what_is_clear_of_the_spread():
 
 def test_sentences_go_split_by_split(comparison):
     told = findings(comparison)
-    assert told[0].startswith("test: kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
-    assert told[1].startswith("unseen: kinematic first")
-    assert "level in drawing speed" in told[2]
+    assert [split for split, _ in told] == ["test", "unseen", "", ""]
+    assert told[0][1].startswith("kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
+    assert told[1][1].startswith("kinematic first")
+    assert "level in drawing speed" in told[2][1]
 
 
 def test_one_seed_is_said_once(comparison):
-    assert not any("one seed" in sentence for sentence in findings(comparison))
-    for row in comparison["summary"]:
+    assert not any("one seed" in sentence for _, sentence in findings(comparison))
+    for row in comparison.summary:
         for value in row.values():
             if isinstance(value, dict) and value.get("std") is not None:
                 value["std"] = None
     told = findings(comparison)
-    assert sum("one seed" in sentence for sentence in told) == 1
-    assert "not known" not in told[0]
+    assert sum("one seed" in sentence for _, sentence in told) == 1
+    assert "not known" not in told[0][1]
 
 
 def test_charts_tell_methods_apart_without_colour():
@@ -246,8 +250,8 @@ def test_hostile_names_are_text_and_the_same_data_gives_the_same_page(world, tmp
     monkeypatch.setattr(study_pages, "open_run", lambda folder: opened)
     jobs = [job(f"{HOSTILE}{k}", seed, 24.0 + k, 0.8) for k in (0, 1) for seed in (0, 1)]
     comparison = comparison_of(capture, [*jobs, {**FAILED, "name": HOSTILE, "error": HOSTILE}])
-    comparison |= {"notes": [HOSTILE], "settings": [HOSTILE], "version": HOSTILE}
-    comparison["machine"]["cpu"] = HOSTILE
+    comparison = replace(comparison, notes=[HOSTILE], settings=[HOSTILE], version=HOSTILE)
+    comparison.machine["cpu"] = HOSTILE
     check_hostile_names(lambda: page_of(tmp_path / "out", comparison, capture)[0], VOID)
 
 

@@ -19,10 +19,9 @@ from neeco.raster.losses import photometric_loss
 from neeco.scene.deformations import hexplane, nps, time_mlp
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
 from neeco.scene.methods import METHODS
-from neeco.scene.nerfies import scene as nerf_scene
-from neeco.scene.nerfies import warp
-from neeco.scene.nerfies.render import Rays
-from neeco.scene.nerfies.session import elastic_loss, robust
+from neeco.scene.nerfies import field
+from neeco.scene.nerfies.field import Rays
+from neeco.scene.nerfies.session import elastic_loss, geman_mcclure
 from neeco.scene.scene import Scene
 
 META = torch.device("meta")
@@ -54,7 +53,7 @@ def test_a_moved_scene_is_the_same_scene() -> None:
 def test_posing_labels_and_deltas_stay_on_the_device(scene: Scene) -> None:
     state = scene.recorded.states[3]
     disturbed = [
-        scene.deformation.disturbed(Perturbation(0.3), 5_000, 0.1, np.random.default_rng(seed)) for seed in range(8)
+        scene.deformation.perturb(Perturbation(0.3), 5_000, 0.1, np.random.default_rng(seed)) for seed in range(8)
     ]
     for perturbation in (UNPERTURBED, *disturbed):
         posed = scene.at(state, perturbation)
@@ -85,11 +84,11 @@ def test_a_field_and_its_losses_stay_on_the_device() -> None:
     scene = make_nerf(fine_samples=5, appearance=2).requires_grad_(True).to(META)
     directions = torch.ones(7, 3, device=META)
     rays = Rays(torch.zeros(7, 3, device=META), directions, torch.zeros(7, dtype=torch.float64, device=META))
-    drawn = scene.trace(rays)
+    drawn = scene.render_rays(rays)
     assert drawn.fine is not None
-    moved = scene.warp(drawn.places[:, 0], drawn.codes, scene.opened)
-    elastic = elastic_loss(scene.warp.jacobian(drawn.places[:, 0], drawn.codes, scene.opened)).mean()
-    loss = drawn.fine.color.mean() + drawn.coarse.color.mean() + elastic + robust(moved.square().sum(-1)).mean()
+    moved = scene.warp(drawn.positions[:, 0], drawn.codes, scene.opened)
+    elastic = elastic_loss(scene.warp.jacobian(drawn.positions[:, 0], drawn.codes, scene.opened)).mean()
+    loss = drawn.fine.color.mean() + drawn.coarse.color.mean() + elastic + geman_mcclure(moved.square().sum(-1)).mean()
     loss.backward()
     assert all_meta(loss, *(parameter.grad for parameter in scene.parameters()))
     rendering = scene.render(scene.recorded.states[0], scene.recorded.cameras[0])
@@ -107,7 +106,7 @@ class TestProducts:
             asked.append(device)
             return nullcontext()
 
-        for module in (nps, time_mlp, hexplane, nerf_scene, warp):
+        for module in (nps, time_mlp, hexplane, field):
             monkeypatch.setattr(module, "tf32_products", note)
         return asked
 
@@ -117,5 +116,5 @@ class TestProducts:
 
     def test_the_networks_of_a_field(self, asked: list[torch.device]) -> None:
         scene = make_nerf(fine_samples=5).to(META)
-        scene.trace(Rays(*torch.ones(2, 7, 3, device=META), torch.zeros(7, dtype=torch.float64, device=META)))
+        scene.render_rays(Rays(*torch.ones(2, 7, 3, device=META), torch.zeros(7, dtype=torch.float64, device=META)))
         assert asked == [META] * 4  # coarse and fine, each through the warp

@@ -15,7 +15,8 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
-from neeco.scene.deformations.kinematic import PART_LOGITS, Spin
+from neeco.scene.deformations.kinematic import Kinematic, Spin
+from neeco.scene.instruments import PART_LOGITS
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
 UNIT = torch.nn.functional.normalize
@@ -96,7 +97,7 @@ def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene
             canonical = kinematic.canonical
             canonical.means[TISSUE] = hinges.tips[0, part]
             drawn = kinematic.at(grasper_state(POSE, reading)).means[TISSUE]
-            side = ("tip_left", "tip_right")[hinges.left_first(0).tolist().index(part)]
+            side = ("tip_left", "tip_right")[hinges.left_right_order(0).tolist().index(part)]
             told = kinematic.keypoints(grasper_state(POSE, reading))["grasper"][side]
             assert torch.allclose(told, drawn, atol=1e-3)
 
@@ -142,7 +143,7 @@ def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
             labels = kinematic.label_channels()[TISSUE:]
             turning = int(hinges.gains[0].abs().argmax())
             still = [names.index("jaw_left"), names.index("jaw_right")][
-                int(hinges.left_first(0).tolist().index(turning)) - 1
+                int(hinges.left_right_order(0).tolist().index(turning)) - 1
             ]
         assert torch.allclose(labels.sum(1), torch.ones(len(labels)))
         jaws = labels[:, 2:].sum(1)
@@ -187,6 +188,14 @@ def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
     distances = [torch.linalg.cross(p - origin, direction.expand_as(p)).norm(dim=1) for p in (points, spun)]
     assert torch.allclose(*distances, atol=1e-4)
     assert torch.allclose(hinges.along_shaft(spun), hinges.along_shaft(points), atol=1e-4)
+
+
+def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: Scene) -> None:
+    class Sways(Kinematic):
+        method = "sways"
+
+    assert kinematic.hinge_motion() is not None
+    assert Sways(kinematic.instruments).hinge_motion(kinematic.canonical) is None
 
 
 def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene) -> None:

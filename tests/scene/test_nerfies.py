@@ -7,19 +7,26 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scene_worlds import make_nerf
+from scene_worlds import make_nerf, rounding
 from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.raster.rotations import skew
-from neeco.scene.encoding import encode_by_octave, window
-from neeco.scene.nerfies.render import composite, even_depths, finer_depths
-from neeco.scene.nerfies.scene import NerfScene
-from neeco.scene.nerfies.session import elastic_loss, robust
-from neeco.scene.nerfies.settings import PUBLISHED, NerfiesSettings
-from neeco.scene.nerfies.warp import WarpField, move_by_screw
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.nerfies.field import (
+    PUBLISHED,
+    NerfiesSettings,
+    NerfScene,
+    WarpField,
+    composite,
+    encode_by_octave,
+    importance_depths,
+    move_by_screw,
+    octave_weights,
+    stratified_depths,
+)
+from neeco.scene.nerfies.session import elastic_loss, geman_mcclure
 from neeco.scene.scene import gaussian_scene
 
 
@@ -70,9 +77,9 @@ def test_a_scene_without_warp_looks_the_same_at_all_times() -> None:
 
 
 def test_frequencies_open_one_after_the_other() -> None:
-    assert window(torch.tensor(0.0), 4).tolist() == [0, 0, 0, 0]
-    torch.testing.assert_close(window(torch.tensor(1.5), 4), torch.tensor([1.0, 0.5, 0.0, 0.0]))
-    assert window(torch.tensor(4.0), 4).tolist() == [1, 1, 1, 1]
+    assert octave_weights(torch.tensor(0.0), 4).tolist() == [0, 0, 0, 0]
+    torch.testing.assert_close(octave_weights(torch.tensor(1.5), 4), torch.tensor([1.0, 0.5, 0.0, 0.0]))
+    assert octave_weights(torch.tensor(4.0), 4).tolist() == [1, 1, 1, 1]
     values = torch.tensor([[0.25, -0.5]])
     coded = encode_by_octave(values, 2, torch.tensor(1.0))
     assert coded.shape == (1, 10)
@@ -87,7 +94,7 @@ def test_frequencies_open_one_after_the_other() -> None:
 
 def test_a_slab_of_known_density_absorbs_as_it_must() -> None:
     """Density 0.02 / mm from 30 to 60 mm before nothing: alpha 1 - exp(-0.6); depth by integrating it."""
-    depths = even_depths(3000, torch.tensor([20.0, 80.0]), 1, None).double()
+    depths = stratified_depths(3000, torch.tensor([20.0, 80.0]), 1, None).double()
     inside = (depths > 30) & (depths < 60)
     colors = torch.ones(1, 3000, 3, dtype=torch.float64) * torch.tensor([1.0, 0.5, 0.0])
     drawn = composite(inside * 0.01, colors, depths, torch.tensor([2.0], dtype=torch.float64))
@@ -106,11 +113,11 @@ def test_the_last_sample_stands_for_all_behind_it_in_colour_alone() -> None:
 
 
 def test_finer_samples_lie_where_the_weight_is() -> None:
-    depths = even_depths(20, torch.tensor([0.0, 20.0]), 2, None)
+    depths = stratified_depths(20, torch.tensor([0.0, 20.0]), 2, None)
     weights = torch.zeros(2, 20)
     weights[:, 7] = 1.0
     for generator in (None, torch.Generator().manual_seed(0)):
-        finer = finer_depths(depths, weights, 40, generator)
+        finer = importance_depths(depths, weights, 40, generator)
         assert finer.shape == (2, 60)
         assert bool((finer.diff(dim=1) >= 0).all())
         assert int(((finer >= 7) & (finer <= 8)).sum(1).min()) >= 40
@@ -121,7 +128,7 @@ def test_a_rigid_motion_strains_nothing_and_a_stretch_does() -> None:
     assert float(elastic_loss(turn)) < 1e-9
     stretched = torch.diag(torch.tensor([1.0, 1.0, math.exp(0.06)]))[None]
     assert float(elastic_loss(stretched)) == pytest.approx(0.03 * 2 * 0.0036 / (0.0036 + 0.0036), rel=1e-4)
-    assert float(robust(torch.tensor(1e6))) == pytest.approx(0.06, rel=1e-3)
+    assert float(geman_mcclure(torch.tensor(1e6))) == pytest.approx(0.06, rel=1e-3)
     wanted = turn.clone().requires_grad_(True)
     elastic_loss(wanted * torch.tensor([1.0, 2.0, 1.0])).sum().backward()
     assert torch.isfinite(wanted.grad).all()
@@ -149,14 +156,19 @@ def test_codes_lie_between_their_neighbours_in_time() -> None:
 
 
 def test_drawing_in_chunks_changes_nothing_and_says_where_things_are() -> None:
-    scene = make_nerf()
+    octaves = 3  # few: the last one multiplies what the warp rounds by 2^2 pi
+    scene = make_nerf(frequencies=octaves, warp_frequencies=octaves)
     state, camera = scene.recorded.states[1], scene.recorded.cameras[1]
     drawn = scene.render(state, camera, labels=True)
     assert drawn.color.shape == (6, 8, 3)
     assert drawn.channels is None
     assert bool(((drawn.depth >= 20) & (drawn.depth <= 80))[drawn.alpha > 1e-6].all())
     scene.settings = replace(scene.settings, chunk=1000)
-    torch.testing.assert_close(scene.render(state, camera).color, drawn.color, atol=1e-4, rtol=0)
+    moved = rounding(1.0, 8 * 3 + 3 * (1 + 2 * octaves) + 8)  # places in [-1, 1], through the warp
+    tolerance = math.pi * 2 ** (octaves - 1) * moved + rounding(1.0, 8 * 2 + 3 * (1 + 2 * octaves))
+    whole = scene.render(state, camera).color
+    torch.testing.assert_close(whole, drawn.color, atol=tolerance, rtol=0)
+    assert float((whole - whole.mean((0, 1))).abs().max()) > 10 * tolerance  # pixels differ by more
 
 
 def test_what_needs_gaussians_is_refused_in_one_line() -> None:

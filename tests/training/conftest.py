@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from neeco.training import train as module
-
 sys.path.insert(0, str(Path(__file__).parent))
 
 from capture_files import write_capture
@@ -23,10 +21,3 @@ def one_thread() -> None:
 def capture(tmp_path: Path) -> Path:
     """A small capture of two splits on disk."""
     return write_capture(tmp_path / "capture")
-
-
-@pytest.fixture
-def short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows and checkpoints often enough for runs of a few dozen steps."""
-    monkeypatch.setattr(module, "ROW_INTERVAL", 5)
-    monkeypatch.setattr(module, "CHECKPOINT_INTERVAL", 20)

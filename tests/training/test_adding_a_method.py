@@ -23,7 +23,7 @@ from neeco.raster import Camera, Gaussians, rasterize
 from neeco.scene import deformations, methods
 from neeco.scene.io import load_scene
 from neeco.settings import plain
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 

@@ -9,7 +9,8 @@ import torch
 
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
+from neeco.training.config import DensityConfig
+from neeco.training.density import GradientStatistics, control_density, reset_opacity
 
 
 def two_bodies(size: float) -> CanonicalGaussians:
@@ -30,10 +31,11 @@ def steep(canonical: CanonicalGaussians, *rows: int) -> GradientStatistics:
     return statistics
 
 
-def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None, lost=None):
-    limits = [BodyLimit(count, 1.0) for count in most]
+def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None, unsupported=None):
     generator = torch.Generator().manual_seed(0)
-    return control_density(canonical, adam or Adam(), statistics, limits, threshold, generator, lost)
+    return control_density(
+        canonical, adam or Adam(), statistics, most, 1.0, threshold, generator, DensityConfig(), unsupported
+    )
 
 
 def test_a_small_gaussian_is_cloned_where_it_is() -> None:
@@ -62,12 +64,12 @@ def test_a_transparent_gaussian_goes() -> None:
     assert 102.0 not in after.means[:, 0]
 
 
-def test_what_is_lost_goes_however_opaque_and_steep() -> None:
+def test_an_unsupported_gaussian_goes_however_opaque_and_steep() -> None:
     before = two_bodies(0.5)
-    lost = torch.zeros(15, dtype=torch.bool)
-    lost[[3, 11]] = True
-    after = change(before, steep(before, 3, 5), lost=lost)
-    assert after.counts == (10, 4)  # one lost, one cloned; one lost
+    unsupported = torch.zeros(15, dtype=torch.bool)
+    unsupported[[3, 11]] = True
+    after = change(before, steep(before, 3, 5), unsupported=unsupported)
+    assert after.counts == (10, 4)  # one removed, one cloned; one removed
     assert not (after.means == before.means[3]).all(1).any()
 
 
@@ -112,7 +114,7 @@ def test_an_opacity_reset_lowers_the_high_ones_keeps_the_low_ones_and_forgets_th
         tensor = canonical.tensors()[name].requires_grad_(True)
         tensor.grad = torch.ones_like(tensor)
         adam.step([(name, tensor, 0.0)])
-    reset_opacity(canonical, adam)
+    reset_opacity(canonical, adam, 0.01)
     ceiling = math.log(0.01 / 0.99)
     assert torch.equal(canonical.opacity_logits.detach(), before.clamp(max=ceiling))
     assert bool((before > ceiling).any())

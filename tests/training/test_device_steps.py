@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -22,9 +21,8 @@ from neeco.capture.model import Frame
 from neeco.scene.methods import METHODS
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as module
-from neeco.training.options import training_config
-from neeco.training.refinement import Refinement
-from neeco.training.session import GaussianSession, pose_order
+from neeco.training.config import training_config
+from neeco.training.session import GaussianSession
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -80,7 +78,7 @@ class SeenNumbers(TorchFunctionMode):
         return out
 
 
-def session_on_meta(method: str, views_per_step: int) -> GaussianSession:
+def session_on_meta(method: str, batch_size: int) -> GaussianSession:
     """In mid-run, with everything refined that can be."""
     scene = make_scene(method).to(META)
     states = scene.recorded.states
@@ -88,20 +86,16 @@ def session_on_meta(method: str, views_per_step: int) -> GaussianSession:
     size = CAMERA.height, CAMERA.width
     image, mask = torch.zeros(*size, 3, dtype=torch.uint8, device=META), torch.ones(size, dtype=torch.bool, device=META)
     refine = [f"refine.{part}=true" for part in ("registration", "latency", "frame_poses", "cameras")]
-    config = training_config(method, {"iterations": 20_000, "views_per_step": views_per_step}, refine)
-    names = tuple(instrument.name for instrument in scene.instruments)
+    config = training_config(method, {"iterations": 20_000, "batch_size": batch_size}, refine)
     session = GaussianSession(
         scene,
         config.length,
         torch.Generator(),  # "meta" has none of its own
         TrainingViews(frames, (image,) * len(frames), (mask,) * len(frames)),
         print,
-        views_per_step,
+        batch_size,
         config,
-        pose_order(frames, names),
         50.0,
-        Refinement(config.refine, frames, names, META),
-        np.random.default_rng(0),
     )
     session.start()
     session.iteration = 5_000
@@ -109,10 +103,10 @@ def session_on_meta(method: str, views_per_step: int) -> GaussianSession:
 
 
 @pytest.mark.parametrize(
-    ("method", "views_per_step"), [*((name, 1) for name, kind in METHODS.items() if kind.has_gaussians), ("neeco", 3)]
+    ("method", "batch_size"), [*((name, 1) for name, kind in METHODS.items() if kind.has_gaussians), ("neeco", 3)]
 )
 def test_a_step_asks_the_device_once_and_copies_nothing_there(
-    method: str, views_per_step: int, monkeypatch: pytest.MonkeyPatch
+    method: str, batch_size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
 
@@ -122,13 +116,13 @@ def test_a_step_asks_the_device_once_and_copies_nothing_there(
         return [0.1] * len(scalars)
 
     monkeypatch.setattr(module, "numbers", numbers)
-    session = session_on_meta(method, views_per_step)
+    session = session_on_meta(method, batch_size)
     session.step()  # what is kept is copied now
     watched = Watched()
     with SeenTensors(watched), SeenNumbers(watched):
         monkeypatch.setattr(module, "rasterize", watched.aside(module.rasterize))
         monkeypatch.setattr(module, "photometric_loss", watched.aside(module.photometric_loss))
         session.step()
-    assert asked == [3 * views_per_step] * 2
+    assert asked == [3 * batch_size] * 2
     assert watched.copied == []
-    assert session.iteration == 5_000 + 2 * views_per_step
+    assert session.iteration == 5_000 + 2 * batch_size

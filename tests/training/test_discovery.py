@@ -14,16 +14,20 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.scene.hinges import Hinges
+from neeco.scene.instruments import Hinges
 from neeco.scene.training_views import TrainingViews
-from neeco.training.initial import gaussian_session, initial_scene
+from neeco.training.config import SearchConfig, training_config
+from neeco.training.initial import begin_session, initial_scene
 from neeco.training.instruments import discovery
-from neeco.training.instruments.carving import CarvedShape, carve
-from neeco.training.instruments.discovery import at_middle, shape_around_frame, tissue_evidence
-from neeco.training.instruments.evidence import Evidence
-from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
-from neeco.training.options import training_config
+from neeco.training.instruments.discovery import (
+    search_hinge,
+    shape_around_frame,
+    tissue_evidence,
+    unbend_seeds,
+)
+from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
 
+SEARCH = SearchConfig(seeds=500)
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0
 HINGE_ANGLE = 0.9  # rad about the shaft, in the true shaft frame
 
@@ -86,7 +90,7 @@ def found(mounting: str) -> tuple[Evidence, CarvedShape, Tensor]:
     """(evidence, carved shape, true-shaft-frame from carved-shaft-frame)."""
     shaft_from_sensor = MOUNTINGS[mounting]
     evidence = make_evidence(shaft_from_sensor)
-    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
     assert shape is not None
     return evidence, shape, shaft_from_sensor.float() @ shape.instrument_from_shaft
 
@@ -103,12 +107,13 @@ def test_the_shaft_axis_is_carved_however_the_sensor_is_mounted(mounting: str) -
 @pytest.mark.parametrize("mounting", MOUNTINGS)
 def test_the_hinge_is_found_without_training(mounting: str) -> None:
     evidence, shape, true_from_carved = found(mounting)
-    guesses = search_hinge(evidence, "tool", "jaw", shape)
-    angle = dominant_angle(guesses)
+    hinge = search_hinge(evidence, "tool", "jaw", shape, SEARCH)
+    assert hinge is not None
+    angle = hinge.angle
     axis = true_from_carved[:3, :3] @ torch.tensor([math.cos(angle), math.sin(angle), 0.0])
     truth = torch.tensor([math.cos(HINGE_ANGLE), math.sin(HINGE_ANGLE), 0.0])
     assert math.degrees(math.acos(min(1.0, abs(float(axis @ truth))))) < 20
-    pivot = true_from_carved @ torch.tensor([0.0, 0.0, balanced_depth(guesses), 1.0])
+    pivot = true_from_carved @ torch.tensor([0.0, 0.0, hinge.depth, 1.0])
     assert abs(float(pivot[2]) - PIVOT_MM) < 7  # training takes it from here
 
 
@@ -116,7 +121,7 @@ def test_an_instrument_much_thinner_than_the_first_grid_is_carved() -> None:
     """On the real dVRK recording, whether an arm was found at all hung on where the grid's points fell."""
     shaft_from_sensor = rigid_from_vector(torch.tensor([0.5, -0.7, 0.3, 7.4, -1.6, 6.0], dtype=torch.float64))
     evidence = make_evidence(shaft_from_sensor, thickness=0.08)
-    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
     assert shape is not None
     direction = (shaft_from_sensor.float() @ shape.instrument_from_shaft)[:3, 2]
     assert math.degrees(math.acos(min(1.0, float(direction[2])))) < 5
@@ -126,7 +131,7 @@ def test_background_that_nothing_explains_is_not_carved() -> None:
     """A third of the still image is always evident; the instrument, which moves a little, is found beside it."""
     evidence = make_evidence(MOUNTINGS["straight"], motion=0.5)
     evidence.hits[:, :, :55] = 1
-    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), 500)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
     assert shape is not None
     direction, origin = shape.instrument_from_shaft[:3, 2], shape.instrument_from_shaft[:3, 3]
     assert math.degrees(math.acos(float(direction[2]))) < 8
@@ -143,7 +148,7 @@ def test_nothing_is_carved_where_poses_have_nothing_to_do_with_the_images() -> N
         evidence.intrinsics,
         evidence.frames,
     )
-    assert carve(shuffled, "tool", torch.Generator().manual_seed(0), 500) is None
+    assert carve(shuffled, "tool", torch.Generator().manual_seed(0), SEARCH) is None
 
 
 def test_a_joint_that_stands_still_gives_no_hinge() -> None:
@@ -158,17 +163,15 @@ def test_a_joint_that_stands_still_gives_no_hinge() -> None:
         for f in evidence.frames
     )
     frozen = Evidence(evidence.hits, evidence.depths, evidence.camera_from_world, evidence.intrinsics, still)
-    assert search_hinge(frozen, "tool", "jaw", shape) == []
+    assert search_hinge(frozen, "tool", "jaw", shape, SEARCH) is None
 
 
-def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path) -> None:
     """Five steps: longer, and the tissue's Gaussians would grow over what is behind them."""
-    monkeypatch.setattr(discovery, "TISSUE_STEPS", 5)
-    monkeypatch.setattr(discovery, "LONGER_STEPS", 5)
     capture = read_capture(write_capture(tmp_path / "capture"))
     frames = capture.split("train")
     white = tuple(torch.full((24, 32, 3), 255, dtype=torch.uint8) for _ in frames)
-    config = training_config("kinematic", {})
+    config = training_config("kinematic", {}, ["search.tissue_steps=5", "search.long_tissue_steps=5"])
     scene = initial_scene(capture, frames, config, print)
     scene.background = 1.0  # as of images cut out of their surroundings
     evidence = tissue_evidence(scene, TrainingViews(frames, white, (None,) * len(frames)), config)
@@ -179,7 +182,7 @@ def test_without_instruments_there_is_nothing_to_look_for(tmp_path: Path, monkey
     monkeypatch.setattr(discovery, "tissue_evidence", lambda *_: pytest.fail("fitted the tissue for nothing"))
     capture = read_capture(write_capture(tmp_path / "capture", instruments=False))
     views = TrainingViews.read(capture.split("train"))
-    session = gaussian_session(capture, views, training_config("kinematic", {}), print)
+    session = begin_session(capture, views, training_config("kinematic", {}), print)
     assert session.scene.canonical.counts == (150,)
     session.step()
 
@@ -194,22 +197,28 @@ def test_seeds_stand_at_the_middle_reading_where_offsets_are_nothing() -> None:
     logits = torch.zeros(50, 3)
     logits[:20, 0] = logits[20:35, 1] = logits[35:, 2] = 40.0
     before = hinges.bend(seeds, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0]
-    moved = at_middle(hinges, seeds, logits)
+    moved = unbend_seeds(hinges, seeds, logits)
     assert not bool(hinges.offsets.any())
-    assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=1e-4)
-    assert torch.allclose(moved[:20], seeds[:20], atol=1e-5)
+    # two turns of at most ten roundings each of coordinates up to |seeds|
+    rounding = 20 * 2**-24 * float(seeds.abs().max())
+    assert torch.allclose(hinges.bend(moved, torch.softmax(logits, -1), {"jaw_angle": 0.9})[0], before, atol=rounding)
+    assert torch.allclose(moved[:20], seeds[:20], atol=rounding)
     assert (moved[20:] - seeds[20:]).norm(dim=1).max() > 0.1
 
 
 def test_the_search_makes_every_tensor_where_the_evidence_is() -> None:
     """What is made without saying where would be on "meta" here, and meeting the evidence there would fail."""
     evidence, shape, _ = found("straight")
-    guesses = search_hinge(evidence, "tool", "jaw", shape)
+    hinge = search_hinge(evidence, "tool", "jaw", shape, SEARCH)
+    assert hinge is not None
     with torch.device("meta"):
-        again = carve(evidence, "tool", torch.Generator("cpu").manual_seed(0), 500)
+        again = carve(evidence, "tool", torch.Generator("cpu").manual_seed(0), SEARCH)
         assert again is not None
-        around = shape_around_frame(again, evidence.distance, torch.Generator("cpu").manual_seed(0))
-        assert search_hinge(evidence, "tool", "jaw", again) == guesses
+        around = shape_around_frame(again, evidence.distance, 500, torch.Generator("cpu").manual_seed(0))
+        repeated = search_hinge(evidence, "tool", "jaw", again, SEARCH)
+        assert repeated is not None
+        assert np.array_equal(repeated.score, hinge.score)
+        assert np.array_equal(repeated.over_rigid, hinge.over_rigid)
     tensors = (again.instrument_from_shaft, again.center_line, again.seeds, around.instrument_from_shaft, around.seeds)
     assert not any(tensor.is_meta for tensor in tensors)
     assert torch.equal(again.seeds, shape.seeds)

@@ -21,15 +21,12 @@ from neeco.capture import check
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY
-from neeco.training.checkpoint import checkpoint_path, read_checkpoint
-from neeco.training.options import training_config
-from neeco.training.run import load_run
+from neeco.training.config import training_config
+from neeco.training.run import checkpoint_path, load_run, read_checkpoint
 from neeco.training.train import ProgressRow, train
 
-CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
-
-
-pytestmark = pytest.mark.usefixtures("short_intervals")
+SHORT = ["density_start=10", "density_stop=0.9", "log_interval=5", "checkpoint_interval=20"]
+CONFIG = training_config("3dgs", {"iterations": 60}, SHORT)
 
 
 def hidden_files(folder: Path) -> list[Path]:
@@ -111,7 +108,7 @@ def test_a_run_of_another_version_is_refused_by_file_and_field(capture: Path, tm
         with pytest.raises(NeecoError, match=rf"config.yaml: {line.partition(':')[0]}: is not as neeco writes it"):
             load_run(run)
 
-    for line in ("minutes: -0.0", "iterations: 0", "views_per_step: 0", "seed: -1"):
+    for line in ("minutes: -0.0", "iterations: 0", "batch_size: 0", "seed: -1"):
         (run / "config.yaml").write_text(config + line + "\n")
         with pytest.raises(
             NeecoError, match=rf"config.yaml: --{line.partition(':')[0].replace('_', '-')}: .*; train again"

@@ -13,18 +13,14 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import rasterize
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.hinges import PART_LOGITS, Hinges
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
-from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import TrainConfig
-from neeco.training.instruments import wrist
-from neeco.training.instruments.border import color_boundary
-from neeco.training.instruments.extend import extend_shaft, shaft_coverage
-from neeco.training.instruments.finish import conclude
-from neeco.training.instruments.solid import measure_radius
-from neeco.training.instruments.wrist import place_wrists, replace_wrists
+from neeco.training.config import SearchConfig, TrainConfig
+from neeco.training.instruments.finish import conclude, extend_shaft, shaft_coverage
+from neeco.training.instruments.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
 
 
@@ -141,9 +137,10 @@ def test_the_colours_border_is_found_to_a_fraction_of_the_radius(session: Gaussi
 
 
 def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
-    session: GaussianSession, monkeypatch: pytest.MonkeyPatch
+    session: GaussianSession,
 ) -> None:
-    monkeypatch.setattr(wrist, "ROLLS", (math.pi / 4, -math.pi / 4))  # the rings have eight Gaussians each
+    search = SearchConfig(spin_angle=math.pi / 4)  # the rings have eight Gaussians each
+    session.config = replace(session.config, search=search)
     hinges = hinges_of(session)
     hinges.wrist_start.fill_(3.0)
     replace_wrists(session, session.scene.deformation)

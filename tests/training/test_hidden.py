@@ -6,14 +6,14 @@ import torch
 from ball_world import RADIUS, ball_scene
 from rod_world import WALL_MM
 
-from neeco.training.instruments.hidden import drop_hidden
+from neeco.training.instruments.finish import drop_occluded
 
 PLACES = [(0.0, 0.0, 60.0), (10.0, 5.0, 65.0), (-12.0, 3.0, 70.0), (4.0, -6.0, 55.0), (0.0, 9.0, 62.0)]
 
 
 def test_a_ball_before_the_wall_keeps_its_inside_and_its_back() -> None:
     scene = ball_scene("ball", PLACES)
-    kept = drop_hidden(scene)
+    kept = drop_occluded(scene)
     assert kept.counts == scene.canonical.counts
     assert torch.equal(kept.means, scene.canonical.means)
 
@@ -32,7 +32,7 @@ def test_what_lies_behind_the_wall_is_dropped_and_what_comes_out_in_some_frames_
         [torch.linspace(-1, 1, 100), torch.full((100,), RADIUS + 3.0), torch.full((100,), WALL_MM - 61.0)], 1
     )
     scene.canonical = canonical.map(lambda tensor: means if tensor is canonical.means else tensor)
-    kept = drop_hidden(scene)
+    kept = drop_occluded(scene)
     left = kept.means[kept.body(1)]
     far = left[:, 2] > 50
     assert int(far.sum()) < 60  # those that stand behind other hidden ones even when the ball is drawn alone
@@ -41,4 +41,4 @@ def test_what_lies_behind_the_wall_is_dropped_and_what_comes_out_in_some_frames_
 
 def test_without_frames_nothing_is_dropped() -> None:
     scene = ball_scene("ball", [])
-    assert drop_hidden(scene).counts == scene.canonical.counts
+    assert drop_occluded(scene).counts == scene.canonical.counts

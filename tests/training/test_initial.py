@@ -11,6 +11,7 @@ import torch
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.rotations import rigid_from_vector
+from neeco.training.config import TrainConfig
 from neeco.training.initial import moving_joints
 
 ARM = Instrument("arm", {"insertion": None, "jaw": (0.0, 1.0), "stuck": None})
@@ -33,16 +34,16 @@ def frames(count: int = 40, cameras: int = 1) -> tuple[Frame, ...]:
 @pytest.mark.parametrize("cameras", [1, 6])
 def test_a_joint_that_follows_from_the_pose_moves_no_part_and_is_named(cameras: int) -> None:
     told: list[str] = []
-    assert moving_joints(ARM, frames(cameras=cameras), None, told.append) == ("jaw", "stuck")
+    assert moving_joints(ARM, frames(cameras=cameras), TrainConfig(), told.append) == ("jaw", "stuck")
     assert told == ["arm: joint insertion follows from the pose; it moves no part of its own"]
 
 
 def test_joints_that_are_asked_for_are_taken_as_given() -> None:
     told: list[str] = []
-    assert moving_joints(ARM, frames(), ("insertion",), told.append) == ("insertion",)
+    assert moving_joints(ARM, frames(), TrainConfig(joints=("insertion",)), told.append) == ("insertion",)
     assert told == []
 
 
 def test_a_joint_that_is_not_there_is_refused_by_name() -> None:
     with pytest.raises(NeecoError, match="--joints: arm has no joint 'jow'; it has insertion, jaw, stuck"):
-        moving_joints(ARM, frames(), ("jow",), print)
+        moving_joints(ARM, frames(), TrainConfig(joints=("jow",)), print)

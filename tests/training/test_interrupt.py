@@ -11,24 +11,19 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from neeco.cli import main
 from neeco.training import train as module
-from neeco.training.interrupt import hearing_stops
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.session import GaussianSession
-from neeco.training.train import ProgressRow, train
+from neeco.training.train import ProgressRow, deferred_interrupts, train
 
 PROGRAM = [sys.executable, "-c", "import sys; from neeco.cli import main; sys.exit(main())"]
-CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9"])
-
-
-@pytest.fixture(autouse=True)
-def rows_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ROW_INTERVAL", 1)
+CONFIG = training_config("3dgs", {"iterations": 60}, ["density_start=10", "density_stop=0.9", "log_interval=1"])
 
 
 def signalling(stop: int, *signals: int):
@@ -62,10 +57,8 @@ def test_a_stopped_run_keeps_its_last_step_and_ends_in_the_same_bytes(
     assert (tmp_path / "cut" / "scene.safetensors").read_bytes() == (whole / "scene.safetensors").read_bytes()
 
 
-def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "ROW_INTERVAL", 10)
+def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(capture: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, log_interval=10)
 
     def rows(folder: Path) -> list[dict]:
         lines = (folder / "metrics.jsonl").read_text().splitlines()
@@ -75,10 +68,10 @@ def test_rows_after_going_on_average_over_the_steps_before_the_stop_too(
         if session.iteration == 17:
             os.kill(os.getpid(), signal.SIGINT)
 
-    train(capture, tmp_path / "whole", CONFIG)
+    train(capture, tmp_path / "whole", config)
     with pytest.raises(KeyboardInterrupt, match="at iteration 17"):
-        train(capture, tmp_path / "cut", CONFIG, watch=stop_within_the_row)
-    train(capture, tmp_path / "cut", CONFIG, resume=True)
+        train(capture, tmp_path / "cut", config, watch=stop_within_the_row)
+    train(capture, tmp_path / "cut", config, resume=True)
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
 
 
@@ -111,7 +104,7 @@ def test_ctrl_c_before_the_first_step_leaves_nothing(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "gaussian_session", interrupted)
+    monkeypatch.setattr(module, "begin_session", interrupted)
     assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
     assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
     assert not (tmp_path / "runs").exists()
@@ -131,14 +124,14 @@ def test_the_command_line_tells_how_to_go_on_and_going_on_works(capture: Path, t
     last = told.strip().splitlines()[-1]
     found = re.fullmatch(r"neeco: interrupted: at iteration (\d+); go on with: neeco (.*)", last)
     assert found, told
-    assert int(found[1]) % module.CHECKPOINT_INTERVAL != 0  # so the checkpoint was written for this stop
+    assert int(found[1]) % CONFIG.checkpoint_interval != 0  # so the checkpoint was written for this stop
     assert shlex.split(found[2]) == ["train", str(capture), "--output", str(tmp_path / "my run"), "--resume"]
-    from neeco.training.checkpoint import read_checkpoint
+    from neeco.training.run import read_checkpoint
 
     assert read_checkpoint(tmp_path / "my run")[1]["iteration"] == int(found[1])
 
 
-def test_outside_the_main_thread_training_works_and_hears_nothing(capture: Path, tmp_path: Path) -> None:
+def test_outside_the_main_thread_training_works_and_catches_no_signal(capture: Path, tmp_path: Path) -> None:
     failures: list[BaseException] = []
 
     def work() -> None:
@@ -157,9 +150,9 @@ def test_outside_the_main_thread_training_works_and_hears_nothing(capture: Path,
 def test_an_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with hearing_stops() as stop:
+        with deferred_interrupts() as stop:
             os.kill(os.getpid(), signal.SIGINT)
-        assert not stop.heard
+        assert not stop.is_set()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)

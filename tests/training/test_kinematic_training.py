@@ -14,17 +14,13 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
-from neeco.scene.deformations import kinematic
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
-from neeco.training import train as module
+from neeco.training.config import training_config
 from neeco.training.initial import initial_scene
-from neeco.training.instruments import discovery
 from neeco.training.instruments.evidence import gather_evidence
-from neeco.training.options import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
@@ -36,17 +32,13 @@ EARLY = [
     "refine.cameras=true",
     "refine.registration=true",
     "deformation.shaft_roll_start=5",
+    "search.tissue_steps=100",
+    "log_interval=1",
+    "deformation.hinge_start=12",
+    "deformation.shadow_at=[10]",
+    "deformation.label_sharpness_start=14",
 ]
 CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "TISSUE_STEPS", 100)
-    monkeypatch.setattr(Kinematic, "learns_from", 12)
-    monkeypatch.setattr(kinematic, "SHADOW_AT", (10,))
-    monkeypatch.setattr(kinematic, "SHARPENS_FROM", 14)
-    monkeypatch.setattr(module, "ROW_INTERVAL", 1)
 
 
 @pytest.fixture(scope="module")
@@ -107,13 +99,12 @@ def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) ->
     views = TrainingViews.read(frames)
     plain = training_config("3dgs", {"iterations": 1})
     scene = initial_scene(read_capture(capture), frames, plain, print)
-    together = gather_evidence(scene, views)
+    together = gather_evidence(scene, views, plain.search)
     assert together.hits.shape == (len(frames), 72, 80)
     points = torch.tensor([[0.0, 0.0, 60.0], [38.0, 0.0, 80.0], [0.0, 42.0, 80.0], [10.0, -20.0, 70.0]])
     for index in range(4):
-        alone = gather_evidence(
-            scene, TrainingViews(frames[index : index + 1], views.images[index : index + 1], (None,))
-        )
+        single = TrainingViews(frames[index : index + 1], views.images[index : index + 1], (None,))
+        alone = gather_evidence(scene, single, plain.search)
         expected = alone.look_up_camera(points[None])
         found = together.subset(torch.tensor([index])).look_up_camera(points[None])
         assert torch.equal(found[1], expected[1])

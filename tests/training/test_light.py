@@ -13,8 +13,8 @@ from neeco.capture.model import Frame
 from neeco.raster import rasterize
 from neeco.scene import Scene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.instruments.light import find_shadow
-from neeco.training.options import training_config
+from neeco.training.config import training_config
+from neeco.training.instruments.shadow import find_shadow
 from neeco.training.session import GaussianSession, new_session
 
 OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the photographs

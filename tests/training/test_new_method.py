@@ -16,8 +16,7 @@ from neeco.errors import NeecoError
 from neeco.scene import CanonicalGaussians, deformations, methods
 from neeco.scene.deformations.base import Posed
 from neeco.scene.io import load_scene
-from neeco.training.config import method_defaults
-from neeco.training.options import training_config
+from neeco.training.config import method_defaults, training_config
 from neeco.training.train import train
 
 FILE = '''
@@ -154,11 +153,11 @@ def test_extras_with_a_rate_are_learned_and_others_hold_still(
 
 def test_hooks_are_called_in_their_order(drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[str] = []
-    hooks = ("fit_ranges", "initial_extras", "begin", "disturbed", "training_channels", "regularisation")
+    hooks = ("fit_ranges", "initial_extras", "begin", "perturb", "training_channels", "regularisation")
     for name in (*hooks, "between_steps", "finish"):
         monkeypatch.setattr(drift, name, noting(called, name, getattr(drift, name)))
     train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 2}))
-    step = ["training_channels", "disturbed", "regularisation", "between_steps"]
+    step = ["training_channels", "perturb", "regularisation", "between_steps"]
     assert called == ["fit_ranges", "initial_extras", "begin", *step, *step, "finish"]
 
 

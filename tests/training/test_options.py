@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,14 @@ import yaml
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
 from neeco.scene.methods import METHODS, method_settings
-from neeco.training.config import config_from_dict, config_to_dict, method_defaults
-from neeco.training.options import schedule_parts, training_config, variant_config
+from neeco.training.config import (
+    TrainConfig,
+    config_from_dict,
+    config_to_dict,
+    method_defaults,
+    schedule_parts,
+    training_config,
+)
 from neeco.training.run import read_config, stored_config, write_config
 
 ROD = (Instrument("rod"),)
@@ -112,7 +119,9 @@ def test_a_run_of_no_length_is_refused(values: dict) -> None:
         training_config("3dgs", values)
 
 
-@pytest.mark.parametrize(("name", "value"), [("seed", -1), ("tissue_budget", 0), ("instrument_budget", -5)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("seed", -1), ("max_tissue_gaussians", 0), ("max_instrument_gaussians", -5)]
+)
 def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: int) -> None:
     with pytest.raises(NeecoError, match=f"--{name.replace('_', '-')}: {value} is too small"):
         training_config("kinematic", {name: value})
@@ -120,8 +129,8 @@ def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: i
 
 @pytest.mark.parametrize("method", ["3dgs", "deformable-3dgs", "4dgs", "kinematic"])
 def test_a_variant_turns_every_part_of_the_adjustment_on_and_nothing_else(method: str) -> None:
-    plain = config_to_dict(variant_config(method, {"seed": 3}))
-    adjusted = config_to_dict(variant_config(f"{method}+dta", {"seed": 3}))
+    plain = config_to_dict(training_config(method, {"seed": 3}))
+    adjusted = config_to_dict(training_config(f"{method}+dta", {"seed": 3}))
     assert plain == config_to_dict(training_config(method, {"seed": 3}))
     assert {plain["schedule"].pop(part) for part in schedule_parts()} == {"off"}
     assert {adjusted["schedule"].pop(part) for part in schedule_parts()} == {"on"}
@@ -135,7 +144,7 @@ def test_parts_of_the_adjustment_are_those_that_take_on_off_and_inverse() -> Non
 
 
 def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
-    config = variant_config("4dgs+dta", {}, ["schedule.compensation=off"])
+    config = training_config("4dgs+dta", {}, ["schedule.compensation=off"])
     assert (config.schedule.compensation, config.schedule.frame_order) == ("off", "on")
 
 
@@ -151,12 +160,40 @@ def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
 )
 def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
     with pytest.raises(NeecoError, match=f"^method: .*{named}"):
-        variant_config(name, {})
+        training_config(name, {})
 
 
-def test_views_per_step_are_for_gaussians_and_at_least_one() -> None:
-    assert training_config("3dgs", {"views_per_step": 4}).views_per_step == 4
-    with pytest.raises(NeecoError, match="--views-per-step: 0 is too small; give at least 1"):
-        training_config("3dgs", {}, ["views_per_step=0"])
-    with pytest.raises(NeecoError, match=r"--views-per-step: method nerfies draws rays .* deformation\.rays=NUMBER"):
-        training_config("nerfies", {"views_per_step": 2})
+def test_a_batch_is_of_gaussians_and_at_least_one_frame() -> None:
+    assert training_config("3dgs", {"batch_size": 4}).batch_size == 4
+    with pytest.raises(NeecoError, match="--batch-size: 0 is too small; give at least 1"):
+        training_config("3dgs", {}, ["batch_size=0"])
+    with pytest.raises(NeecoError, match=r"--batch-size: method nerfies draws rays .* deformation\.rays=NUMBER"):
+        training_config("nerfies", {"batch_size": 2})
+
+
+@pytest.mark.parametrize(("old", "new"), TrainConfig.renamed.items())
+def test_old_names_are_read_from_the_command_line_with_a_warning_and_from_config_yaml_without(
+    old: str, new: str
+) -> None:
+    with pytest.warns(FutureWarning, match=f"--set {old} is called --set {new} now"):
+        config = training_config("3dgs", {}, [f"{old}=3"])
+    assert getattr(config, new) == 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert getattr(config_from_dict({"method": "3dgs", old: 3}), new) == 3
+
+
+@pytest.mark.parametrize(
+    ("assignment", "named"),
+    [
+        ("search.grid=0", "search.grid: 0 is too small"),
+        ("density.prune_interval=0", "density.prune_interval: 0 is too small"),
+        ("density.reset_opacity=1.0", "density.reset_opacity: 1.0 is not between 0 and 1"),
+        ("schedule.phase_1.interval=0", "schedule.phase_1.interval: 0 is too small"),
+        ("log_interval=0", "log_interval: 0 is too small"),
+        ("optimizer.speed=1", "unknown field 'optimizer.speed'"),
+    ],
+)
+def test_hyperparameters_nothing_can_be_trained_with_are_refused(assignment: str, named: str) -> None:
+    with pytest.raises(NeecoError, match=f"--set.*{named}"):
+        training_config("kinematic", {}, [assignment])

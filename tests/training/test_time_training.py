@@ -13,14 +13,14 @@ from neeco.errors import NeecoError
 from neeco.scene.deformations.base import UNPERTURBED
 from neeco.scene.deformations.hexplane import HexPlane
 from neeco.scene.deformations.time_mlp import TimeMLP
-from neeco.training.options import training_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train
 
 METHODS = ("deformable-3dgs", "4dgs")
 SMALL = {
     "deformable-3dgs": ["deformation.width=16"],
-    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.moments=5"],
+    "4dgs": ["deformation.resolution=8", "deformation.width=8", "deformation.time_resolution=5"],
 }
 
 
@@ -96,7 +96,7 @@ def test_planes_are_regularised_from_the_moment_they_wake(tmp_path: Path, monkey
     real = HexPlane.regularisation
 
     def regularisation(self, canonical, rendering, iteration):
-        asked.append(self.resting)
+        asked.append(self.warming_up)
         return real(self, canonical, rendering, iteration)
 
     monkeypatch.setattr(HexPlane, "regularisation", regularisation)

@@ -10,13 +10,11 @@ import pytest
 
 import neeco.training.session
 from neeco.errors import NeecoError
-from neeco.training.options import training_config, variant_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
-pytestmark = pytest.mark.usefixtures("short_intervals")
-
-
+SHORT = ["density_start=10", "density_stop=0.9", "log_interval=5", "checkpoint_interval=20"]
 SMALL = {
     "neeco": ["deformation.width=16", "deformation.depth=2"],
     "deformable-3dgs+dta": ["deformation.width=16"],
@@ -26,7 +24,7 @@ SMALL = {
 
 
 def config_of(method: str):
-    return variant_config(method, {"iterations": 60}, [*SMALL.get(method, []), "density_start=10", "density_stop=0.9"])
+    return training_config(method, {"iterations": 60}, [*SMALL.get(method, []), *SHORT])
 
 
 @pytest.mark.parametrize("method", ["3dgs", "neeco", "deformable-3dgs+dta", "4dgs"])

@@ -12,9 +12,8 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.raster.optimizer import Adam
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import TrainConfig
-from neeco.training.initial import gaussian_session
-from neeco.training.options import training_config
+from neeco.training.config import TrainConfig, training_config
+from neeco.training.initial import begin_session
 from neeco.training.schedule import due
 from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, train
@@ -23,14 +22,21 @@ NEECO = ["deformation.width=16", "deformation.depth=2", "deformation.warm_up=0",
 
 
 def config_of(views: int, method: str = "neeco", assignments: tuple[str, ...] = ()) -> TrainConfig:
-    small = [*(NEECO if method == "neeco" else []), "density_start=10", "density_stop=0.9", *assignments]
-    return training_config(method, {"iterations": 60, "views_per_step": views}, small)
+    small = [
+        *(NEECO if method == "neeco" else []),
+        "density_start=10",
+        "density_stop=0.9",
+        "log_interval=5",
+        "checkpoint_interval=20",
+        *assignments,
+    ]
+    return training_config(method, {"iterations": 60, "batch_size": views}, small)
 
 
 def begun(folder: Path, config: TrainConfig) -> GaussianSession:
     capture = read_capture(folder)
     torch.manual_seed(0)
-    return gaussian_session(capture, TrainingViews.read(capture.split("train")), config, print)
+    return begin_session(capture, TrainingViews.read(capture.split("train")), config, print)
 
 
 def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: int) -> list[dict[str, Tensor]]:
@@ -74,7 +80,6 @@ def test_gradients_are_the_mean_of_single_ones_and_density_counts_every_frame(
     assert torch.allclose(*histories, rtol=1e-4)
 
 
-@pytest.mark.usefixtures("short_intervals")
 @pytest.mark.parametrize(("method", "views"), [("3dgs", 2), ("neeco", 3)])
 def test_an_interrupted_run_ends_in_the_same_bytes(method: str, views: int, capture: Path, tmp_path: Path) -> None:
     def interrupt(row: ProgressRow) -> None:

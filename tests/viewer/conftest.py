@@ -11,7 +11,7 @@ import torch
 from viewer_page import CHROMIUM, SOFTWARE
 from viewer_world import grasper_scene, write_photographs, write_run
 
-from neeco.viewer.server import Viewer
+from neeco.viewer.server import ViewerServer
 
 
 @pytest.fixture(autouse=True)
@@ -29,12 +29,12 @@ def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Viewer]]:
+def serve() -> Iterator[Callable[..., ViewerServer]]:
     """Starts servers, which end with the test."""
-    started: list[Viewer] = []
+    started: list[ViewerServer] = []
 
-    def start(*runs: Path, **options: Any) -> Viewer:
-        viewer = Viewer(runs, **options)
+    def start(*runs: Path, **options: Any) -> ViewerServer:
+        viewer = ViewerServer(runs, **options)
         started.append(viewer)
         return viewer
 

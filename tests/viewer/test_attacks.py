@@ -18,16 +18,16 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from neeco.errors import NeecoError
-from neeco.viewer import serving
-from neeco.viewer.artist import Artist
-from neeco.viewer.server import Viewer
+from neeco.viewer import server
+from neeco.viewer.server import ViewerServer
+from neeco.viewer.session import RenderThread
 
 viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
-Serve = Callable[..., Viewer]
+Serve = Callable[..., ViewerServer]
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -43,7 +43,7 @@ CAMERA = {
 }
 
 
-def port_of(viewer: Viewer) -> int:
+def port_of(viewer: ViewerServer) -> int:
     return int(viewer.address.split(":")[2].split("/")[0])
 
 
@@ -69,27 +69,27 @@ def exhaust(connection: ClientConnection) -> None:
         connection.recv(timeout=20)
 
 
-def client_of(viewer: Viewer, known: int = 0) -> Any:
+def client_of(viewer: ViewerServer, known: int = 0) -> Any:
     """The newest of more than `known` browsers, once it has its panel."""
     until = time.monotonic() + 20
     while time.monotonic() < until:
-        if len(viewer.studio.artist.sitters) > known:
+        if len(viewer.render_thread.sessions) > known:
             clients = viewer._server.get_clients()
             return clients[max(clients)]
         time.sleep(0.02)
     raise AssertionError("no browser has come")
 
 
-def is_served(viewer: Viewer) -> bool:
+def is_served(viewer: ViewerServer) -> bool:
     """Does a new browser get a page, and a picture?"""
     port = port_of(viewer)
     assert answer(port, b"GET / HTTP/1.1", f"Host: 127.0.0.1:{port}".encode()) == b"HTTP/1.1 200 OK"
     with opened(port) as connection:
-        before = set(viewer.studio.artist.sitters)
+        before = set(viewer.render_thread.sessions)
         looks(connection)
         until = time.monotonic() + 20
         while time.monotonic() < until:
-            if any(sitter._said_at > 0 for sitter in viewer.studio.artist.sitters if sitter not in before):
+            if any(session.status_at > 0 for session in viewer.render_thread.sessions if session not in before):
                 return True
             time.sleep(0.02)
     return False
@@ -163,7 +163,7 @@ def test_a_token_of_odd_bytes_is_wrong_and_no_trouble(made_run: Path, serve: Ser
         msgspec.msgpack.encode({"no": "type"}),
         msgspec.msgpack.encode({"type": "NoSuchMessage"}),
         msgspec.msgpack.encode({"type": "ViewerCameraMessage", "wxyz": 1}),
-        b"\x00" * (serving.LARGEST_MESSAGE + 1),
+        b"\x00" * (server.MAX_MESSAGE + 1),
     ],
 )
 def test_what_is_not_understood_ends_that_connection_alone(
@@ -200,7 +200,7 @@ def test_a_place_that_is_none_does_not_end_the_others_pictures(made_run: Path, s
         }
         connection.send(msgspec.msgpack.encode(go))
         time.sleep(0.5)
-        assert viewer.studio.artist._thread.is_alive()
+        assert viewer.render_thread._thread.is_alive()
         assert is_served(viewer)
 
 
@@ -241,7 +241,7 @@ def test_a_storm_of_messages_leaves_the_others_their_pictures(made_run: Path, se
 def test_more_browsers_than_there_is_room_for_are_told_so(
     made_run: Path, serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serving, "MOST_BROWSERS", 2)
+    monkeypatch.setattr(server, "MAX_BROWSERS", 2)
     viewer = serve(made_run)
     with opened(port_of(viewer)), opened(port_of(viewer)), pytest.raises(InvalidStatus) as refused:
         opened(port_of(viewer))
@@ -255,15 +255,15 @@ def test_a_browser_for_which_time_cannot_go_on_does_not_end_the_others_pictures(
     def fail(now: float) -> None:
         raise RuntimeError("no time")
 
-    artist = Artist()
-    artist.start()
+    thread = RenderThread()
+    thread.start()
     try:
-        artist.seat(SimpleNamespace(key=1, draw=lambda sharp: None, tick=fail))
+        thread.add(SimpleNamespace(key=1, render=lambda sharp: None, tick=fail))
         time.sleep(0.2)
-        artist.seat(SimpleNamespace(key=2, draw=lambda sharp: drawn.append(sharp), tick=lambda now: None))
+        thread.add(SimpleNamespace(key=2, render=lambda sharp: drawn.append(sharp), tick=lambda now: None))
         time.sleep(0.6)
     finally:
-        artist.stop()
+        thread.stop()
     assert drawn == [False, True]
 
 
@@ -315,7 +315,7 @@ def test_a_scene_that_cannot_be_is_refused_in_one_short_line(
 ) -> None:
     run = rewritten(made_run, tmp_path, change)
     with pytest.raises(NeecoError) as refused:
-        Viewer([run])
+        ViewerServer([run])
     said = str(refused.value)
     assert said.startswith(str(run / "scene.safetensors"))
     assert "\n" not in said

@@ -23,16 +23,16 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.labels.drawing import to_numpy
 from neeco.raster.types import Camera
 from neeco.scene.io import save_scene
-from neeco.viewer.server import Viewer
-from neeco.viewer.source import Source
-from neeco.viewer.steering import Steered, Wishes, shafts_of, steered_state
-from neeco.viewer.views import DEPTH, DIFFERENCE, IMAGE, MADE_UP, OVERLAY, PARTS, picture, views_of
-from neeco.viewer.window import fitting_view
+from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
+from neeco.viewer.runs import WatchedRun
+from neeco.viewer.server import ViewerServer
+from neeco.viewer.views import DEPTH, DIFFERENCE, IMAGE, OVERLAY, PARTS, UNOBSERVED, picture, views_of
+from neeco.viewer.viser_scene import fitting_view
 
 pytestmark = pytest.mark.browser
 pytest.importorskip("viser")
 
-Serve = Callable[..., Viewer]
+Serve = Callable[..., ViewerServer]
 ALIKE_DB = 33.0  # JPEG of quality 92 leaves about that of a small, colourful picture
 UNLIKE_DB = 28.0
 JAW = "jaw_angle (°)"
@@ -49,8 +49,8 @@ def window(recorded: Camera, shape: tuple[int, ...]) -> Camera:
 def alike(shown: np.ndarray, scene: Any, frame: float = 0.0, seen_by: int = 0, view: str = IMAGE, **steered) -> float:
     """PSNR in dB of a browser's picture against what the rasteriser draws of a steered state."""
     name = scene.instruments[0].name
-    wishes = Wishes(frame, {name: Steered(**steered)})
-    state = steered_state(scene.recorded.states, shafts_of(scene), wishes)
+    controls = Controls(frame, {name: InstrumentControls(**steered)})
+    state = controlled_state(scene.recorded.states, shafts_of(scene), controls)
     drawn = picture(scene, state, window(scene.recorded.cameras[seen_by], shown.shape), view).pixels
     return psnr(torch.from_numpy(shown / 255), torch.from_numpy(drawn / 255))
 
@@ -78,7 +78,7 @@ def test_it_opens_with_the_first_frame_and_its_numbers(page: ViewerPage, scene) 
 def test_every_slider_shows_what_the_rasteriser_draws(page: ViewerPage, scene) -> None:
     page.settled()
     page.tick("camera of the frame")  # so that the camera stays
-    wishes: dict[str, Any] = {}
+    controls: dict[str, Any] = {}
     for label, value, wish, number in (
         (JAW, 60.0, "joints", {"jaw_angle": math.radians(60)}),
         ("along shaft (mm)", 8.0, "slide", 8.0),
@@ -86,14 +86,14 @@ def test_every_slider_shows_what_the_rasteriser_draws(page: ViewerPage, scene) -
         ("yaw (°)", 20.0, "yaw", math.radians(20)),
         ("pitch (°)", -15.0, "pitch", math.radians(-15)),
     ):
-        before = dict(wishes)
-        wishes[wish] = number
+        before = dict(controls)
+        controls[wish] = number
         shown = page.set(label, value)
-        assert alike(shown, scene, **wishes) > ALIKE_DB, label
+        assert alike(shown, scene, **controls) > ALIKE_DB, label
         if wish != "roll":  # a round shaft rolled looks nearly the same
-            assert alike(shown, scene, **before) < alike(shown, scene, **wishes) - 1.0, label
+            assert alike(shown, scene, **before) < alike(shown, scene, **controls) - 1.0, label
     shown = page.set("frame", 4.5)
-    assert alike(shown, scene, 4.5, **wishes) > ALIKE_DB
+    assert alike(shown, scene, 4.5, **controls) > ALIKE_DB
     shown = page.after(lambda: page.press("back to the recording"))
     assert alike(shown, scene, 4.5) > ALIKE_DB
     assert [page.value(label) for label in ("roll (°)", "yaw (°)", "pitch (°)")] == [0.0, 0.0, 0.0]
@@ -122,7 +122,7 @@ def test_the_camera_goes_along_with_the_frames_and_jumps_back_exactly(page: View
     page.wait_for("PSNR")
 
 
-@pytest.mark.parametrize("view", [OVERLAY, PARTS, DEPTH, MADE_UP])
+@pytest.mark.parametrize("view", [OVERLAY, PARTS, DEPTH, UNOBSERVED])
 def test_every_view_is_the_one_that_is_named(page: ViewerPage, scene, view: str) -> None:
     page.settled()
     shown = page.after(lambda: page.choose("show", view))
@@ -166,7 +166,9 @@ def test_the_gizmo_takes_the_instrument_along(page: ViewerPage, scene) -> None:
     page.set("frame", 6.0)  # held where it is
     page.press("go to this frame's camera")
     pose = to_numpy(
-        steered_state(scene.recorded.states, shafts_of(scene), Wishes(0.0, {"grasper": Steered(slide=5.0)}))
+        controlled_state(
+            scene.recorded.states, shafts_of(scene), Controls(0.0, {"grasper": InstrumentControls(slide=5.0)})
+        )
         .instruments["grasper"]
         .pose
     )
@@ -213,7 +215,7 @@ def test_an_arrow_of_the_gizmo_drags_the_instrument_and_turns_nothing(page: View
     x, y = page.pixel_like(60, 140, 240, 90)
     after = page.after(lambda: page.drag(x, y, x + 40, y + 25))
     assert alike(after, scene) < ALIKE_DB  # the instrument is small in the picture
-    (visitor,) = page.server.studio.artist.sitters
+    (visitor,) = page.server.render_thread.session
     start = to_numpy(scene.recorded.states[0].instruments["grasper"].pose)
     end = visitor.overlays.pose("grasper")
     assert end[:3, :3] == pytest.approx(start[:3, :3], abs=1e-3)
@@ -247,13 +249,13 @@ def test_kept_states_and_images_are_what_was_shown(serve: Serve, context: Any, m
     page.set("frame", 3.0)
     page.press("keep this state")
     page.wait_for("kept: 2 in")
-    loaded = Source(run).loaded
+    loaded = WatchedRun(run).loaded
     first, second = read_states(run / "kept" / "states.jsonl", loaded.scene.instruments)
-    wishes = [Wishes(frame, {"grasper": Steered(roll=math.radians(40))}) for frame in (0.0, 3.0)]
-    for kept, wished in zip((first, second), wishes, strict=True):
-        state = steered_state(loaded.recorded.states, loaded.shafts, wished)
+    controls = [Controls(frame, {"grasper": InstrumentControls(roll=math.radians(40))}) for frame in (0.0, 3.0)]
+    for kept, asked_for in zip((first, second), controls, strict=True):
+        state = controlled_state(loaded.recorded.states, loaded.shafts, asked_for)
         assert torch.allclose(kept.state.instruments["grasper"].pose, state.instruments["grasper"].pose)
-        taken_by = loaded.recorded.cameras[int(wished.frame)]
+        taken_by = loaded.recorded.cameras[int(asked_for.frame)]
         assert kept.world_from_camera == pytest.approx(to_numpy(taken_by.world_from_camera), abs=1e-4)
     page.press("forget the last kept")
     page.wait_for("kept: 1 in")
@@ -274,12 +276,12 @@ def test_two_browsers_each_have_their_own_state(page: ViewerPage, context: Any, 
 
 
 def test_a_page_comes_back_when_the_server_does(made_run: Path, context: Any, scene) -> None:
-    first = Viewer([made_run], port=18300)
+    first = ViewerServer([made_run], port=18300)
     page = ViewerPage(context, first.address)
     page.settled()
     page.set("frame", 4.0)
     first.stop()
-    again = Viewer([made_run], port=18300)
+    again = ViewerServer([made_run], port=18300)
     try:
         assert again.address == first.address
         shown = page.after(lambda: None)

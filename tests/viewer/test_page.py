@@ -20,11 +20,10 @@ from neeco.evaluation.image_metrics import psnr
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
-from neeco.viewer.export import page_of
-from neeco.viewer.packed import pack
-from neeco.viewer.steering import Steered, Wishes, shafts_of, steered_state
+from neeco.viewer.controls import Controls, InstrumentControls, controlled_state, shafts_of
+from neeco.viewer.export import pack, page_of
 
 pytestmark = pytest.mark.browser
 
@@ -176,9 +175,9 @@ def test_every_slider_moves_the_instrument_as_the_server_does(
     page.slide(name, value)
     set_to = page.value(name)
     assert set_to == pytest.approx(value, abs=0.3)
-    steered = Steered(joints={name: set_to}) if name == "jaw_angle" else Steered(**{name: set_to})
-    wishes = Wishes(2.0, {GRASPER.name: steered})
-    state = steered_state(scene.recorded.states, shafts_of(scene), wishes)
+    steered = InstrumentControls(joints={name: set_to}) if name == "jaw_angle" else InstrumentControls(**{name: set_to})
+    controls = Controls(2.0, {GRASPER.name: steered})
+    state = controlled_state(scene.recorded.states, shafts_of(scene), controls)
     agree(page, scene, state, scene.recorded.cameras[2], None)
     assert decibels(page.drawn()[0], before) < 40
     page.page.get_by_role("button", name="as recorded").click()
@@ -187,7 +186,7 @@ def test_every_slider_moves_the_instrument_as_the_server_does(
 
 def test_between_frames_it_interpolates_as_the_server_does(page: Page, scene: Scene) -> None:
     page.slide("frame", 2.5)
-    state = steered_state(scene.recorded.states, {}, Wishes(2.5))
+    state = controlled_state(scene.recorded.states, {}, Controls(2.5))
     matrix = page.page.evaluate("window.neeco.eye.matrix")
     pose = torch.cat([torch.tensor(matrix, dtype=torch.float64).reshape(3, 4), torch.tensor([[0.0, 0, 0, 1]])])
     agree(page, scene, state, replace(scene.recorded.cameras[2], world_from_camera=pose), None)

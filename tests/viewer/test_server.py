@@ -15,17 +15,16 @@ import pytest
 
 from neeco.cli import main
 from neeco.errors import NeecoError
-from neeco.viewer import serving
-from neeco.viewer.artist import Artist
-from neeco.viewer.pace import MOVING_PX, SHARP_PX, Pace
-from neeco.viewer.server import Viewer
+from neeco.viewer import server
+from neeco.viewer.server import ViewerServer
+from neeco.viewer.session import MOVING_PX, SHARP_PX, AdaptiveResolution, RenderThread
 
 viser = pytest.importorskip("viser")
 from viser import _messages as messages  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-Serve = Callable[..., Viewer]
+Serve = Callable[..., ViewerServer]
 PROTOCOL = f"viser-v{viser.__version__}"
 
 
@@ -46,7 +45,7 @@ def socket_status(port: int, path: str = "/", **headers: str) -> int:
         return refused.response.status_code
 
 
-def port_of(viewer: Viewer) -> int:
+def port_of(viewer: ViewerServer) -> int:
     return int(viewer.address.split(":")[2].split("/")[0])
 
 
@@ -140,14 +139,14 @@ def test_a_server_that_the_guard_does_not_see_is_not_left_running(
 
     monkeypatch.setattr("viser.ViserServer", Other)
     with pytest.raises(NeecoError, match="opens its port in a way that is not known"):
-        Viewer([made_run])
+        ViewerServer([made_run])
     assert len(stopped) == 1
 
 
 def test_without_viser_it_says_what_to_install(made_run: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(made_run), "--no-browser"]) == 1
-    assert capsys.readouterr().err == f"neeco: error: {serving.MISSING}\n"
+    assert capsys.readouterr().err == f"neeco: error: {server.MISSING}\n"
 
 
 @pytest.mark.parametrize(
@@ -184,12 +183,12 @@ def test_it_prints_its_address_and_ends_quietly_on_interrupt(made_run: Path) -> 
 
 
 class Browser:
-    """A sitter that only notes what it is asked."""
+    """A session that only notes what it is asked."""
 
     def __init__(self, key: int, seconds: float = 0.0) -> None:
         self.key, self.seconds, self.drawn = key, seconds, []
 
-    def draw(self, sharp: bool) -> None:
+    def render(self, sharp: bool) -> None:
         self.drawn.append(sharp)
         time.sleep(self.seconds)
 
@@ -198,72 +197,72 @@ class Browser:
 
 
 @pytest.fixture
-def artist():
-    artist = Artist()
-    artist.start()
-    yield artist
-    artist.stop()
+def thread():
+    thread = RenderThread()
+    thread.start()
+    yield thread
+    thread.stop()
 
 
-def test_what_moves_is_drawn_coarsely_and_once_still_sharp(artist: Artist) -> None:
+def test_what_moves_is_drawn_coarsely_and_once_still_sharp(thread: RenderThread) -> None:
     browser = Browser(1)
-    artist.seat(browser)
+    thread.add(browser)
     time.sleep(0.6)
     assert browser.drawn == [False, True]
 
 
-def test_wishes_made_while_one_is_drawn_become_one(artist: Artist) -> None:
+def test_wishes_made_while_one_is_drawn_become_one(thread: RenderThread) -> None:
     browser = Browser(1, seconds=0.2)
-    artist.seat(browser)
+    thread.add(browser)
     for _ in range(20):
-        artist.ask(1)
+        thread.request(1)
         time.sleep(0.01)
     time.sleep(1.0)
     assert browser.drawn in ([False, False, True], [False, False, False, True])
 
 
-def test_browsers_take_turns(artist: Artist) -> None:
+def test_browsers_take_turns(thread: RenderThread) -> None:
     busy, other = Browser(1, seconds=0.02), Browser(2, seconds=0.02)
-    artist.seat(busy)
-    artist.seat(other)
+    thread.add(busy)
+    thread.add(other)
     for _ in range(40):
-        artist.ask(1)
-        artist.ask(2)
+        thread.request(1)
+        thread.request(2)
         time.sleep(0.01)
     assert abs(len(busy.drawn) - len(other.drawn)) <= 2
     assert len(busy.drawn) > 4
 
 
-def test_one_browsers_trouble_does_not_end_the_others_pictures(artist: Artist) -> None:
+def test_one_browsers_trouble_does_not_end_the_others_pictures(thread: RenderThread) -> None:
     class Broken(Browser):
-        def draw(self, sharp: bool) -> None:
+        def render(self, sharp: bool) -> None:
             raise RuntimeError("no picture")
 
     healthy = Browser(2)
-    artist.seat(Broken(1))
-    artist.seat(healthy)
+    thread.add(Broken(1))
+    thread.add(healthy)
     time.sleep(0.6)
     assert healthy.drawn == [False, True]
 
 
-def test_who_has_gone_is_not_drawn_for(artist: Artist) -> None:
+def test_who_has_gone_is_not_drawn_for(thread: RenderThread) -> None:
     browser = Browser(1)
-    artist.seat(browser)
-    artist.leave(1)
+    thread.add(browser)
+    thread.remove(1)
     time.sleep(0.4)
-    artist.ask(1)
+    thread.request(1)
     time.sleep(0.4)
     assert len(browser.drawn) <= 1
 
 
 def test_a_slow_scene_is_drawn_smaller_and_a_fast_one_as_large_as_the_window() -> None:
-    fast, slow = Pace(), Pace()
+    fast, slow = AdaptiveResolution(), AdaptiveResolution()
     for _ in range(3):
-        fast.took(1e-3, 256 * 400)
-        slow.took(5.0, 256 * 400)
+        fast.record(1e-3, 256 * 400)
+        slow.record(5.0, 256 * 400)
     assert fast.height(False, 900, 1.6) == MOVING_PX
     assert fast.height(True, 900, 1.6) == SHARP_PX
     assert fast.height(True, 300, 1.6) == 300
     assert slow.height(False, 900, 1.6) < slow.height(True, 900, 1.6) < 100
-    fast.took(60.0, 256 * 400)  # had to find something out first
+    fast.record(60.0, 256 * 400)  # had to find something out first
     assert fast.height(False, 900, 1.6) == MOVING_PX

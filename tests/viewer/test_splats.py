@@ -18,7 +18,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.image_metrics import psnr
 from neeco.raster import rasterize
 from neeco.raster.types import Gaussians
-from neeco.viewer.splats import ply_bytes, splats_of, spz_bytes, standing
+from neeco.viewer.splats import exported_state, ply_bytes, splats_of, spz_bytes
 
 STATE = grasper_state(pose_of(0.7, -0.4, 1.1, 2.0, 1.0, 60.0), 0.5)
 
@@ -112,7 +112,7 @@ def test_what_is_baked_matters() -> None:
 
 def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None:
     scene = ball_scene("ball", [(0.0, 0.0, 60.0)])
-    state, camera = standing(scene, 0, None)
+    state, camera = exported_state(scene, 0, None)
     splats = splats_of(scene, state, camera)
     truth = scene.render(state, camera).color
     small, large = spz_bytes(splats), ply_bytes(splats)
@@ -124,7 +124,7 @@ def test_a_ball_survives_in_both_formats_and_the_same_bytes_come_twice() -> None
 def test_positions_that_spz_cannot_hold_are_refused() -> None:
     scene = ball_scene("ball", [(0.0, 0.0, 3000.0)])
     with pytest.raises(NeecoError, match=r"--format: spz .* use ply"):
-        spz_bytes(splats_of(scene, *standing(scene, 0, None)))
+        spz_bytes(splats_of(scene, *exported_state(scene, 0, None)))
 
 
 def run_folder(path: Path, scene) -> Path:

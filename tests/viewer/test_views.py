@@ -12,16 +12,15 @@ from scene_worlds import make_nerf, make_scene
 from viewer_world import HEIGHT, WIDTH, camera, grasper_scene
 
 from neeco.labels.drawing import draw
-from neeco.viewer.source import Source
-from neeco.viewer.timeline import Timeline, coarse_psnr, narrowed, score_frame, spread_order
+from neeco.viewer.runs import Timeline, WatchedRun, coarse_psnr, narrowed, score_frame, spread_order
 from neeco.viewer.views import (
     DEPTH,
     DIFFERENCE,
     IMAGE,
-    MADE_UP,
-    MADE_UP_COLOR,
     OVERLAY,
     PARTS,
+    UNOBSERVED,
+    UNOBSERVED_COLOR,
     VIEWS,
     Picture,
     beside,
@@ -44,8 +43,8 @@ def shown(scene, view: str, frame: int = 0) -> Picture:
     return picture(scene, scene.recorded.states[frame], camera(), view)
 
 
-def plain(color: tuple[int, int, int], width: int = 8, said: str = "") -> Picture:
-    return Picture(np.full((6, width, 3), color, np.uint8), np.full((6, width), float(color[0])), said)
+def plain(color: tuple[int, int, int], width: int = 8, note: str = "") -> Picture:
+    return Picture(np.full((6, width, 3), color, np.uint8), np.full((6, width), float(color[0])), note)
 
 
 def test_the_image_is_the_drawing(scene) -> None:
@@ -77,7 +76,7 @@ def test_what_is_nearer_is_lighter_in_the_depth(scene) -> None:
     drawn = shown(scene, DEPTH)
     parts = draw(scene, scene.recorded.states[0], camera()).parts.numpy()
     assert drawn.pixels[parts > 0].mean() > drawn.pixels[parts == 0].mean() + 50
-    assert "mm" in drawn.said
+    assert "mm" in drawn.note
 
 
 def test_depth_of_nothing_is_black() -> None:
@@ -86,16 +85,16 @@ def test_depth_of_nothing_is_black() -> None:
     pose[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # away from everything
     drawn = picture(scene, scene.recorded.states[0], replace(camera(), world_from_camera=pose), DEPTH)
     assert not drawn.pixels.any()
-    assert drawn.said == "nothing in view"
+    assert drawn.note == "nothing in view"
 
 
 def test_what_no_frame_saw_is_magenta_and_what_frames_saw_is_not(scene) -> None:
-    seen = shown(scene, MADE_UP)
+    seen = shown(scene, UNOBSERVED)
     behind = camera().world_from_camera.clone()
     behind[:3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
     behind[2, 3] = 200.0  # from the wall's other side
-    unseen = picture(scene, scene.recorded.states[0], replace(camera(), world_from_camera=behind), MADE_UP)
-    far = [np.abs(item.pixels.astype(float) - MADE_UP_COLOR).mean() for item in (seen, unseen)]
+    unseen = picture(scene, scene.recorded.states[0], replace(camera(), world_from_camera=behind), UNOBSERVED)
+    far = [np.abs(item.pixels.astype(float) - UNOBSERVED_COLOR).mean() for item in (seen, unseen)]
     assert far[1] < 40 < 80 < far[0]
 
 
@@ -125,7 +124,7 @@ def test_a_difference_stands_where_the_photograph_does(scene) -> None:
 def test_views_are_those_that_the_method_can_show() -> None:
     assert views_of(grasper_scene(), True) == VIEWS
     assert views_of(grasper_scene(), False) == VIEWS[:-1]
-    assert views_of(make_scene("3dgs"), True) == (IMAGE, DEPTH, MADE_UP, DIFFERENCE)
+    assert views_of(make_scene("3dgs"), True) == (IMAGE, DEPTH, UNOBSERVED, DIFFERENCE)
     assert views_of(make_nerf(), False) == (IMAGE, DEPTH)
 
 
@@ -146,10 +145,10 @@ def test_a_field_shows_image_and_depth() -> None:
 
 
 def test_side_by_side_each_keeps_its_width() -> None:
-    both = beside([plain((10, 0, 0), said="a"), plain((20, 0, 0), said="b")])
+    both = beside([plain((10, 0, 0), note="a"), plain((20, 0, 0), note="b")])
     assert both.pixels[0, :, 0].tolist() == [10] * 7 + [255] * 2 + [20] * 7
     assert both.depth[0].tolist() == [10.0] * 8 + [20.0] * 8
-    assert both.said == "a; b"
+    assert both.note == "a; b"
 
 
 @pytest.mark.parametrize(("share", "left"), [(0.0, 0), (0.5, 4), (1.0, 8)])
@@ -164,7 +163,7 @@ def test_what_cannot_be_compared_is_darker() -> None:
 
 
 def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None:
-    loaded = Source(made_run).loaded
+    loaded = WatchedRun(made_run).loaded
     score = score_frame(loaded, 3)
     assert score.psnr > 50
     assert score.iou == pytest.approx(1.0)
@@ -172,7 +171,7 @@ def test_a_frame_that_the_scene_draws_itself_scores_best(made_run: Path) -> None
 
 
 def test_the_timeline_finds_the_worst_frame(made_run: Path) -> None:
-    loaded = Source(made_run).loaded
+    loaded = WatchedRun(made_run).loaded
     wrong = replace(loaded.frames[4], state=loaded.frames[8].state)
     timeline = Timeline(replace(loaded, frames=(*loaded.frames[:4], wrong, *loaded.frames[5:])))
     while not timeline.done:

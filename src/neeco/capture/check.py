@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
-from neeco.capture.documents import Parsed, Place, Problem, ProblemReport, errors_only, key_name, printable
+from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
 from neeco.capture.model import STILL, Capture, Frame, Instrument
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.statefile import passes_limits
@@ -76,12 +76,10 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> Ch
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
-        _check_splits(parsed, report)
-        _check_times(parsed, report)
-        _check_repeated_files(parsed, report)
-        _check_images(parsed, report)
-        _check_states(parsed, report)
-        check_geometry(parsed, report)
+        _check_frames(parsed)
+        _check_images(parsed)
+        _check_states(parsed)
+        check_geometry(parsed)
     return Checked(report.problems, _summary(parsed), capture)
 
 
@@ -109,46 +107,39 @@ def _summary(parsed: Parsed) -> CaptureSummary:
     )
 
 
-def _check_splits(parsed: Parsed, report: ProblemReport) -> None:
-    file = parsed.places[0].file
+def _check_frames(parsed: Parsed) -> None:
+    """Report splits without frames, times missing or going backwards, and files listed twice."""
+    frames = parsed.header("frames")
     counts = Counter(frame.split for frame in parsed.frames)
     if not counts["train"]:
         found = ", ".join(f"{printable(name)} ({count})" for name, count in counts.items())
-        report.error(file, "frames", f"split 'train' is empty; found {found}", "give most frames the split 'train'")
+        frames.error(f"split 'train' is empty; found {found}", "give most frames the split 'train'")
     elif counts["train"] < FEWEST_TRAIN_FRAMES:
         message = f"too few frames: {counts['train']} to train on, at least {FEWEST_TRAIN_FRAMES} are needed"
-        report.error(file, "frames", message, "record more")
+        frames.error(message, "record more")
     elif counts["train"] < FEW_TRAIN_FRAMES:
         message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
-        report.warning(file, "frames", message, "record more if you can")
+        frames.warning(message, "record more if you can")
     if not counts["test"]:
-        report.warning(file, "frames", "split 'test' is empty", "without it nothing tells how good the scene is")
-
-
-def _check_times(parsed: Parsed, report: ProblemReport) -> None:
-    file = parsed.places[0].file
-    if not parsed.timed:
-        report.warning(file, "frames", "not every frame has a time; the order stands in", "add `time` in seconds")
-        return
+        frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
     latest: dict[str, float] = {}
     back = []
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         if frame.state.time < latest.get(place.file, frame.state.time):
             back.append(place)
         latest[place.file] = frame.state.time
-    if back:
+    if not parsed.timed:
+        frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+    elif back:
         more = f" (and {len(back) - 1} more times)" if len(back) > 1 else ""
         remedy = "right if the capture joins recordings or cameras; else sort the frames"
-        report.warning(back[0].file, f"{back[0].field}.time", f"time goes backwards here{more}", remedy)
-
-
-def _check_repeated_files(parsed: Parsed, report: ProblemReport) -> None:
-    first: dict[Path, Place] = {}
+        back[0].child("time").warning(f"time goes backwards here{more}", remedy)
+    first: dict[Path, Node] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         earlier = first.setdefault(frame.image_path, place)
         if earlier is not place:
             message = f"is the same image as {earlier.field}: {printable(frame.image_path.name)}"
-            report.error(place.file, f"{place.field}.file_path", message, "list every image once")
+            place.child("file_path").error(message, "list every image once")
 
 
 @dataclass(frozen=True)
@@ -161,27 +152,26 @@ class _Decoded:
     mask_error: str
 
 
-def _check_images(parsed: Parsed, report: ProblemReport) -> None:
+def _check_images(parsed: Parsed) -> None:
     """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         decoded = list(pool.map(_decode, parsed.frames))
-    reported = {(problem.file, problem.field) for problem in report.problems}  # by the reader, of sizes not stated
+    # the reader may have reported an image whose size it wanted to know
+    reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
     for index, (found, place) in enumerate(zip(decoded, parsed.places, strict=True)):
-        field = f"{place.field}.file_path"
-        if found.image_error and (place.file, field) not in reported:
-            report.error(place.file, field, *found.image_error.split("; ", 1))
+        if found.image_error and not reported[index]:
+            place.child("file_path").error(*found.image_error.split("; ", 1))
         if found.mask_error:
-            report.error(place.file, f"{place.field}.mask_path", *found.mask_error.split("; ", 1))
+            place.child("mask_path").error(*found.mask_error.split("; ", 1))
         if found.uniform:
-            report.warning(place.file, field, "every pixel of the image has one colour", "was the camera covered?")
+            place.child("file_path").warning("every pixel of the image has one colour", "was the camera covered?")
         elif found.digest is not None and first.setdefault(found.digest, index) != index:
-            _report_duplicate(parsed, first[found.digest], index, report)
+            _report_duplicate(parsed, first[found.digest], index)
     without = [place for frame, place in zip(parsed.frames, parsed.places, strict=True) if frame.mask_path is None]
     if without and len(without) < len(parsed.frames):
         message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
-        place = without[0]
-        report.warning(place.file, f"{place.field}.mask_path", message, "its whole image counts in the loss")
+        without[0].child("mask_path").warning(message, "its whole image counts in the loss")
 
 
 def _decode(frame: Frame) -> _Decoded:
@@ -202,18 +192,17 @@ def _decode(frame: Frame) -> _Decoded:
     return _Decoded(digest, uniform, image_error, mask_error)
 
 
-def _report_duplicate(parsed: Parsed, first: int, second: int, report: ProblemReport) -> None:
+def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
     """Two files with the same pixels: harmless only when everything else is the same as well."""
-    one, two, place = parsed.frames[first], parsed.frames[second], parsed.places[second]
+    one, two, place = parsed.frames[first], parsed.frames[second], parsed.places[second].child("file_path")
     if one.image_path == two.image_path:
         return  # reported as one file listed twice
     message = f"duplicate frame: same pixels as {parsed.places[first].field} ({one.image_path.name!r})"
     if one.split == two.split and _same_state(one, two):
-        report.warning(place.file, f"{place.field}.file_path", message, "drop one of them")
+        place.warning(message, "drop one of them")
     else:
         reason = "in another split" if _same_state(one, two) else "with another camera or state"
-        remedy = "drop one of them (a stalled video does this)"
-        report.error(place.file, f"{place.field}.file_path", f"{message}, {reason}", remedy)
+        place.error(f"{message}, {reason}", "drop one of them (a stalled video does this)")
 
 
 def _same_state(one: Frame, two: Frame) -> bool:
@@ -229,79 +218,70 @@ def _same_state(one: Frame, two: Frame) -> bool:
     )
 
 
-def _check_states(parsed: Parsed, report: ProblemReport) -> None:
+def _check_states(parsed: Parsed) -> None:
     """Report missing instruments and joints, limits passed, degrees, and states that never change."""
     for instrument in parsed.instruments:
-        _check_present(parsed, instrument, report)
+        frames = zip(parsed.frames, parsed.places, strict=True)
+        without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
+        name = printable(instrument.name)
+        if len(without) == len(parsed.frames):
+            message = f"instrument {name} is declared but no frame has it"
+            parsed.header("instruments").error(message, "remove it or give its poses")
+        else:
+            message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
+            for place in without:
+                place.child("instruments").error(message, "give its pose or drop the frame")
         for joint in instrument.joints:
-            _check_joint(parsed, instrument, joint, report)
-    _check_changes(parsed, report)
+            _check_joint(parsed, instrument, joint)
+    _check_changes(parsed)
 
 
-def _check_present(parsed: Parsed, instrument: Instrument, report: ProblemReport) -> None:
-    frames = zip(parsed.frames, parsed.places, strict=True)
-    without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
-    name = printable(instrument.name)
-    if without and len(without) == len(parsed.frames):
-        message, remedy = f"instrument {name} is declared but no frame has it", "remove it or give its poses"
-        report.error(without[0].file, "instruments", message, remedy)
-        return
-    for place in without:
-        message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
-        report.error(place.file, f"{place.field}.instruments", message, "give its pose or drop the frame")
-
-
-def _check_joint(parsed: Parsed, instrument: Instrument, joint: str, report: ProblemReport) -> None:
+def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     limits = instrument.joints[joint]
     is_length = joint.endswith("_mm")  # a sliding joint
     if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
         message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
-        report.error(parsed.places[0].file, "instruments", message, "give radians")
-    largest: tuple[float, Place] | None = None
-    for place, state in parsed.states_of(instrument.name):
-        field = f"{place.field}.joints.{key_name(joint)}"
+        parsed.header("instruments").error(message, "give radians")
+    largest: tuple[float, Node] | None = None
+    for state_place, state in parsed.states_of(instrument.name):
+        place = state_place.child("joints").child(joint)
         if joint not in state.joints:
-            report.error(place.file, field, "is missing", "give its value in every frame, or drop the frame")
+            place.error("is missing", "give its value in every frame, or drop the frame")
             continue
         value = state.joints[joint]
         if limits is not None and passes_limits(value, limits):
             message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
-            report.error(place.file, field, message, "repair the reading (radians?) or the limits")
+            place.error(message, "repair the reading (radians?) or the limits")
         if largest is None or abs(value) > abs(largest[0]):
-            largest = value, Place(place.file, field)
+            largest = value, place
     if largest is not None and limits is None and not is_length and abs(largest[0]) > FULL_TURN:
         message = f"reaches {largest[0]:g} rad, more than a full turn: degrees?"
-        remedy = "give radians; state the joint's limits in the header if it does turn that far"
-        report.error(largest[1].file, largest[1].field, message, remedy)
+        largest[1].error(message, "give radians; state the joint's limits in the header if it does turn that far")
 
 
-def _check_changes(parsed: Parsed, report: ProblemReport) -> None:
+def _check_changes(parsed: Parsed) -> None:
     """A state that is always the same teaches nothing about other states."""
-    changing = 0
-    still: list[str] = []
+    frames, changing, still = parsed.header("frames"), False, []
     for instrument in parsed.instruments:
-        found = parsed.states_of(instrument.name)
-        if len(found) < 2:
+        states = [state for _, state in parsed.states_of(instrument.name)]
+        if len(states) < 2:
             continue
-        file = found[0][0].file
-        poses = np.stack([state.pose.numpy() for _, state in found])
-        moves = float(np.ptp(poses, axis=0).max()) > STILL
+        name = printable(instrument.name)
+        moves = float(np.ptp(np.stack([state.pose.numpy() for state in states]), axis=0).max()) > STILL
         joints_move = False
         for joint in instrument.joints:
-            values = [state.joints[joint] for _, state in found if joint in state.joints]
+            values = [state.joints[joint] for state in states if joint in state.joints]
             joint_moves = len(values) > 1 and max(values) - min(values) > STILL
             joints_move = joints_move or joint_moves
             if values and not joint_moves and moves:
-                message = f"joint {printable(joint)} of {printable(instrument.name)} is always {values[0]:g}"
-                report.warning(file, "frames", message, "its other values cannot be learned")
-        changing += moves or joints_move
+                message = f"joint {printable(joint)} of {name} is always {values[0]:g}"
+                frames.warning(message, "its other values cannot be learned")
+        changing = changing or moves or joints_move
         if not (moves or joints_move):
-            still.append(instrument.name)
+            still.append(name)
         elif not moves:
-            message = f"the pose of {printable(instrument.name)} never changes"
-            report.warning(file, "frames", message, "is its tracker connected?")
+            frames.warning(f"the pose of {name} never changes", "is its tracker connected?")
     for name in still:
-        report_it = report.warning if changing else report.error
-        message = f"the state of {printable(name)} never changes: pose and joints are the same in every frame"
+        message = f"the state of {name} never changes: pose and joints are the same in every frame"
         remedy = "is its tracker connected? remove it from the capture if it is fixed"
-        report_it(parsed.places[0].file, "frames", message, remedy)
+        (frames.warning if changing else frames.error)(message, remedy)

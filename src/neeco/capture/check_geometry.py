@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.documents import Parsed, Place, ProblemReport, errors_only, printable
+from neeco.capture.documents import Node, Parsed, errors_only, printable
 from neeco.capture.model import swap_camera_axes
 from neeco.raster.pinhole import project
 
@@ -22,7 +22,7 @@ SEEN_AGAIN = 0.3  # a share that makes a mistake the likely one
 METRES = 1.0  # mm; an endoscope is never this close, nor an instrument's travel this short
 BEHIND = 1e-9  # mm; what is less deep is not in front of a camera
 SENSOR_REACH_MM = 500.0  # how far from the visible part of an instrument its sensor may sit
-MATRIX_FIELD, POSE_FIELD = "frames[*].transform_matrix", "frames[*].instruments[*].pose"
+POSES = "frames[*].instruments[*].pose"
 ALL_IN_MM = "give all lengths in mm"
 Mistake = tuple[str, str]  # what is wrong, what to do
 
@@ -82,36 +82,36 @@ class _Scene:
         return max(self.spread, self.distance)
 
 
-def check_geometry(parsed: Parsed, report: ProblemReport) -> None:
+def check_geometry(parsed: Parsed) -> None:
     """Check points, cameras against points, then instruments against both (not against cameras that are wrong)."""
+    report = parsed.places[0].report
     before = len(errors_only(report.problems))
-    points = _usable_points(parsed, report)
+    points = _usable_points(parsed)
     placed = parsed.with_cameras()
     scene = None if points is None or not placed.frames else _Scene.of(placed, points)
     if scene is not None:
-        _check_cameras(placed, scene, report)
+        _check_cameras(placed, scene)
     if placed.frames and len(errors_only(report.problems)) == before:
-        _check_instruments(placed, scene, report)
+        _check_instruments(placed, scene)
 
 
-def _usable_points(parsed: Parsed, report: ProblemReport) -> np.ndarray | None:
+def _usable_points(parsed: Parsed) -> np.ndarray | None:
     """The measured points [P, 3] float64. Reports that there are none, few, or all in one spot; None when unusable."""
     place = parsed.points_place
+    assert place is not None  # there are frames
     if parsed.points is None or not parsed.points.measured:
-        already = any(problem.file == place.file and problem.field == place.field for problem in report.problems)
-        if not already:
-            remedy = "training starts from random ones, and gets less"
-            report.warning(place.file, place.field, "no sparse points", remedy)
+        if not place.reported:
+            place.warning("no sparse points", "training starts from random ones, and gets less")
         return None
     points = parsed.points.positions.astype(np.float64)
     if len(points) == 0:
-        report.error(place.file, place.field, "holds no points", "add SfM points or drop ply_file_path")
+        place.error("holds no points", "add SfM points or drop ply_file_path")
         return None
     if len(points) < FEW_POINTS:
         message = f"few sparse points: {len(points)}, fewer than {FEW_POINTS}"
-        report.warning(place.file, place.field, message, "give SfM's whole cloud if you can")
+        place.warning(message, "give SfM's whole cloud if you can")
     if _spread(points) < 1e-9:
-        report.error(place.file, place.field, "all points are in one spot", "repair the point cloud")
+        place.error("all points are in one spot", "repair the point cloud")
         return None
     return points
 
@@ -121,35 +121,34 @@ def _spread(points: np.ndarray) -> float:
     return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
 
 
-def _check_cameras(parsed: Parsed, scene: _Scene, report: ProblemReport) -> None:
+def _check_cameras(parsed: Parsed, scene: _Scene) -> None:
     """Report cameras far from the points, and mistakes in camera poses."""
-    file = parsed.places[0].file
+    matrices = parsed.header("frames[*].transform_matrix")
     if parsed.instruments and scene.distance < METRES:
         message = f"cameras are {scene.distance:.3g} mm from the points: metres?"
-        report.error(file, "frames", message, "give cameras, points and poses in mm")
+        parsed.header("frames").error(message, "give cameras, points and poses in mm")
         return
     seen = scene.cameras.sees(scene.points[None]).mean(axis=1)  # [F] share of the points in each image
     mistake = _camera_mistake(scene, float(seen.mean())) if seen.mean() < SEEN_RARELY else None
     if mistake is not None:
-        report.error(file, MATRIX_FIELD, f"points are outside the images: {mistake[0]}", mistake[1])
+        matrices.error(f"points are outside the images: {mistake[0]}", mistake[1])
         return
     if not seen.any():
         remedy = "camera-to-world with OpenGL axes, in the points' frame and unit (mm), is expected"
-        report.error(file, MATRIX_FIELD, "no camera has any point in its image", remedy)
+        matrices.error("no camera has any point in its image", remedy)
         return
     if scene.distance > 10 * FAR * scene.spread:
         message = f"cameras are far from the points: {scene.distance:.4g} mm, the points span {2 * scene.spread:.4g} mm"
-        report.error(file, MATRIX_FIELD, message, "metres for mm?")
+        matrices.error(message, "metres for mm?")
         return
     distances = np.linalg.norm(scene.cameras.centers - scene.center, axis=1)
-    for index, place in enumerate(parsed.places):
-        field = f"{place.field}.transform_matrix"
-        if distances[index] > FAR * scene.size:
-            message = f"camera is far from the points: {distances[index]:.4g} mm, others {scene.distance:.4g} mm"
-            report.error(place.file, field, message, "repair the pose or drop the frame")
-        elif seen[index] == 0:
-            message = "the camera has no point in its image"
-            report.warning(place.file, field, message, "a wrong pose, or a part of the scene that SfM missed")
+    for place, distance, share in zip(parsed.places, distances, seen, strict=True):
+        if distance > FAR * scene.size:
+            message = f"camera is far from the points: {distance:.4g} mm, others {scene.distance:.4g} mm"
+            place.child("transform_matrix").error(message, "repair the pose or drop the frame")
+        elif share == 0:
+            remedy = "a wrong pose, or a part of the scene that SfM missed"
+            place.child("transform_matrix").warning("the camera has no point in its image", remedy)
 
 
 def _camera_mistake(scene: _Scene, given: float) -> Mistake | None:
@@ -161,18 +160,14 @@ def _camera_mistake(scene: _Scene, given: float) -> Mistake | None:
     inverted = np.linalg.inv(opengl)
     farther = cameras.poses.copy()
     farther[:, :3, 3] *= 1000.0
-    opengl_remedy = "flip y and z: transform_matrix has OpenGL axes"
-    seen = {
-        ("camera axes are OpenCV's", opengl_remedy): cameras.sees(points, opengl),
-        ("matrices are world-to-camera", "invert them: camera-to-world is expected"): cameras.sees(
-            points, swap_camera_axes(inverted)
-        ),
-        ("matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"): cameras.sees(
-            points, inverted
-        ),
-        ("camera positions are in metres", ALL_IN_MM): cameras.sees(points, farther),
-        ("points are in metres", ALL_IN_MM): cameras.sees(points * 1000.0),
-    }
+    guesses = [
+        (opengl, "camera axes are OpenCV's", "flip y and z: transform_matrix has OpenGL axes"),
+        (swap_camera_axes(inverted), "matrices are world-to-camera", "invert them: camera-to-world is expected"),
+        (inverted, "matrices are world-to-camera with OpenCV axes", "invert them, then flip y and z"),
+        (farther, "camera positions are in metres", ALL_IN_MM),
+    ]
+    seen = {(what, remedy): cameras.sees(points, poses) for poses, what, remedy in guesses}
+    seen["points are in metres", ALL_IN_MM] = cameras.sees(points * 1000.0)
     return _likeliest(seen, given)
 
 
@@ -183,81 +178,72 @@ def _likeliest(seen: dict[Mistake, np.ndarray], given: float) -> Mistake | None:
     return best if shares[best] > max(SEEN_AGAIN, 3 * given) else None
 
 
-def _check_instruments(parsed: Parsed, scene: _Scene | None, report: ProblemReport) -> None:
+def _check_instruments(parsed: Parsed, scene: _Scene | None) -> None:
     """Report instruments far from the scene or outside every image, and the mistakes behind it."""
     if not parsed.registered and parsed.instruments:
         message = "instrument poses are 'unregistered': in a tracker's or robot's own frame, not the cameras' world"
         remedy = (
             "where an instrument is in the images must be learned, and cannot be checked here; register it if you can"
         )
-        report.warning(parsed.places[0].file, "instrument_frame", message, remedy)
+        parsed.header("instrument_frame").warning(message, remedy)
     everyone = _Cameras.of(parsed)
     for instrument in parsed.instruments:
         found = parsed.states_of(instrument.name)
         if not found:
             continue
-        places = [place for place, _ in found]
-        poses = np.stack([state.pose.numpy() for _, state in found])
-        if not _report_metres(instrument.name, poses, places[0], report) and parsed.registered:
+        name = printable(instrument.name)
+        poses = np.stack([state.pose.numpy() for _, state in found])  # [I, 4, 4]
+        origins = poses[:, :3, 3]
+        farthest = float(np.linalg.norm(origins, axis=1).max())
+        if np.ptp(origins, axis=0).max() > 0 and farthest < METRES:
+            message = f"positions of {name} stay within {farthest:.2g} mm of the frame's origin: metres?"
+            parsed.header(POSES).error(message, "give them in mm")
+        elif parsed.registered:
             has = np.array([instrument.name in frame.state.instruments for frame in parsed.frames])
             cameras = _Cameras(everyone.poses[has], everyone.intrinsics[has], everyone.sizes[has])
-            _check_placement(instrument.name, cameras, scene, poses, places, report)
-
-
-def _report_metres(name: str, poses: np.ndarray, place: Place, report: ProblemReport) -> bool:
-    """Report an instrument that moves, but never a millimetre from its frame's origin; True if so."""
-    origins = poses[:, :3, 3]
-    farthest = float(np.linalg.norm(origins, axis=1).max())
-    if np.ptp(origins, axis=0).max() == 0 or farthest >= METRES:
-        return False
-    message = f"positions of {printable(name)} stay within {farthest:.2g} mm of the frame's origin: metres?"
-    report.error(place.file, POSE_FIELD, message, "give them in mm")
-    return True
+            _check_placement(name, parsed.header(POSES), cameras, scene, poses, [place for place, _ in found])
 
 
 def _check_placement(
-    name: str, cameras: _Cameras, scene: _Scene | None, poses: np.ndarray, places: list[Place], report: ProblemReport
+    name: str, all_poses: Node, cameras: _Cameras, scene: _Scene | None, poses: np.ndarray, places: list[Node]
 ) -> None:
     """Check one registered instrument: the cameras, poses [I, 4, 4] and places of the frames that have it."""
-    file, instrument = places[0].file, f"instrument {printable(name)}"
     seen = cameras.sees(poses[:, None, :3, 3])[:, 0]  # [I]
     outside = "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
     if seen.mean() < SEEN_RARELY and (mistake := _instrument_mistake(cameras, poses, float(seen.mean()))) is not None:
-        report.error(file, POSE_FIELD, f"{instrument} is outside {outside}: {mistake[0]}", mistake[1])
+        all_poses.error(f"instrument {name} is outside {outside}: {mistake[0]}", mistake[1])
         return
     if scene is not None:
         distances = np.linalg.norm(poses[:, :3, 3] - scene.center, axis=1)
         far = np.flatnonzero(distances > FAR * scene.size + SENSOR_REACH_MM * (scene.distance > METRES))
         for index in far:
-            message = f"{instrument} is far from the points: {distances[index]:.4g} mm"
-            remedy = "pose and points must share frame and unit (mm)"
-            report.error(places[index].file, f"{places[index].field}.pose", message, remedy)
+            message = f"instrument {name} is far from the points: {distances[index]:.4g} mm"
+            places[index].child("pose").error(message, "pose and points must share frame and unit (mm)")
         if len(far):
             return
     elif np.median(np.linalg.norm(poses[:, :3, 3] - cameras.centers, axis=1)) < METRES:
-        report.error(file, POSE_FIELD, f"{instrument} is within {METRES:g} mm of the cameras: metres?", ALL_IN_MM)
+        all_poses.error(f"instrument {name} is within {METRES:g} mm of the cameras: metres?", ALL_IN_MM)
         return
-    if not seen.any():
-        _report_never_seen(name, cameras, poses, file, report)
+    if not seen.any():  # a sensor away from the instrument's visible part, or a wrong frame
+        (x, y, z), share = _visible_body_point(cameras, poses)
+        if share > 0.5:
+            point = f"({x:.0f}, {y:.0f}, {z:.0f})"
+            remedy = f"right only if the sensor sits away from the tip: the point {point} mm is in view"
+        else:
+            expected = "world_from_instrument in mm, in the cameras' world, is expected"
+            remedy = f"{expected} (quaternion order, axes, registration?)"
+        (all_poses.warning if share > 0.5 else all_poses.error)(f"the origin of {name} is outside every image", remedy)
     elif seen.mean() < SEEN_RARELY:
-        message = f"the origin of {printable(name)} is outside {outside}"
-        report.warning(file, POSE_FIELD, message, "right if its sensor sits far behind")
-    else:
-        _report_jumps(instrument, poses, seen, places, report)
-
-
-def _report_never_seen(name: str, cameras: _Cameras, poses: np.ndarray, file: str, report: ProblemReport) -> None:
-    """An origin outside every image: a sensor away from the instrument's visible part, or a wrong frame."""
-    message = f"the origin of {printable(name)} is outside every image"
-    (x, y, z), share = _visible_body_point(cameras, poses)
-    if share > 0.5:
-        remedy = f"right only if the sensor sits away from the tip: the point ({x:.0f}, {y:.0f}, {z:.0f}) mm is in view"
-        report.warning(file, POSE_FIELD, message, remedy)
-    else:
-        remedy = (
-            "world_from_instrument in mm, in the cameras' world, is expected (quaternion order, axes, registration?)"
-        )
-        report.error(file, POSE_FIELD, message, remedy)
+        message = f"the origin of {name} is outside {outside}"
+        all_poses.warning(message, "right if its sensor sits far behind")
+    else:  # single poses far away from all others, and out of view: tracker drop-outs
+        origins = poses[:, :3, 3]
+        distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
+        usual = max(float(np.median(distances)), METRES)
+        for index in np.flatnonzero((distances > FAR * usual) & ~seen):
+            message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
+            remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
+            places[index].child("pose").warning(message, remedy)
 
 
 def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarray, float]:
@@ -285,10 +271,9 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> M
     in_camera = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins) + cameras.centers
     flipped = np.einsum("fij,fj->fi", cameras.poses[:, :3, :3], origins * [1, -1, -1]) + cameras.centers
     in_world = "turn the poses into the cameras' world frame"
+    inverted = np.linalg.inv(poses)[:, :3, 3]
     guesses = {
-        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): np.linalg.inv(poses)[
-            :, :3, 3
-        ],
+        ("poses are instrument-from-world", "invert them: world_from_instrument is expected"): inverted,
         ("its world has y and z flipped (OpenGL axes)", in_world): origins * [1, -1, -1],
         ("its world has y and z swapped (y up)", in_world): origins[:, [0, 2, 1]] * [1, -1, 1],
         ("its world has z and y swapped (z up)", in_world): origins[:, [0, 2, 1]] * [1, 1, -1],
@@ -299,16 +284,3 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> M
     if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.centers, axis=1).max():
         guesses["cameras and points are in metres, its positions in mm", ALL_IN_MM] = origins / 1000.0
     return _likeliest({mistake: cameras.sees(moved[:, None]) for mistake, moved in guesses.items()}, given)
-
-
-def _report_jumps(
-    instrument: str, poses: np.ndarray, seen: np.ndarray, places: list[Place], report: ProblemReport
-) -> None:
-    """Single poses far away from all others, and out of view: tracker drop-outs."""
-    origins = poses[:, :3, 3]
-    distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
-    usual = max(float(np.median(distances)), METRES)
-    for index in np.flatnonzero((distances > FAR * usual) & ~seen):
-        message = f"{instrument} is {distances[index]:.4g} mm from where it usually is, and out of view"
-        remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
-        report.warning(places[index].file, f"{places[index].field}.pose", message, remedy)

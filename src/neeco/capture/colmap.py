@@ -8,13 +8,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
-from neeco.capture.documents import Parsed, Place, ProblemReport, inside, printable, relative_name
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
@@ -27,9 +28,6 @@ _MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
 }  # fmt: skip
-
-
-_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -70,86 +68,68 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _add_points(model / f"points3D{suffix}", parse_points, parsed, report)
+    _parse_points(model / f"points3D{suffix}", parse_points, parsed, report)
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
-        place = Place(file, printable(image.name))
-        frame = _frame(image, cameras, root, order, place, report)
-        if frame is not None:
-            parsed.frames.append(frame)
+        place = Node(None, file, printable(image.name), report)
+        try:
+            parsed.frames.append(_frame(image, cameras, root, order))
             parsed.places.append(place)
+        except NeecoError as error:
+            place.error_from(error)
     return parsed
 
 
-def _add_points(
+def _parse_points(
     path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
 ) -> None:
-    parsed.points_place = Place(relative_name(path, parsed.root), "")
+    parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)
     try:
-        rows = _parse(path, parse)
+        rows = np.array(_parse(path, parse), dtype=np.float64).reshape(-1, 6)
     except NeecoError as error:
-        report.error(parsed.points_place.file, "", str(error).removeprefix(f"{path}: "))
+        parsed.points_place.error(str(error).removeprefix(f"{path}: "))
         return
-    positions = np.array([row[:3] for row in rows], dtype=np.float32).reshape(-1, 3)
-    colors = np.array([row[3:6] for row in rows], dtype=np.float32).reshape(-1, 3) / 255
+    positions = rows[:, :3].astype(np.float32)
     if not np.isfinite(positions).all():
-        report.error(parsed.points_place.file, "", "holds points that are NaN or infinite", "remove them")
+        parsed.points_place.error("holds points that are NaN or infinite", "remove them")
         return
-    parsed.points = PointCloud(positions, colors.clip(0, 1))
+    parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
 
 
-def _frame(
-    image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int, place: Place, report: ProblemReport
-) -> Frame | None:
-    intrinsics, pose = cameras.get(image.camera_id), _world_from_camera(image)
-    if intrinsics is None:
-        message = f"uses camera {image.camera_id}, which the model lacks"
-        report.error(place.file, place.field, message, "export it again")
-        return None
-    if pose is None:
-        report.error(place.file, place.field, "its pose is not a finite unit quaternion and translation", "drop it")
-        return None
-    try:
-        focal = _pinhole(intrinsics)
-        path = inside(root, root / "images", image.name)
-    except NeecoError as error:
-        report.error_from(place.file, place.field, error)
-        return None
+def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int) -> Frame:
+    """Raises NeecoError, which does not name the frame."""
+    if image.camera_id not in cameras:
+        raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
+    intrinsics = cameras[image.camera_id]
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    camera = Camera(pose, *_pinhole(intrinsics), intrinsics.width, intrinsics.height)
+    path = inside(root, root / "images", image.name)
     if not path.is_file():
-        report.error(place.file, place.field, "no such file in images/", "put the undistorted images there")
-        return None
-    camera = Camera(torch.from_numpy(pose).float(), *focal, intrinsics.width, intrinsics.height)
-    split = "test" if order % TEST_EVERY == 0 else "train"
-    return Frame(path, camera, State(time=float(order)), split)
+        raise NeecoError("no such file in images/; put the undistorted images there")
+    return Frame(path, camera, State(time=float(order)), "test" if order % TEST_EVERY == 0 else "train")
 
 
 def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy. Raises NeecoError for distorted or impossible cameras."""
-    if camera.model == "SIMPLE_PINHOLE":
-        fx, cx, cy = camera.params
-        fy = fx
-    elif camera.model == "PINHOLE":
-        fx, fy, cx, cy = camera.params
-    else:
+    if camera.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
         raise NeecoError(
             f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
         )
+    fx, fy, cx, cy = (camera.params[0], *camera.params)[-4:]  # a simple one has one focal length
     usable = all(np.isfinite(camera.params)) and fx > 0 and fy > 0
     if not (usable and 0 < cx < camera.width and 0 < cy < camera.height and max(camera.width, camera.height) < 65_536):
         raise NeecoError("its camera has impossible intrinsics; repair the cameras file")
     return fx, fy, cx, cy
 
 
-def _world_from_camera(image: _Image) -> np.ndarray | None:
-    """[4, 4] from COLMAP's camera_from_world, None when it is no rigid transform."""
+def _world_from_camera(image: _Image) -> np.ndarray:
+    """[4, 4] from COLMAP's camera_from_world. Raises NeecoError when it is no rigid transform."""
     quaternion, translation = np.array(image.quaternion), np.array(image.translation)
-    if not (np.isfinite(quaternion).all() and np.isfinite(translation).all() and np.abs(translation).max() < 1e9):
-        return None
     norm = np.linalg.norm(quaternion)
-    if not 0.99 < norm < 1.01:
-        return None
+    if not (0.99 < norm < 1.01 and np.abs(translation).max() < 1e9):  # nor when NaN
+        raise NeecoError("its pose is not a finite unit quaternion and translation; drop it")
     rotation = quat_to_matrix(torch.from_numpy(quaternion / norm)).numpy()
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
@@ -157,7 +137,7 @@ def _world_from_camera(image: _Image) -> np.ndarray | None:
     return pose
 
 
-def _parse(path: Path, parse: Callable[[bytes], _Content]) -> _Content:
+def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:
     """`parse` applied to a file's content; damage becomes NeecoError."""
     content = read_bytes(path, "a file of a COLMAP model", "no such file; export the whole COLMAP model")
     try:
@@ -220,8 +200,7 @@ def _points_binary(content: bytes) -> list[tuple[float, ...]]:
 
 
 def _lines(content: bytes) -> list[str]:
-    lines = content.decode("utf-8").splitlines()
-    return [line for line in lines if not line.startswith("#")]
+    return [line for line in content.decode("utf-8").splitlines() if not line.startswith("#")]
 
 
 def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
@@ -239,10 +218,7 @@ def _cameras_text(content: bytes) -> dict[int, _Intrinsics]:
 def _images_text(content: bytes) -> list[_Image]:
     images = []
     # two lines an image; the second (observations) may be empty, so only every other line is read
-    lines = _lines(content)
-    while lines and not lines[0].strip():
-        lines.pop(0)
-    for line in lines[::2]:
+    for line in list(dropwhile(lambda line: not line.strip(), _lines(content)))[::2]:
         if line.strip():
             _, *pose, camera_id, name = line.split(maxsplit=9)
             values = tuple(map(float, pose))

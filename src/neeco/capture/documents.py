@@ -16,8 +16,6 @@ from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
 from neeco.raster.rotations import rigid_fault
 
-MATRIX_REMEDY = "give four rows of four numbers"
-
 
 @dataclass(frozen=True)
 class Problem:
@@ -47,11 +45,6 @@ class ProblemReport:
 
     def error(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("error", file, field, message, remedy))
-
-    def error_from(self, file: str, field: str, error: NeecoError) -> None:
-        """Report an exception of the form "what is wrong; what to do" that does not say where."""
-        message, _, remedy = str(error).partition("; ")
-        self.error(file, field, message, remedy)
 
     def warning(self, file: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(Problem("warning", file, field, message, remedy))
@@ -101,7 +94,7 @@ def as_float(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Node:
-    """A value of a JSON or YAML file and where it lies. A reading that fails reports one error and returns None.
+    """A value of a JSON or YAML file and its place. A reading that fails reports one error and returns None.
 
     Whether that ends the reading is the report's choice: `ProblemReport` collects, `RaisingReport` raises.
     """
@@ -114,8 +107,18 @@ class Node:
     def error(self, message: str, remedy: str = "") -> None:
         self.report.error(self.file, self.field, message, remedy)
 
+    def error_from(self, error: NeecoError) -> None:
+        """Report an exception of the form "what is wrong; what to do" that does not say where."""
+        message, _, remedy = str(error).partition("; ")
+        self.error(message, remedy)
+
     def warning(self, message: str, remedy: str = "") -> None:
         self.report.warning(self.file, self.field, message, remedy)
+
+    @property
+    def reported(self) -> bool:
+        """Whether a problem of this place is known already."""
+        return any((problem.file, problem.field) == (self.file, self.field) for problem in self.report.problems)
 
     def has(self, key: str) -> bool:
         """Whether the object has this key with a value other than null."""
@@ -127,13 +130,18 @@ class Node:
         value = self.value.get(key) if isinstance(self.value, dict) else None
         return Node(value, self.file, path, self.report)
 
+    def item(self, index: int) -> Node:
+        """The element `index` of a list (None when this is not one)."""
+        value = self.value[index] if isinstance(self.value, list) else None
+        return Node(value, self.file, f"{self.field}[{index}]", self.report)
+
     def items(self) -> Iterator[Node]:
         """The elements of a list; reports an error and yields nothing when this is not a list."""
         if not isinstance(self.value, list):
             self.error(f"expected a list, found {printable(self.value)}")
             return
-        for index, value in enumerate(self.value):
-            yield Node(value, self.file, f"{self.field}[{index}]", self.report)
+        for index in range(len(self.value)):
+            yield self.item(index)
 
     def is_object(self) -> bool:
         """Whether this is an object; reports an error otherwise."""
@@ -198,31 +206,24 @@ class Node:
 
     def rigid(self) -> np.ndarray | None:
         """A rigid transform [4, 4] float64: a rotation in its corner and the row 0 0 0 1, which may be left out."""
-        rows = self.value
-        if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
-            found = "is missing" if rows is None else f"expected a 4x4 matrix, found {printable(rows)}"
-            self.error(found, MATRIX_REMEDY)
-            return None
-        if any(len(row) != 4 for row in rows):
-            self.error("expected a 4x4 matrix, found rows of another length", MATRIX_REMEDY)
+        rows, wrong = self.value, ""
+        if rows is None:
+            wrong = "is missing"
+        elif not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) for row in rows):
+            wrong = f"expected a 4x4 matrix, found {printable(rows)}"
+        elif any(len(row) != 4 for row in rows):
+            wrong = "expected a 4x4 matrix, found rows of another length"
+        elif any(as_float(entry) is None for row in rows for entry in row):
+            wrong = "expected a 4x4 matrix, found an entry that is not a number"
+        if wrong:
+            self.error(wrong, "give four rows of four numbers")
             return None
         numbers = [[as_float(entry) for entry in row] for row in rows]
-        if any(entry is None for row in numbers for entry in row):
-            self.error("expected a 4x4 matrix, found an entry that is not a number", MATRIX_REMEDY)
-            return None
         matrix = np.array([*numbers, [0.0, 0.0, 0.0, 1.0]][:4], dtype=np.float64)
-        if (fault := rigid_fault(matrix)) is not None:
+        fault = rigid_fault(matrix)
+        if fault is not None:
             self.error(*fault)
-            return None
-        return matrix
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a frame is described: file and field, for messages."""
-
-    file: str
-    field: str
+        return matrix if fault is None else None
 
 
 @dataclass
@@ -235,15 +236,19 @@ class Parsed:
 
     root: Path
     frames: list[Frame] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)  # of each frame
+    places: list[Node] = field(default_factory=list)  # where each frame is described
     instruments: tuple[Instrument, ...] = ()
     points: PointCloud | None = None  # None: none named
-    points_place: Place = Place("", "")
+    points_place: Node | None = None
     registered: bool = True
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
+
+    def header(self, field: str) -> Node:
+        """The place `field` of the file that describes the first frame."""
+        return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
         """The same without the frames whose camera is a placeholder."""
@@ -251,15 +256,13 @@ class Parsed:
         frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
         return replace(self, frames=frames, places=places, without_camera=set())
 
-    def states_of(self, name: str) -> list[tuple[Place, InstrumentState]]:
+    def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
         """(place of the state, state) of one instrument, over the frames that have it."""
-        found = []
-        for frame, place in zip(self.frames, self.places, strict=True):
-            if name in frame.state.instruments:
-                index = list(frame.state.instruments).index(name)
-                state = frame.state.instruments[name]
-                found.append((Place(place.file, f"{place.field}.instruments[{index}]"), state))
-        return found
+        return [
+            (place.child("instruments").item(list(frame.state.instruments).index(name)), frame.state.instruments[name])
+            for frame, place in zip(self.frames, self.places, strict=True)
+            if name in frame.state.instruments
+        ]
 
 
 def inside(root: Path, folder: Path, text: str) -> Path:

@@ -7,13 +7,13 @@ row, then the nearest and farthest depth; the columns of R are the camera's down
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from neeco.capture.documents import Node, Parsed, Place, ProblemReport, inside, printable
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.points import random_points
@@ -51,27 +51,32 @@ def parse_endonerf(root: Path, report: ProblemReport) -> Parsed:
     Images are paired with poses by sorted name. There are no instrument states; tool masks and depth maps are not used;
     where the depth bounds are usable, random points fill the space between them.
     """
-    parsed = Parsed(root, timed=False, points_place=Place(POSES_FILE, "points"), is_endonerf=True)
-    table = _load(root, report)
-    if table is None:
+    file = Node(None, POSES_FILE, "", report)
+    parsed = Parsed(root, timed=False, points_place=file.child("points"), is_endonerf=True)
+    try:
+        table = _load(root)
+    except NeecoError as error:
+        file.error_from(error)
         return parsed
     images = folder_images(root, "images", report)
     if len(images) != len(table):
         message = f"has {len(table)} rows for {len(images)} images in images/"
-        report.error(POSES_FILE, "", message, "each image needs one row, in the order of the sorted names")
+        file.error(message, "each image needs one row, in the order of the sorted names")
         return parsed
-    rows = [_row(values, f"[{index}]", report) for index, values in enumerate(table)]
-    for order, (path, row) in enumerate(zip(images, rows, strict=True)):
+    rows = []
+    for order, (path, values) in enumerate(zip(images, table, strict=True)):
+        place = file.item(order)
+        row = _row(values, place)
         if row is None:
             continue
+        rows.append(row)
         pose = torch.from_numpy(row.world_from_camera).float()
         camera = Camera(pose, row.focal, row.focal, row.width / 2, row.height / 2, row.width, row.height)
         split = "test" if order % TEST_EVERY == FIRST_TEST else "train"
         parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
-        parsed.places.append(Place(POSES_FILE, f"[{order}]"))
-    usable = [row for row in rows if row is not None]
-    parsed.points = _points(usable)
-    _warn_of_limits(root, usable, report)
+        parsed.places.append(place)
+    parsed.points = _points(rows)
+    _warn_of_limits(root, rows, file)
     return parsed
 
 
@@ -86,43 +91,38 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
         try:
             paths.append(inside(root, root / folder, path.name))
         except NeecoError as error:
-            report.error_from(f"{folder}/{path.name}", "", error)
+            Node(None, f"{folder}/{path.name}", "", report).error_from(error)
     return paths
 
 
-def _load(root: Path, report: ProblemReport) -> np.ndarray | None:
-    """The table [N, 17] as float64."""
+def _load(root: Path) -> np.ndarray:
+    """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
     remedy = "write an array of N x 17 numbers with numpy.save"
+    path = inside(root, root, POSES_FILE)
     try:
         # mapped, so that a wrong header cannot make us allocate more than the file holds
         with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
-            table = np.load(inside(root, root, POSES_FILE), mmap_mode="r", allow_pickle=False)
-    except NeecoError as error:
-        report.error_from(POSES_FILE, "", error)
-        return None
+            table = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception:  # damaged headers make numpy raise nearly anything
-        report.error(POSES_FILE, "", "is damaged or not an array of plain numbers", remedy)
-        return None
+        raise NeecoError(f"is damaged or not an array of plain numbers; {remedy}") from None
     if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu":
-        report.error(POSES_FILE, "", "is not an array of plain numbers", remedy)
-        return None
+        raise NeecoError(f"is not an array of plain numbers; {remedy}")
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
-        report.error(POSES_FILE, "", f"has shape {printable(table.shape)}, expected N x {COLUMNS}", remedy)
-        return None
+        raise NeecoError(f"has shape {printable(table.shape)}, expected N x {COLUMNS}; {remedy}")
     return np.array(table, dtype=np.float64)
 
 
-def _row(values: np.ndarray, field: str, report: ProblemReport) -> _Row | None:
+def _row(values: np.ndarray, place: Node) -> _Row | None:
     matrix = values[:15].reshape(3, 5)
     down, right, back, origin = (matrix[:, column] for column in range(4))
     with np.errstate(invalid="ignore"):
         pose = np.stack([right, down, -back, origin], axis=1)
-    rigid = Node(pose.tolist(), POSES_FILE, field, report).rigid()
+    rigid = replace(place, value=pose.tolist()).rigid()
     height, width, focal = (float(value) for value in matrix[:, 4])
     sized = 1 <= height < 65_536 and 1 <= width < 65_536 and height % 1 == 0 and width % 1 == 0
     if not (sized and np.isfinite(focal) and focal > 0):
         message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}"
-        report.error(POSES_FILE, field, message, "write whole pixels and a positive focal length in the fifth column")
+        place.error(message, "write whole pixels and a positive focal length in the fifth column")
         return None
     if rigid is None:
         return None
@@ -142,23 +142,23 @@ def _points(rows: list[_Row]) -> PointCloud | None:
     return random_points(centers.mean(axis=0), max(half_width, half_depth))
 
 
-def _warn_of_limits(root: Path, rows: list[_Row], report: ProblemReport) -> None:
+def _warn_of_limits(root: Path, rows: list[_Row], file: Node) -> None:
+    """Warn of what such a folder lacks, and of what in it is not read."""
     remedy = "only methods that need none can be trained, such as 3dgs"
-    report.warning(POSES_FILE, "instruments", "no instrument states", remedy)
-    report.warning(POSES_FILE, "units", "names no unit of length", "lengths are taken as mm: distances may be off")
+    file.child("instruments").warning("no instrument states", remedy)
+    file.child("units").warning("names no unit of length", "lengths are taken as mm: distances may be off")
     poses = np.stack([row.world_from_camera for row in rows]) if rows else np.zeros((0, 4, 4))
     if len(poses) > 1 and np.ptp(poses, axis=0).max() < STILL:
         message = "the camera never moves, so the images do not tell depth"
-        report.warning(POSES_FILE, "poses", message, "views other than the recorded one will be wrong")
+        file.child("poses").warning(message, "views other than the recorded one will be wrong")
     elif len(poses) > 1:
-        message = "camera axes are taken as LLFF's: down, right, backwards"
         remedy = "folders prepared for some EndoNeRF successors hold right, down, forwards: reorder those"
-        report.warning(POSES_FILE, "poses", message, remedy)
+        file.child("poses").warning("camera axes are taken as LLFF's: down, right, backwards", remedy)
     if (root / MASKS).is_dir():
         message = "tool masks (white = tool) are not loss masks (black = ignored) and are left out"
         remedy = (
             f"`neeco ingest {printable(root.name)} --output CAPTURE` turns them into loss masks that ignore the tool"
         )
-        report.warning(f"{MASKS}/", "", message, remedy)
+        file.report.warning(f"{MASKS}/", "", message, remedy)
     if (root / "depth").is_dir():
-        report.warning("depth/", "", "depth maps are not read", "training starts from random points")
+        file.report.warning("depth/", "", "depth maps are not read", "training starts from random points")

@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
@@ -34,6 +36,10 @@ class InstrumentState:
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
 
+    if TYPE_CHECKING:  # what may be given
+
+        def __init__(self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ...) -> None: ...
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))
 
@@ -42,11 +48,20 @@ class InstrumentState:
 class State:
     """Everything that moves, at one moment: each instrument's state by its name, and the time.
 
-    State({"grasper": InstrumentState(world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
+    An instrument's state may be given as (pose, joints), too: world_from_instrument [4, 4] in mm, and name -> rad.
+
+        State({"grasper": (world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
     """
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
+
+    def __post_init__(self) -> None:
+        given = {
+            name: InstrumentState(*state) if isinstance(state, tuple) else state
+            for name, state in self.instruments.items()
+        }
+        object.__setattr__(self, "instruments", given)
 
     def to(self, device: torch.device | str) -> State:
         """The same state, its poses on `device`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from neeco.capture.colmap import find_model, parse_colmap
-from neeco.capture.documents import Parsed, ProblemReport, errors_only, inside
+from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
 from neeco.capture.model import Capture
 from neeco.capture.points import points_in_view
@@ -52,7 +52,7 @@ def parse_capture(
     try:
         file = inside(path, path, transforms)
     except NeecoError as error:
-        report.error_from(transforms, "", error)
+        Node(None, transforms, "", report).error_from(error)
         return Parsed(path)
     if file.is_file():
         document = load_document(file, path, report)

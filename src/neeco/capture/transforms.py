@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.documents import Node, Parsed, Place, ProblemReport, inside, printable, relative_name
+from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.images import EXTENSIONS, image_size
 from neeco.capture.model import Frame, State, swap_camera_axes
 from neeco.capture.points import random_points, read_ply
@@ -78,7 +78,7 @@ def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0) 
         parsed.timed = True
     if parsed.points is None:
         parsed.points = random_points(np.zeros(3), BLENDER_HALF_SIZE)
-        parsed.points_place = Place(next(iter(files.values())).file, "ply_file_path")
+        parsed.points_place = next(iter(files.values())).child("ply_file_path")
     return parsed
 
 
@@ -126,10 +126,14 @@ def _parse_frames(
     for index, node in enumerate(nodes.items()):
         if not node.is_object():
             continue
-        image_path = _image_path(node, folder, parsed.root, extensions)
+        image_path = None
+        if (file := node.child("file_path")).value is None:
+            file.error("is missing", "name the frame's image")
+        else:
+            image_path = _file(file, folder, parsed.root, extensions)
         name = splits.of(node, index)
         pose = node.child("transform_matrix").rigid()
-        mask_path = _optional_file(node, "mask_path", folder, parsed.root)
+        mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
         time = node.child("time").number() if node.has("time") else float(index)
         timed += node.has("time")
         instruments = parse_instruments(node)
@@ -147,7 +151,7 @@ def _parse_frames(
             opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
             camera = replace(camera, world_from_camera=opencv)
         parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
-        parsed.places.append(Place(node.file, node.field))
+        parsed.places.append(node)
     header.pass_on()
     if nodes.value == []:
         nodes.error("is empty", "list the images and their cameras there")
@@ -159,20 +163,19 @@ def _parse_frames(
 
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
-    parsed.points_place = Place(document.file, "ply_file_path")
-    path = _optional_file(document, "ply_file_path", folder, parsed.root)
+    parsed.points_place = document.child("ply_file_path")
+    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
     if path is None:
         return
-    parsed.points_place = Place(relative_name(path, parsed.root), "vertex")
+    name = relative_name(path, parsed.root)
+    parsed.points_place = Node(None, name, "vertex", document.report)
     try:
         parsed.points = read_ply(path)
     except NeecoError as error:
-        document.report.error(relative_name(path, parsed.root), "", str(error).removeprefix(f"{path}: "))
+        document.report.error(name, "", str(error).removeprefix(f"{path}: "))
         return
-    bad = int((~np.isfinite(parsed.points.positions).all(axis=1)).sum())
-    if bad:
-        place = parsed.points_place
-        document.report.error(place.file, place.field, f"{bad} points are NaN or infinite", "remove them from the file")
+    if bad := int((~np.isfinite(parsed.points.positions).all(axis=1)).sum()):
+        parsed.points_place.error(f"{bad} points are NaN or infinite", "remove them from the file")
         parsed.points = None
 
 
@@ -207,18 +210,6 @@ class _Splits:
         return "test" if index % TEST_EVERY == 0 else "train"
 
 
-def _image_path(frame: Node, folder: Path, root: Path, extensions: tuple[str, ...]) -> Path | None:
-    node = frame.child("file_path")
-    if node.value is None:
-        node.error("is missing", "name the frame's image")
-        return None
-    return _file(node, folder, root, extensions)
-
-
-def _optional_file(parent: Node, key: str, folder: Path, root: Path) -> Path | None:
-    return _file(parent.child(key), folder, root) if parent.has(key) else None
-
-
 def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:
     """The existing file inside the capture that a node names; `extensions` are tried on paths without one."""
     text = node.text()
@@ -227,7 +218,7 @@ def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()
     try:
         candidates = [inside(root, folder, text + extension) for extension in ("", *extensions)]
     except NeecoError as error:
-        node.report.error_from(node.file, node.field, error)
+        node.error_from(error)
         return None
     for candidate in candidates:
         if candidate.is_file():

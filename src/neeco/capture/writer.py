@@ -41,12 +41,13 @@ def write_capture(
     capture and `overwrite` is not set.
 
         frames = [
-            Frame(f"{k:04d}.png", Camera(world_from_camera[k], fx, fy, cx, cy, width, height),
+            Frame(Path(f"{k:04d}.png"), Camera(world_from_camera[k], fx, fy, cx, cy, width, height),
                   State({"grasper": InstrumentState(world_from_grasper[k], {"jaw_angle": jaw[k]})}, time=k / 25),
                   split="test" if k % 8 == 0 else "train")
             for k in range(len(pixels))
         ]
-        capture = Capture("mine", frames, (Instrument("grasper", {"jaw_angle": (0.0, 1.2)}),), PointCloud(xyz, rgb))
+        grasper = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
+        capture = Capture(Path("mine"), tuple(frames), (grasper,), PointCloud(xyz, rgb))
         write_capture(capture, "mine", images=pixels)
     """
     path = Path(path)
@@ -162,18 +163,13 @@ def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray
         target = f"images/{name}{frame.image_path.suffix}"
         _copy(frame.image_path, path / target)
         return target
-    target = f"images/{name}.png"
-    write_image(path / target, frame.load_image() if image is None else _checked(image, frame))
-    return target
-
-
-def _checked(image: Tensor | np.ndarray, frame: Frame) -> Tensor:
-    """Given pixels as floats in [0, 1]. Raises NeecoError when they are not of the camera's size."""
-    pixels = torch.as_tensor(image)
+    pixels = frame.load_image() if image is None else torch.as_tensor(image)
     wanted = (frame.camera.height, frame.camera.width, 3)
     if tuple(pixels.shape) != wanted:
         raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
-    return pixels / 255 if pixels.dtype == torch.uint8 else pixels
+    target = f"images/{name}.png"
+    write_image(path / target, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
+    return target
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -2,39 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from neeco.cli._output import fitted
 from neeco.experiments.ablations import AblationPlan
 
+if TYPE_CHECKING:
+    from neeco.experiments.ablation_study import AblationResult
+
 
 def run(plan: AblationPlan) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.ablation_study import run_ablations, write_tables
+    from neeco.experiments.ablation_study import run_ablations
     from neeco.report.study_pages import write_ablation_report
 
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
-    write_tables(plan.output, ablation)
     page = write_ablation_report(plan.output, ablation)
     _print_tables(Console(), ablation)
     for line in (f"tables: {plan.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):
         print(line)
-    return 1 if ablation["failures"] else 0
+    return 1 if ablation.failures else 0
 
 
-def _print_tables(console: Console, ablation: dict[str, Any]) -> None:
+def _print_tables(console: Console, ablation: AblationResult) -> None:
     """Of the paper's tables how many of its directions hold, ours whole, then the notes."""
     from neeco.experiments.ablation_study import agreement, grid
 
-    for table in ablation["tables"]:
-        if table["judged"]:
-            console.print(f"{table['title']}: {agreement(table)}", markup=False, highlight=False)
+    for table in ablation.tables:
+        if table.judged:
+            console.print(f"{table.title}: {agreement(table)}", markup=False, highlight=False)
             continue
         for piece in fitted(grid(table), console.width):
             console.print(piece)
-    for note in ablation["notes"]:
+    for note in ablation.notes:
         console.print(f"note: {note}", style="dim", markup=False, highlight=False)

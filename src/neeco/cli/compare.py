@@ -48,7 +48,7 @@ class Compare:
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A field of every method's training config, as NAME=VALUE (e.g. tissue_budget=5000); repeatable."""
+    """A field of every method's training config, as NAME=VALUE (e.g. max_tissue_gaussians=5000); repeatable."""
     lpips_weights: Path | None = None
     """Folder with alexnet.safetensors and/or vgg16.safetensors (or set NEECO_LPIPS_WEIGHTS)."""
     device: Device = "auto"
@@ -57,7 +57,7 @@ class Compare:
 def run(args: Compare) -> int:
     """Compare with progress bars; print the tables and where the files lie; 1 when a run failed."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.comparison import absent_notes, budget_words, compare, failures, plan_comparison, tables_of
+    from neeco.experiments.comparison import absent_notes, budget_words, compare, plan_comparison, tables_of
     from neeco.report.study_pages import write_comparison_report
 
     with Bars() as bars:
@@ -71,8 +71,8 @@ def run(args: Compare) -> int:
     for table in tables_of(comparison):
         for part in fitted(table, console.width):
             console.print(part)
-    notes, failed = absent_notes(comparison), failures(comparison)
-    return print_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison['jobs'])} runs")
+    notes, failed = absent_notes(comparison), comparison.failures
+    return print_outcome(console, args.output, "comparison", page, notes, failed, f"{len(comparison.jobs)} runs")
 
 
 def _spec(args: Compare) -> ComparisonSpec:

@@ -35,14 +35,14 @@ def run(arguments: Arguments) -> int:
     from neeco.raster.devices import device_of
     from neeco.scene.scene import gaussian_scene
     from neeco.training.run import open_run
-    from neeco.viewer.splats import splats_of, standing, write_splats
+    from neeco.viewer.splats import exported_state, splats_of, write_splats
 
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         scene = gaussian_scene(trained.scene, "export")
         frames = len(scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
-        splats = splats_of(scene, *standing(scene, arguments.frame, arguments.states))
+        splats = splats_of(scene, *exported_state(scene, arguments.frame, arguments.states))
     output = arguments.output or arguments.run / f"scene.{arguments.format}"
     write_splats(splats, output, arguments.format)
     print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without hinges and labels")

@@ -49,19 +49,19 @@ def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
-    from neeco.training.options import variant_config
+    from neeco.training.config import training_config
 
-    config = variant_config(
+    config = training_config(
         args.method,
         {
             "iterations": args.iterations,
-            "views_per_step": args.batch_size,
+            "batch_size": args.batch_size,
             "minutes": args.minutes,
             "seed": args.seed,
             "transforms": args.transforms,
             "joints": args.joints,
-            "tissue_budget": args.max_tissue_gaussians,
-            "instrument_budget": args.max_instrument_gaussians,
+            "max_tissue_gaussians": args.max_tissue_gaussians,
+            "max_instrument_gaussians": args.max_instrument_gaussians,
         },
         args.set,
     )

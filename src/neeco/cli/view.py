@@ -40,10 +40,10 @@ def run(arguments: Arguments) -> int:
         raise NeecoError("view: no run given; give one, or two to compare")
     if arguments.export is not None:
         return _export(arguments, arguments.export)
-    from neeco.viewer.server import Viewer
+    from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
-    with Viewer(arguments.runs, arguments.host, arguments.port, device) as viewer:
+    with ViewerServer(arguments.runs, arguments.host, arguments.port, device) as viewer:
         try:
             print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
             if not arguments.no_browser:

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.align import align_frame, pose_changes
+from neeco.evaluation.align import fit_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import Reference, load_reference
-from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, iou, mean_of, to_truth_ids
+from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, finite, iou, mean_of, to_truth_ids
 from neeco.files import write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
@@ -34,18 +34,6 @@ EVALUATION_FILE = "evaluation.json"
 TIMED_DRAWS = 7
 TIMED_SECONDS = 10.0  # after which a slow scene is not drawn again
 LPIPS_KEYS = {"alexnet": "lpips", "vgg16": "lpips_vgg"}  # AlexNet is the one its authors score with
-SCORES = (
-    "psnr",
-    "ssim",
-    "lpips",
-    "lpips_vgg",
-    "psnr_instrument",
-    "mask_iou",
-    "mask_dice",
-    "psnr_covered",
-    "psnr_uncovered",
-    "covered_fraction",
-)
 Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 
 
@@ -53,7 +41,8 @@ Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 class _Tally:
     """Scores of the frames of one split, drawn at one kind of pose."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
+    scores: list[dict[str, float | None]] = field(default_factory=list)
     parts: PartTally = field(default_factory=PartTally)
 
 
@@ -124,7 +113,7 @@ def evaluate_run(
         notes += _split_notes(split, result["given"][split])
     names = [list(name) for name in scene.label_names]
     labels = {"threshold": threshold_of(scene), "names": names, "jaw_assignment": jaw_assignment}
-    evaluation: dict[str, Any] = _finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
+    evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -157,42 +146,46 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
-            state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
+            fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
+            state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         drawing = draw(scene, state, camera)
-        tally.rows.append(row | _scores(drawing, recorded, networks))
+        tally.scores.append(_scores(drawing, recorded, networks))
+        tally.rows.append(row | tally.scores[-1])
         if drawing.parts is not None and reference is not None and reference.parts is not None:
             tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), reference.parts, mask)
 
 
 def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
-    """All numbers of one frame, by the names in SCORES; None where there is nothing to compare with."""
+    """All numbers of one frame; None where there is nothing to compare with."""
     image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((recorded.tissue & counted).sum())
-    row: dict[str, float | None] = dict.fromkeys(SCORES)
-    row["psnr"] = psnr(image, target, counted)
-    row["ssim"] = ssim(image, target, mask)
-    row["psnr_covered"] = psnr(image, target, counted & ~recorded.unobserved)
-    row["psnr_uncovered"] = psnr(image, target, counted & recorded.unobserved)
-    row["covered_fraction"] = 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None
+    drawn = None if drawing.parts is None or reference is None else drawing.parts > 0
     shown = image if mask is None else torch.where(mask[..., None], image, target)
-    for name, network in networks.items():
-        row[LPIPS_KEYS[name]] = network.between(network.features(shown), recorded.features[name], mask)
-    if reference is not None:
-        row["psnr_instrument"] = psnr(image, target, counted & reference.mask)
-        if drawing.parts is not None:
-            row["mask_iou"] = iou(drawing.parts > 0, reference.mask, counted)
-            row["mask_dice"] = dice(drawing.parts > 0, reference.mask, counted)
-    return row
+    lpips = {
+        name: network.between(network.features(shown), recorded.features[name], mask)
+        for name, network in networks.items()
+    }
+    return {
+        "psnr": psnr(image, target, counted),
+        "ssim": ssim(image, target, mask),
+        **{key: lpips.get(name) for name, key in LPIPS_KEYS.items()},
+        "psnr_instrument": None if reference is None else psnr(image, target, counted & reference.mask),
+        "mask_iou": None if reference is None or drawn is None else iou(drawn, reference.mask, counted),
+        "mask_dice": None if reference is None or drawn is None else dice(drawn, reference.mask, counted),
+        "psnr_covered": psnr(image, target, counted & ~recorded.unobserved),
+        "psnr_uncovered": psnr(image, target, counted & recorded.unobserved),
+        "covered_fraction": 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None,
+    }
 
 
 def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], str | None]:
     """Means over the frames that have the number, and which way the jaws were matched."""
-    numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.rows]) for key in SCORES}
-    numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.rows)
+    numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
+    numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
     known = {part for _, part in scene.label_names}
     known |= {"jaws"} & {"jaws" for part in known if part in ("jaw_left", "jaw_right")}
     parts: dict[str, float | None] = dict.fromkeys(PART_SCORES)
@@ -248,14 +241,3 @@ def _split_notes(split: str, numbers: dict[str, Any]) -> list[str]:
     if math.isnan(numbers["psnr_uncovered"]):
         notes.append(f"{split}: psnr_uncovered: null, the training frames saw all its tissue")
     return notes
-
-
-def _finite(value: Any) -> Any:
-    """The same structure with NaN and infinity as None: JSON has no such numbers."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -68,7 +68,12 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         image = torch.where(mask[..., None], image, target)
     x = image.permute(2, 0, 1)  # [3, H, W]
     y = target.permute(2, 0, 1).to(x.dtype)
-    blurred = _blur(torch.cat([x, y, x * x, y * y, x * y]))  # [15, H, W]
+    planes = torch.cat([x, y, x * x, y * y, x * y])  # [15, H, W]
+    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window, pad = (weights / weights.sum()).to(planes), SSIM_WINDOW // 2
+    rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))  # separable: two passes of 11 taps
+    blurred = conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = blurred.split(3)
     var_x = mean_xx - mean_x * mean_x
     var_y = mean_yy - mean_y * mean_y
@@ -79,16 +84,6 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     if mask is not None:
         values = values[mask]
     return float(values.mean()) if values.numel() else math.nan
-
-
-def _blur(planes: Tensor) -> Tensor:
-    """Gaussian blur of [C, H, W] planes with zero padding; the window is separable, so two passes of 11 taps."""
-    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    window = (weights / weights.sum()).to(planes)
-    pad = SSIM_WINDOW // 2
-    rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))
-    return conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
 
 
 @dataclass(frozen=True)
@@ -102,19 +97,20 @@ class Convolution:
     tap: bool
 
 
-_ALEXNET = (
-    Convolution(11, 4, 2, None, True),
-    Convolution(5, 1, 2, (3, 2), True),
-    Convolution(3, 1, 1, (3, 2), True),
-    Convolution(3, 1, 1, None, True),
-    Convolution(3, 1, 1, None, True),
-)
-_VGG16 = tuple(
-    Convolution(3, 1, 1, (2, 2) if block > 0 and index == 0 else None, index == depth - 1)
-    for block, depth in enumerate((2, 2, 3, 3, 3))
-    for index in range(depth)
-)
-NETWORKS: dict[str, tuple[Convolution, ...]] = {"alexnet": _ALEXNET, "vgg16": _VGG16}
+NETWORKS: dict[str, tuple[Convolution, ...]] = {
+    "alexnet": (
+        Convolution(11, 4, 2, None, True),
+        Convolution(5, 1, 2, (3, 2), True),
+        Convolution(3, 1, 1, (3, 2), True),
+        Convolution(3, 1, 1, None, True),
+        Convolution(3, 1, 1, None, True),
+    ),
+    "vgg16": tuple(
+        Convolution(3, 1, 1, (2, 2) if block > 0 and index == 0 else None, index == depth - 1)
+        for block, depth in enumerate((2, 2, 3, 3, 3))
+        for index in range(depth)
+    ),
+}
 
 
 @dataclass(frozen=True)

@@ -165,15 +165,11 @@ def open_truth(
         if splits is not None:
             raise NeecoError(f"--splits: {truth} is a folder of masks and has no splits; give the capture instead")
         return open_masks(truth, classes, "--truth-classes")
-    capture, path = truth, truth.root
+    path = truth.root
     for split in splits or ():
-        if split not in capture.splits:
-            raise NeecoError(f"--splits: {path} has no split {split!r}; it has {', '.join(capture.splits)}")
-    frames = capture.frames if splits is None else [frame for split in splits for frame in capture.split(split)]
-    return _capture_masks(path, frames, classes)
-
-
-def _capture_masks(path: Path, frames: Sequence[Frame], classes: Mapping[int, str] | None) -> Masks:
+        if split not in truth.splits:
+            raise NeecoError(f"--splits: {path} has no split {split!r}; it has {', '.join(truth.splits)}")
+    frames = truth.frames if splits is None else [frame for split in splits for frame in truth.split(split)]
     files: dict[str, Path] = {}
     masked: dict[str, Frame] = {}
     for frame in frames:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -56,8 +56,8 @@ def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tenso
 class PartTally:
     """Gathers per-part IoU over the frames of a split.
 
-    Which jaw is "left" is a name a scene learned from images cannot know, so both assignments of the two jaws are kept
-    and the better one over the whole split is reported (never the better one per frame).
+    A scene learned from images cannot know which jaw is called left: both assignments of the two jaws are counted, and
+    the better one over the whole split is reported (never the better one per frame).
     """
 
     frames: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"as named": [], "swapped": []})
@@ -96,6 +96,17 @@ def mean_of(values: Sequence[float | None]) -> float:
     return sum(numbers) / len(numbers) if numbers else math.nan
 
 
+def finite(value: Any) -> Any:
+    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
 def boundary_pixels(mask: np.ndarray) -> np.ndarray:
     """Contour of a bool mask [H, W], one pixel wide: pixels that differ from their right, lower or lower right
     neighbour. What the image's edge cuts off is no contour."""
@@ -122,18 +133,14 @@ def boundary_f(
     if not judged[0] or not judged[1]:
         return float(judged[0] == judged[1] and mask.any() == truth.any())
     radius = math.ceil(tolerance * math.hypot(*mask.shape))
-    window = _window(contours[0] | contours[1])  # distances outside it are never asked for
+    either = contours[0] | contours[1]
+    (window,) = ndimage.find_objects(either.astype(np.uint8))  # distances outside it are never needed
     first, second, inside = (image[window] for image in (*contours, everywhere))
     near_second = ndimage.distance_transform_edt(~second) <= radius
     near_first = ndimage.distance_transform_edt(~first) <= radius
     precision = int((first & inside & near_second).sum()) / judged[0]
     recall = int((second & inside & near_first).sum()) / judged[1]
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-def _window(pixels: np.ndarray) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
@@ -174,6 +181,4 @@ def average_precision(
 
 def _matches(fits: np.ndarray) -> int:
     """How many pairs can be made where each row and each column is used once at most."""
-    if not fits.any():
-        return 0
-    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum())
+    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum()) if fits.any() else 0

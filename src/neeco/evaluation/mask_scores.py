@@ -1,9 +1,9 @@
-"""Any folder of masks against the truth: overlap, contours and boxes, of the instrument and of each part."""
+"""Score any folder of masks against the truth: overlap, contours and boxes, of the instrument and of each part."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,27 @@ from typing import Any
 import numpy as np
 
 from neeco import __version__
-from neeco.capture import Capture
+from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
-from neeco.evaluation.mask_metrics import TRUTH_PARTS, average_precision, boundary_f, boxes_of, dice, iou, mean_of
+from neeco.evaluation.mask_metrics import (
+    TRUTH_PARTS,
+    average_precision,
+    boundary_f,
+    boxes_of,
+    dice,
+    finite,
+    iou,
+    mean_of,
+)
 
 SCHEMA = "neeco-mask-scores/1"
-SCORES = ("iou", "dice", "boundary_f", "box_ap", "box_ap50")
+OVERLAPS = ("iou", "dice", "boundary_f")  # of each image
+SCORES = (*OVERLAPS, "box_ap", "box_ap50")
 LEFT, RIGHT, JAWS = "jaw_left", "jaw_right", "jaws"
 INSTRUMENT = "instrument"
 SWAP = {LEFT: RIGHT, RIGHT: LEFT}
+Tables = Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to it
 
 
 @dataclass(frozen=True)
@@ -29,27 +40,25 @@ class Regions:
 
     classes: tuple[str, ...]  # without overlap; Challenge IoU is over these
     missing: tuple[str, ...]  # of `classes`, those that the prediction does not name
-    predicted: Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to it
-    truth: Mapping[str, np.ndarray]
+    predicted: Tables
+    truth: Tables
 
     @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """(predicted region, true region): each with its like, and each jaw with the other."""
-        swapped = [(LEFT, RIGHT), (RIGHT, LEFT)] if {LEFT, RIGHT} <= set(self.classes) else []
-        return [(name, name) for name in self.truth] + swapped
+    def has_jaws(self) -> bool:
+        return {LEFT, RIGHT} <= set(self.classes)
 
 
 @dataclass(frozen=True)
 class _Image:
-    """One image: scores by (predicted region, true region), boxes by region, and which regions the truth shows."""
+    """One image: overlaps by (predicted region, true region), boxes by region."""
 
     name: str
-    scores: dict[tuple[str, str], dict[str, float]]
+    overlaps: dict[tuple[str, str], dict[str, float]]
     predicted_boxes: dict[str, np.ndarray]
     true_boxes: dict[str, np.ndarray]
 
     def iou(self, region: str, swap: Mapping[str, str]) -> float:
-        return self.scores[swap.get(region, region), region]["iou"]
+        return self.overlaps[swap.get(region, region), region]["iou"]
 
     def shows(self, region: str) -> bool:
         return len(self.true_boxes[region]) > 0
@@ -68,7 +77,7 @@ def score_masks(
     """Score a folder of masks against a capture's (read, or its folder) or another folder's, matched by file stem.
 
     splits: of a capture; None: those of which `predicted` has an image. classes, truth_classes: part by id, where ids
-    differ from ours. components: a box per connected group instead of one per id. progress: told (done, of).
+    differ from ours. components: a box per connected group instead of one per id. progress: called with (done, of).
     An image without a prediction counts as predicted empty. Per region the mean over the images where either side
     shows it: `iou`, `dice`, `boundary_f`; over the whole folder `box_ap`, `box_ap50`
     (`average_precision`). `challenge_iou` is EndoVis 2017's as in ISINet's evaluation (Gonzalez et al., MICCAI
@@ -81,78 +90,81 @@ def score_masks(
     wanted = open_truth(source, truth_classes, None if isinstance(source, Capture) else splits)
     everything = set(wanted.files)
     if isinstance(source, Capture):
-        wanted = open_truth(source, truth_classes, splits or _drawn_splits(given, wanted))
+        wanted = open_truth(source, truth_classes, splits or _predicted_splits(given, wanted))
     if not set(given.files) & set(wanted.files):
         names = f"{next(iter(given.files))!r} and {next(iter(wanted.files))!r}"
         raise NeecoError(f"{predicted}: no mask is named like one of {wanted.path} (such as {names}); rename the files")
-    regions, reason = shared_regions(given, wanted)
+    regions, reason = _shared_regions(given, wanted)
     images = []
     for index, name in enumerate(sorted(wanted.files)):
         images.append(_score_image(name, given, wanted, regions, components))
         if progress is not None:
             progress(index + 1, len(wanted.files))
-    result = _summary(images, regions, reason)
-    notes = [*result.pop("notes"), *given.notes, *wanted.notes]
-    missing = sorted(set(wanted.files) - set(given.files))
+    result = _summary(images, regions)
+    notes = [*([reason] if reason else []), *result.pop("notes"), *given.notes, *wanted.notes]
+    missing, extra = sorted(set(wanted.files) - set(given.files)), sorted(set(given.files) - everything)
     if missing:
         notes.append(f"{len(missing)} of {len(images)} images have no prediction and count as empty")
-    extra = sorted(set(given.files) - everything)
     if extra:
         notes.append(f"{len(extra)} predictions have no truth and were left out")
-    return {
-        "schema": SCHEMA,
-        "version": __version__,
-        "predicted": str(predicted),
-        "truth": str(wanted.path),
-        "splits": list(dict.fromkeys(frame.split for frame in wanted.frames.values())) or None,
-        "images": len(images),
-        **result,
-        "boxes": f"one per {'connected group of pixels' if components else 'id'}, without confidence",
-        "missing": missing,
-        "extra": extra,
-        "notes": notes,
-    }
+    return finite(
+        {
+            "schema": SCHEMA,
+            "version": __version__,
+            "predicted": str(predicted),
+            "truth": str(wanted.path),
+            "splits": _splits(wanted.frames.values()) or None,
+            "images": len(images),
+            **result,
+            "boxes": f"one per {'connected group of pixels' if components else 'id'}, without confidence",
+            "missing": missing,
+            "extra": extra,
+            "notes": notes,
+        }
+    )
 
 
-def shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
+def _splits(frames: Iterable[Frame]) -> list[str]:
+    return list(dict.fromkeys(frame.split for frame in frames))
+
+
+def _predicted_splits(predicted: Masks, truth: Masks) -> list[str]:
+    """The splits of which there are predictions; all where there are none."""
+    found = _splits(frame for name, frame in truth.frames.items() if name in predicted.files)
+    return found or _splits(truth.frames.values())
+
+
+def _shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
     """The regions two folders can be compared in, and why there are no parts among them, if so.
 
     Where either side names its jaws `jaws`, the other's two become one.
     """
-    if predicted.names is None or truth.names is None:
-        sides = [str(masks.path) for masks in (predicted, truth) if masks.names is None]
-        return _regions({}, {}, ()), f"parts: null, {' and '.join(sides)} tell instrument from tissue only"
-    ours, theirs = dict(predicted.names), dict(truth.names)
+    ours, theirs = dict(predicted.names or {}), dict(truth.names or {})
     if JAWS in {*ours.values(), *theirs.values()}:
         ours, theirs = (
             {number: JAWS if part in SWAP else part for number, part in names.items()} for names in (ours, theirs)
         )
     order = [*TRUTH_PARTS, JAWS]
     classes = sorted(set(theirs.values()), key=lambda part: (order.index(part) if part in order else len(order), part))
-    if not set(classes) & set(ours.values()):
-        return _regions({}, {}, ()), (
-            f"parts: null, the prediction names {', '.join(sorted(set(ours.values())))}, the truth {', '.join(classes)}"
-        )
-    return _regions(ours, theirs, tuple(classes)), None
-
-
-def _regions(ours: Mapping[int, str], theirs: Mapping[int, str], classes: tuple[str, ...]) -> Regions:
-    def tables(names: Mapping[int, str]) -> dict[str, np.ndarray]:
-        result = {INSTRUMENT: np.arange(256) > 0}
-        for part in classes:
-            result[part] = np.isin(np.arange(256), [number for number, name in names.items() if name == part])
-        if {LEFT, RIGHT} <= set(classes):
-            result[JAWS] = result[LEFT] | result[RIGHT]
-        return result
-
+    reason = None
+    if sides := [str(masks.path) for masks in (predicted, truth) if masks.names is None]:
+        reason = f"parts: null, {' and '.join(sides)} tell instrument from tissue only"
+    elif not set(classes) & set(ours.values()):
+        named = ", ".join(sorted(set(ours.values())))
+        reason = f"parts: null, the prediction names {named}, the truth {', '.join(classes)}"
+    if reason is not None:
+        classes = []
     missing = tuple(part for part in classes if part not in ours.values())
-    return Regions(classes, missing, tables(ours), tables(theirs))
+    return Regions(tuple(classes), missing, _tables(ours, classes), _tables(theirs, classes)), reason
 
 
-def _drawn_splits(predicted: Masks, truth: Masks) -> list[str]:
-    return list(dict.fromkeys(frame.split for name, frame in truth.frames.items() if name in predicted.files)) or list(
-        dict.fromkeys(frame.split for frame in truth.frames.values())
-    )
+def _tables(names: Mapping[int, str], classes: Sequence[str]) -> Tables:
+    tables = {INSTRUMENT: np.arange(256) > 0}
+    for part in classes:
+        tables[part] = np.isin(np.arange(256), [number for number, name in names.items() if name == part])
+    if {LEFT, RIGHT} <= set(classes):
+        tables[JAWS] = tables[LEFT] | tables[RIGHT]
+    return tables
 
 
 def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, components: bool) -> _Image:
@@ -163,11 +175,11 @@ def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, co
         raise NeecoError(f"{predicted.files[name]}: size: mask is {found}, its truth is {wanted}; resize it (nearest)")
     guesses = {region: table[guess] for region, table in regions.predicted.items()}
     truths = {region: table[ids] for region, table in regions.truth.items()}
-    scores = {pair: _overlap(guesses[pair[0]], truths[pair[1]], counted) for pair in regions.pairs}
     everywhere = True if counted is None else counted
+    pairs = [(region, region) for region in truths] + (list(SWAP.items()) if regions.has_jaws else [])
     return _Image(
         name,
-        scores,
+        {(ours, theirs): _overlap(guesses[ours], truths[theirs], counted) for ours, theirs in pairs},
         {region: boxes_of(mask & everywhere, components) for region, mask in guesses.items()},
         {region: boxes_of(mask & everywhere, components) for region, mask in truths.items()},
     )
@@ -180,47 +192,39 @@ def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) ->
     return {"iou": overlap, "dice": dice(mask, truth, counted), "boundary_f": contours}
 
 
-def _summary(images: Sequence[_Image], regions: Regions, reason: str | None) -> dict[str, Any]:
+def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
     """Numbers per region, and the jaws' names that fit the whole folder better (as `mask_metrics.PartTally`)."""
-    jaws_told = {LEFT, RIGHT} <= set(regions.classes)
-    swap: Mapping[str, str] = {}
-    if jaws_told and _jaw_sum(images, SWAP) > _jaw_sum(images, {}):
-        swap = SWAP
+    swap = SWAP if regions.has_jaws and _jaw_sum(images, SWAP) > _jaw_sum(images, {}) else {}
     numbers = {region: _region_numbers(images, region, swap) for region in regions.truth}
-    notes = [reason] if reason else []
+    notes = []
     for part in regions.missing:
         numbers[part] = dict.fromkeys((*SCORES, "images"))
         notes.append(f"{part}: null, the prediction has no such part; it counts as not found in Challenge IoU")
     if unnamed := [part for part, value in numbers.items() if value["images"] == 0]:
         notes.append(f"{', '.join(unnamed)}: null, no image shows it")
-    instrument = numbers.pop(INSTRUMENT)
-    instrument["challenge_iou"] = _number(_challenge(images, (INSTRUMENT,), {})[0])
+    instrument = numbers.pop(INSTRUMENT) | {"challenge_iou": _challenge(images, (INSTRUMENT,), {})[0]}
     overall = None
     if regions.classes:
         challenge, isinet = _challenge(images, regions.classes, swap)
         class_iou = mean_of([mean_of([image.iou(part, swap) for image in images]) for part in regions.classes])
-        overall = {"challenge_iou": _number(challenge), "isinet_iou": _number(isinet)}
-        overall["mean_class_iou"] = _number(class_iou)
+        overall = {"challenge_iou": challenge, "isinet_iou": isinet, "mean_class_iou": class_iou}
     return {
         INSTRUMENT: instrument,
         "parts": numbers if regions.classes else None,
         "classes": overall,
-        "jaw_assignment": ("swapped" if swap else "as named") if jaws_told else None,
-        "per_image": [
-            {"name": image.name} | {key: _number(value) for key, value in image.scores[INSTRUMENT, INSTRUMENT].items()}
-            for image in images
-        ],
+        "jaw_assignment": ("swapped" if swap else "as named") if regions.has_jaws else None,
+        "per_image": [{"name": image.name} | image.overlaps[INSTRUMENT, INSTRUMENT] for image in images],
         "notes": notes,
     }
 
 
 def _region_numbers(images: Sequence[_Image], region: str, swap: Mapping[str, str]) -> dict[str, Any]:
     source = swap.get(region, region)
-    rows = [image.scores[source, region] for image in images]
-    numbers: dict[str, Any] = {key: _number(mean_of([row[key] for row in rows])) for key in SCORES[:3]}
+    rows = [image.overlaps[source, region] for image in images]
+    numbers: dict[str, Any] = {key: mean_of([row[key] for row in rows]) for key in OVERLAPS}
     boxes = [image.predicted_boxes[source] for image in images], [image.true_boxes[region] for image in images]
-    numbers["box_ap"] = _number(average_precision(*boxes))
-    numbers["box_ap50"] = _number(average_precision(*boxes, thresholds=(0.5,)))
+    numbers["box_ap"] = average_precision(*boxes)
+    numbers["box_ap50"] = average_precision(*boxes, thresholds=(0.5,))
     return numbers | {"images": sum(not math.isnan(row["iou"]) for row in rows)}
 
 
@@ -234,7 +238,3 @@ def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[s
     in_truth = [mean_of([image.iou(part, swap) for part in classes if image.shows(part)]) for image in images]
     in_either = [mean_of([image.iou(part, swap) for part in classes]) for image in images]
     return mean_of(in_truth), mean_of(in_either)
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,7 @@ from neeco.capture.check import read_checked
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import held_out_splits
 from neeco.experiments.ablations import (
-    ABLATIONS,
     CHECKPOINTS,
-    OURS,
-    PAPER,
-    PHASE_1_PSNR,
     PHASE_1_SHARE,
     PHASE_1_STEPS,
     PUBLISHED_STEPS,
@@ -30,12 +26,23 @@ from neeco.experiments.ablations import (
     Comparison,
     Entry,
     Variant,
+    all_ablations,
 )
 from neeco.experiments.derived import derive_capture
 from neeco.experiments.machine import machine
 from neeco.experiments.masks import LabelScores, score_label_ways
 from neeco.experiments.study import JobEvent, Result, check_workers, run_jobs
-from neeco.experiments.tables import UNKNOWN, Cell, Column, Row, Table, csv_text, latex_table, markdown_table
+from neeco.experiments.tables import (
+    UNKNOWN,
+    Cell,
+    Column,
+    Row,
+    Table,
+    csv_text,
+    latex_table,
+    markdown_table,
+    write_files,
+)
 from neeco.experiments.training_job import (
     CURVE_FILE,
     Budget,
@@ -44,14 +51,13 @@ from neeco.experiments.training_job import (
     read_json_lines,
     settings_for,
 )
-from neeco.files import own_folder, read_json, write_json, write_text
+from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_settings
-from neeco.training.config import TrainConfig
-from neeco.training.options import training_config
+from neeco.settings import plain
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import open_run
-from neeco.training.schedule import CLOSEST_RESETS
-from neeco.training.train import ROW_INTERVAL
+from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
@@ -67,13 +73,59 @@ HEADINGS = {
     "psnr_instrument": "instrument PSNR",
     "mask_iou": "mask IoU",
 }
-CSV_COLUMNS = ("table", "comparison", "setting", "run", "measure", "paper", "ours", "difference", "agrees")
 
-Values = dict[str, float | None]  # by measure
+Values = dict[str, float | None]  # by measure; empty where the run failed
 
 
-def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> dict[str, Any]:
-    """Train and score every variant of the chosen tables, write DIR/ablation.json and return what it holds.
+@dataclass(frozen=True)
+class AblationRow:
+    """One setting of a table: its numbers by measure, the paper's, and how both differ from the reference's."""
+
+    comparison: str
+    label: str
+    reference: bool  # what the others of its comparison are measured against
+    run: str
+    values: Values
+    paper: dict[str, float]
+    paper_direction: str  # "worse" where the paper shows it in a figure without numbers
+    difference: Values
+    agrees: dict[str, str | None]  # of each judged measure: do ours and the paper's differ in the same direction
+
+
+@dataclass(frozen=True)
+class AblationTable:
+    """A table with its numbers. `judged`, `measures`: those compared with the paper, and all that are shown."""
+
+    name: str
+    group: str
+    title: str
+    question: str
+    judged: list[str]
+    measures: list[str]
+    rows: list[AblationRow]
+    curves: list[dict[str, Any]]  # held-out PSNR over the run: {comparison, label, iteration, progress, psnr}
+
+
+@dataclass(frozen=True)
+class AblationResult:
+    """What ablation.json holds."""
+
+    schema: str
+    version: str
+    capture: str
+    seed: int
+    iterations: dict[str, int]  # by method
+    machine: dict[str, Any]
+    settings: list[str]
+    splits: list[str]
+    tables: list[AblationTable]
+    runs: list[Result]
+    failures: list[dict[str, str]]  # {run, error}
+    notes: list[str]
+
+
+def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> AblationResult:
+    """Train and score every variant of the chosen tables, write DIR/ablation.json and DIR/tables/, return the first.
 
     Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
@@ -97,33 +149,38 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
     failures = [{"run": result["name"], "error": result["error"]} for result in results if "error" in result]
     folders = {job.name: job.folder for job in jobs if job.name in finished}
     methods = [method for method in ("neeco", "kinematic") if any(v.method == method for v in variants)]
+    log_intervals = {job.config.method: job.config.log_interval for job in jobs}
     labels, unscored = _label_scores(chosen, folders, capture, splits, device)
-    ablation = {
-        "schema": SCHEMA,
-        "version": __version__,
-        "capture": str(plan.capture.absolute()),
-        "seed": plan.seed,
-        "iterations": {method: _steps(plan, method) for method in sorted(methods)},
-        "machine": machine(device),
-        "settings": list(plan.settings),
-        "splits": list(splits),
-        "tables": [table_of(table, folders, finished, labels, splits) for table in chosen],
-        "runs": [finished[name] for name in finished],
-        "failures": failures + unscored,
-        "notes": [note for method in methods for note in _shortcomings(method, _steps(plan, method))],
-    }
-    write_json(plan.output / "ablation.json", ablation)
-    return ablation
+    result = AblationResult(
+        schema=SCHEMA,
+        version=__version__,
+        capture=str(plan.capture.absolute()),
+        seed=plan.seed,
+        iterations={method: _steps(plan, method) for method in sorted(methods)},
+        machine=machine(device),
+        settings=list(plan.settings),
+        splits=list(splits),
+        tables=[table_of(table, folders, finished, labels, splits) for table in chosen],
+        runs=list(finished.values()),
+        failures=failures + unscored,
+        notes=[
+            note for method in methods for note in _shortcomings(method, _steps(plan, method), log_intervals[method])
+        ],
+    )
+    write_json(plan.output / "ablation.json", plain(result))
+    write_tables(plan.output, result.tables)
+    return result
 
 
 def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
     """The tables behind `paper`, `ours` or their own names, each once. Raises NeecoError for an unknown name."""
+    known = all_ablations()
+    groups = {group: [table for table in known.values() if table.group == group] for group in ("paper", "ours")}
     chosen: dict[str, Ablation] = {}
-    groups = {"paper": PAPER, "ours": OURS}
     for name in names:
-        if name not in groups and name not in ABLATIONS:
-            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(ABLATIONS)}")
-        chosen |= {ablation.name: ablation for ablation in groups.get(name) or (ABLATIONS[name],)}
+        if name not in groups and name not in known:
+            raise NeecoError(f"--tables: {name!r} is unknown; choose of paper, ours, {', '.join(known)}")
+        chosen |= {table.name: table for table in groups.get(name) or [known[name]]}
     if not chosen:
         raise NeecoError("--tables: names none; leave it out for all of them")
     return tuple(chosen.values())
@@ -131,11 +188,7 @@ def chosen_ablations(names: Sequence[str]) -> tuple[Ablation, ...]:
 
 def distinct_variants(chosen: Sequence[Ablation]) -> list[Variant]:
     """Every run that the tables need, once."""
-    return list(dict.fromkeys(entry.variant for entry in _entries(chosen)))
-
-
-def _entries(chosen: Sequence[Ablation]) -> list[Entry]:
-    return [entry for table in chosen for comparison in table.comparisons for entry in comparison.entries]
+    return list(dict.fromkeys(entry.variant for table in chosen for entry in table.entries))
 
 
 def _open_capture(plan: AblationPlan, variants: Sequence[Variant]) -> Capture:
@@ -188,21 +241,21 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
     """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
     if config.initial_points is not None:
         return config
-    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.tissue_budget)))
+    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.max_tissue_gaussians)))
 
 
-def _shortcomings(method: str, steps: int) -> list[str]:
+def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
     """What runs of so many steps are too short to show."""
     notes = []
-    if method == "neeco" and PHASE_1_SHARE * steps < ROW_INTERVAL:
+    if method == "neeco" and PHASE_1_SHARE * steps < log_interval:
         notes.append(
             f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
-            f"({ROW_INTERVAL} steps); give --iterations {math.ceil(ROW_INTERVAL / PHASE_1_SHARE)} or more"
+            f"({log_interval} steps); give --iterations {math.ceil(log_interval / PHASE_1_SHARE)} or more"
         )
-    if method == "neeco" and TrainConfig().density_stop * steps <= CLOSEST_RESETS:
+    if method == "neeco" and TrainConfig().density_stop * steps <= MIN_RESET_INTERVAL:
         notes.append(
-            f"opacity reset: none comes in {steps} steps (intervals do not scale below {CLOSEST_RESETS}, and density "
-            "control ends half-way), so P_oi changes nothing here"
+            f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
+            "density control ends half-way), so P_oi changes nothing here"
         )
     if method == "kinematic" and steps < KINEMATIC_LEAST:
         notes.append(
@@ -222,7 +275,8 @@ def _label_scores(
     """Scores by run of both ways to label it, for the runs whose table asks; and what could not be scored."""
     scores: dict[str, LabelScores] = {}
     failures = []
-    for name in dict.fromkeys(entry.variant.name for entry in _entries(chosen) if entry.label_way):
+    asked = (entry.variant.name for table in chosen for entry in table.entries if entry.label_way)
+    for name in dict.fromkeys(asked):
         if name not in folders:
             continue
         file = folders[name] / LABELS_FILE
@@ -245,15 +299,9 @@ def table_of(
     folders: Mapping[str, Path],
     results: Mapping[str, Result],
     labels: Mapping[str, LabelScores],
-    splits: tuple[str, ...],
-) -> dict[str, Any]:
-    """One table as ablation.json has it: {name, group, title, question, judged, measures, rows, curves}.
-
-    A row: {comparison, label, reference (bool), run, values, paper, paper_direction, difference, agrees}; values,
-    paper, difference and agrees by measure. `difference` is to the comparison's reference. `agrees` says of each judged
-    measure whether ours differs in the paper's direction: "yes", "no", or "even" below EVEN_DB. A run that failed has
-    None for values. folders, results: of the runs that finished; labels: of those that are labelled both ways.
-    """
+    splits: Sequence[str],
+) -> AblationTable:
+    """A table from the runs that finished (`folders`, `results`) and those that are labelled both ways (`labels`)."""
     primary = primary_split(splits)
     judged = [measure.format(split=primary) for measure in table.judged]
     rows, curves = [], []
@@ -261,22 +309,15 @@ def table_of(
         values = {entry.label: _values(entry, folders, results, labels, splits) for entry in comparison.entries}
         for entry in comparison.entries:
             rows.append(_row(comparison, entry, values, judged, primary))
-            names, folder = {"comparison": comparison.title, "label": entry.label}, folders.get(entry.variant.name)
+            folder = folders.get(entry.variant.name)
             if table.group == "paper" and folder is not None:
+                names = {"comparison": comparison.title, "label": entry.label}
                 points = [row for row in read_json_lines(folder / CURVE_FILE) if row["split"] == primary]
                 curves += [names | {key: row[key] for key in ("iteration", "progress", "psnr")} for row in points]
-    known = dict.fromkeys(key for row in rows for key, value in row["values"].items() if value is not None)
     final = FINAL_SCORES if table.group == "ours" else ("psnr",)
-    return {
-        "name": table.name,
-        "group": table.group,
-        "title": table.title,
-        "question": table.question,
-        "judged": judged,
-        "measures": [*judged, *(key for key in known if key not in judged and key.partition(".")[0] in final)],
-        "rows": rows,
-        "curves": curves,
-    }
+    known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
+    shown = [key for key in known if key not in judged and key.partition(".")[0] in final]
+    return AblationTable(table.name, table.group, table.title, table.question, judged, [*judged, *shown], rows, curves)
 
 
 def primary_split(splits: Sequence[str]) -> str:
@@ -285,12 +326,11 @@ def primary_split(splits: Sequence[str]) -> str:
 
 
 def _row(
-    comparison: Comparison, entry: Entry, values: Mapping[str, Values], judged: list[str], primary: str
-) -> dict[str, Any]:
+    comparison: Comparison, entry: Entry, values: Mapping[str, Values], judged: Sequence[str], primary: str
+) -> AblationRow:
     reference = next(item for item in comparison.entries if item.label == comparison.reference)
     ours, base = values[entry.label], values[reference.label]
-    paper = {key.format(split=primary): value for key, value in entry.paper.items()}
-    paper_base = {key.format(split=primary): value for key, value in reference.paper.items()}
+    paper, paper_base = (dict(zip(judged, item.paper, strict=False)) for item in (entry, reference))
     difference: Values = {}
     agrees: dict[str, str | None] = {}
     if entry is not reference:
@@ -300,17 +340,17 @@ def _row(
         for key in judged:
             expected = paper[key] - paper_base[key] if key in paper else float(entry.expected)
             agrees[key] = direction(difference.get(key), expected)
-    return {
-        "comparison": comparison.title,
-        "label": entry.label,
-        "reference": entry is reference,
-        "run": entry.variant.name,
-        "values": ours,
-        "paper": paper,
-        "paper_direction": "" if entry is reference or not entry.expected else "worse",
-        "difference": difference,
-        "agrees": agrees,
-    }
+    return AblationRow(
+        comparison.title,
+        entry.label,
+        entry is reference,
+        entry.variant.name,
+        ours,
+        paper,
+        "worse" if entry.expected and entry is not reference else "",
+        difference,
+        agrees,
+    )
 
 
 def direction(ours: float | None, paper: float) -> str | None:
@@ -327,7 +367,7 @@ def _values(
     folders: Mapping[str, Path],
     results: Mapping[str, Result],
     labels: Mapping[str, LabelScores],
-    splits: tuple[str, ...],
+    splits: Sequence[str],
 ) -> Values:
     """Every number of one entry by measure; empty when its run failed."""
     name = entry.variant.name
@@ -339,7 +379,7 @@ def _values(
     folder, result = folders[name], results[name]
     values: Values = {}
     if entry.variant.method == "neeco":  # trained in phases: how good it was in the first and on the way
-        values[PHASE_1_PSNR] = phase_1_psnr(folder, int(result["iterations"]))
+        values["phase_1_psnr"] = phase_1_psnr(folder, int(result["iterations"]))
         curve, split = read_json_lines(folder / CURVE_FILE), primary_split(splits)
         for percent in CHECKPOINTS:
             values[f"psnr_at_{percent}.{split}"] = psnr_at(curve, split, percent / 100)
@@ -363,15 +403,11 @@ def psnr_at(curve: Sequence[Mapping[str, Any]], split: str, share: float) -> flo
     return min(rows, key=lambda row: abs(row["progress"] - share))["psnr"] if rows else None
 
 
-def write_tables(output: Path, ablation: Mapping[str, Any]) -> list[Path]:
-    """Write DIR/tables/NAME.csv, .md and .tex for every table; the files written."""
-    written = []
-    for table in ablation["tables"]:
-        latex = latex_table(grid(table), table["title"])
-        for suffix, text in (("csv", ablation_csv(table)), ("md", markdown(table)), ("tex", latex)):
-            written.append(output / "tables" / f"{table['name']}.{suffix}")
-            write_text(written[-1], text)
-    return written
+def write_tables(output: Path, tables: Sequence[AblationTable]) -> None:
+    """Write DIR/tables/NAME.csv, .md and .tex for every table."""
+    for table in tables:
+        texts = {"csv": ablation_csv(table), "md": markdown(table), "tex": latex_table(grid(table), table.title)}
+        write_files(output / "tables", table.name, texts)
 
 
 def heading(measure: str) -> str:
@@ -390,60 +426,68 @@ def formatted(measure: str, value: float | None, *, signed: bool = False) -> str
     return f"{value:{'+' if signed else ''}.{digits}f}"
 
 
-def grid(table: Mapping[str, Any]) -> Table:
+def grid(table: AblationTable) -> Table:
     """A table for reading: per judged measure the paper's number, ours and whether they agree; the rest as ours alone.
 
     What is compared has a column of its own where it is not the same in all rows.
     """
-    judged = table["judged"]
-    several = len({row["comparison"] for row in table["rows"]}) > 1
+    several = len({row.comparison for row in table.rows}) > 1
     columns = []
-    for measure in table["measures"]:
-        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in judged else [heading(measure)]
+    for measure in table.measures:
+        titles = [f"{heading(measure)}: paper", "ours", "agrees"] if measure in table.judged else [heading(measure)]
         columns += [Column(measure, title) for title in titles]
     rows = []
-    for row in table["rows"]:
-        keys = (row["comparison"], row["label"]) if several else (row["label"],)
-        cells = [Cell(text) for measure in table["measures"] for text in _cells(row, measure, measure in judged)]
-        rows.append(Row(keys, tuple(cells), reference=row["reference"]))
-    return Table(table["title"], ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
+    for row in table.rows:
+        cells = [text for measure in table.measures for text in _cells(row, measure, measure in table.judged)]
+        keys = (row.comparison, row.label) if several else (row.label,)
+        rows.append(Row(keys, tuple(map(Cell, cells)), reference=row.reference))
+    return Table(table.title, ("", "setting") if several else ("setting",), tuple(columns), tuple(rows))
 
 
-def _cells(row: Mapping[str, Any], measure: str, judged: bool) -> list[str]:
+def _cells(row: AblationRow, measure: str, judged: bool) -> list[str]:
     """Our number with its difference from the reference; where judged, after the paper's and before the verdict."""
-    ours = formatted(measure, row["values"].get(measure))
-    if (difference := row["difference"].get(measure)) is not None:
+    ours = formatted(measure, row.values.get(measure))
+    if (difference := row.difference.get(measure)) is not None:
         ours += f" ({formatted(measure, difference, signed=True)})"
     if not judged:
         return [ours]
-    number = row["paper"].get(measure)
-    paper = (row["paper_direction"] or UNKNOWN) if number is None else formatted(measure, number)
-    return [paper, ours, "" if row["reference"] else row["agrees"].get(measure) or UNKNOWN]
+    paper = formatted(measure, row.paper.get(measure))
+    agrees = "" if row.reference else row.agrees.get(measure) or UNKNOWN
+    return [row.paper_direction if paper == UNKNOWN and row.paper_direction else paper, ours, agrees]
 
 
-def agreement(table: Mapping[str, Any]) -> str:
+def agreement(table: AblationTable) -> str:
     """How many of the paper's directions ours shows, in words; "" for a table that judges nothing."""
-    counts = Counter(agrees for row in table["rows"] for agrees in row["agrees"].values())
+    counts = Counter(agrees for row in table.rows for agrees in row.agrees.values())
     if not counts:
         return ""
-    parts = [f"{counts['yes']} of {counts.total()} as in the paper"]
     words = {"even": "even", "no": "the other way", None: "not known"}
-    return ", ".join([*parts, *(f"{counts[key]} {text}" for key, text in words.items() if counts[key])])
+    others = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    return ", ".join([f"{counts['yes']} of {counts.total()} as in the paper", *others])
 
 
-def ablation_csv(table: Mapping[str, Any]) -> str:
+def ablation_csv(table: AblationTable) -> str:
     """One line per setting and measure: every number in full."""
-    lines = []
-    for row in table["rows"]:
-        entry = {"table": table["name"], "setting": row["label"], **{key: row[key] for key in ("comparison", "run")}}
-        for measure in dict.fromkeys([*table["measures"], *row["values"]]):
-            numbers = {"paper": row["paper"], "ours": row["values"], **{k: row[k] for k in ("difference", "agrees")}}
-            lines.append({**entry, "measure": measure, **{key: of.get(measure) for key, of in numbers.items()}})
-    return csv_text(CSV_COLUMNS, lines)
+    rows = [
+        {
+            "table": table.name,
+            "comparison": row.comparison,
+            "setting": row.label,
+            "run": row.run,
+            "measure": measure,
+            "paper": row.paper.get(measure),
+            "ours": row.values.get(measure),
+            "difference": row.difference.get(measure),
+            "agrees": row.agrees.get(measure),
+        }
+        for row in table.rows
+        for measure in dict.fromkeys([*table.measures, *row.values])
+    ]
+    return csv_text(list(rows[0]), rows)
 
 
-def markdown(table: Mapping[str, Any]) -> str:
+def markdown(table: AblationTable) -> str:
     """A Markdown table under its title."""
     title, empty, *lines = markdown_table(grid(table))
-    directions = ["", f"Directions: {agreement(table)}."] if table["judged"] else []
-    return "\n".join([title, empty, table["question"], "", *lines, *directions]) + "\n"
+    directions = ["", f"Directions: {agreement(table)}."] if table.judged else []
+    return "\n".join([title, empty, table.question, "", *lines, *directions]) + "\n"

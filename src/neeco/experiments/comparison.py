@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,8 +46,8 @@ from neeco.experiments.training_job import (
 from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
-from neeco.training.config import TrainConfig
-from neeco.training.options import variant_config
+from neeco.settings import plain
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
@@ -121,6 +121,40 @@ class ComparisonPlan:
         return list(dict.fromkeys([*self.spec.methods, *self.spec.masks]))
 
 
+@dataclass(frozen=True)
+class ComparisonResult:
+    """What comparison.json holds, valid at every moment."""
+
+    schema: str
+    version: str
+    complete: bool  # is all in it?
+    capture: str
+    machine: dict[str, Any]
+    budget: dict[str, Any]
+    transforms: str
+    settings: list[str]
+    seeds: list[int]
+    splits: list[str]
+    methods: list[dict[str, Any]]  # {name, method, source: train or masks, folder}
+    jobs: list[Result]
+    summary: list[dict[str, Any]]  # of `summarise`
+    curves: list[dict[str, Any]]  # held-out PSNR of the finished jobs at about ten moments
+    distance: list[dict[str, Any]]  # every held-out frame's scores beside its distance from the training states
+    speed: dict[str, Any]  # of `measure_speed`
+    masks: list[dict[str, Any]]  # scores of masks by name, seed and split
+    notes: list[str]
+
+    @property
+    def trained(self) -> list[str]:
+        """The methods by name, without the folders of masks."""
+        return [entry["name"] for entry in self.methods if entry["source"] == "train"]
+
+    @property
+    def failures(self) -> list[str]:
+        """`name, seed k: why` of every job that failed."""
+        return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in self.jobs if "error" in job]
+
+
 def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
     """Check everything that can be known before the work. Raises NeecoError for whatever cannot be compared."""
     spec.budget.check()
@@ -167,7 +201,7 @@ def plan_comparison(spec: ComparisonSpec) -> ComparisonPlan:
 
 def compare(
     plan: ComparisonPlan, events: Callable[[JobEvent], None] | None = None, progress: Progress | None = None
-) -> dict[str, Any]:
+) -> ComparisonResult:
     """Train and score every method on every seed, measure the speed of all, and write comparison.json and its tables.
 
     Given again after an interruption, it goes on where it stopped; given again with more methods or seeds, it adds
@@ -181,14 +215,13 @@ def compare(
         finished = {index: job for index, job in finished.items() if list(job["splits"]) == list(plan.splits)}
 
         def record(results: Sequence[Result]) -> None:
-            write_json(file, _document(plan, results))
+            write_json(file, plain(_result(plan, results)))
 
         record([finished[index] for index in sorted(finished)])
         results = run_and_record(plan.jobs, spec.workers, record, finished, events, {spec.capture: plan.capture})
-        result = _document(plan, results) | {"complete": True}
-        _measure(plan, result, progress or (lambda what, done, total: None))
-        write_json(file, result)
-        write_tables(spec.output, result)
+        result = _measured(plan, _result(plan, results), progress or (lambda what, done, total: None))
+        write_json(file, plain(result))
+        write_files(spec.output, "comparison", table_texts(result), data_files(result))
     return result
 
 
@@ -197,19 +230,14 @@ def job_folder(output: Path, name: str, seed: int) -> Path:
     return output / "runs" / f"{name}-seed{seed}"
 
 
-def failures(comparison: Mapping[str, Any]) -> list[str]:
-    """`name, seed k: why` of every job that failed."""
-    return [f"{job['name']}, seed {job['seed']}: {job['error']}" for job in comparison["jobs"] if "error" in job]
-
-
 def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     """Every method's settings by name. Raises NeecoError."""
     if not spec.methods:
         raise NeecoError("--methods: none is given; name at least one")
     values = {"transforms": spec.transforms}
-    methods = {name: variant_config(name, values).method for name in spec.methods}
+    methods = {name: training_config(name, values).method for name in spec.methods}
     check_settings(spec.assignments, dict.fromkeys(methods.values()), "--seeds")
-    return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
+    return {name: training_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
 def _check_output(spec: ComparisonSpec) -> None:
@@ -225,8 +253,8 @@ def _check_output(spec: ComparisonSpec) -> None:
         raise NeecoError(f"{file}: budget: compares after {before}, not {spec.budget}; {differs}")
 
 
-def _document(plan: ComparisonPlan, results: Sequence[Result]) -> dict[str, Any]:
-    """comparison.json as far as the jobs alone give it."""
+def _result(plan: ComparisonPlan, jobs: Sequence[Result]) -> ComparisonResult:
+    """The comparison as far as the jobs alone give it."""
     spec = plan.spec
     methods: list[dict[str, Any]] = [
         {"name": name, "method": config, "source": "train", "folder": "runs"}
@@ -236,40 +264,39 @@ def _document(plan: ComparisonPlan, results: Sequence[Result]) -> dict[str, Any]
         {"name": name, "method": None, "source": "masks", "folder": str(path.absolute())}
         for name, path in spec.masks.items()
     ]
-    failed = [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in results if "error" in job]
-    return {
-        "schema": COMPARISON_SCHEMA,
-        "version": __version__,
-        "complete": False,
-        "capture": str(spec.capture.absolute()),
-        "machine": machine(device_of(spec.device), spec.workers),
-        "budget": asdict(spec.budget),
-        "transforms": spec.transforms,
-        "settings": list(spec.assignments),
-        "seeds": list(range(spec.seeds)),
-        "splits": list(plan.splits),
-        "methods": methods,
-        "jobs": list(results),
-        "summary": summarise(plan.names, plan.splits, results, (), plan.given_masks),
-        **_frame_rows(plan, [job for job in results if "error" not in job]),
-        "speed": {"rows": []},
-        "masks": list(plan.given_masks),
-        "notes": [*plan.notes, *failed],
-    }
+    failed = [f"{job['name']}, seed {job['seed']}: failed: {job['error']}" for job in jobs if "error" in job]
+    curves, distance = _frame_rows(plan, [job for job in jobs if "error" not in job])
+    return ComparisonResult(
+        schema=COMPARISON_SCHEMA,
+        version=__version__,
+        complete=False,
+        capture=str(spec.capture.absolute()),
+        machine=machine(device_of(spec.device), spec.workers),
+        budget=asdict(spec.budget),
+        transforms=spec.transforms,
+        settings=list(spec.assignments),
+        seeds=list(range(spec.seeds)),
+        splits=list(plan.splits),
+        methods=methods,
+        jobs=list(jobs),
+        summary=summarise(plan.names, plan.splits, jobs, (), plan.given_masks),
+        curves=curves,
+        distance=distance,
+        speed={"rows": []},
+        masks=list(plan.given_masks),
+        notes=[*plan.notes, *failed],
+    )
 
 
-def _frame_rows(plan: ComparisonPlan, done: Sequence[Result]) -> dict[str, list[dict[str, Any]]]:
-    """What figures are drawn from. curves: held-out PSNR of every finished job at about ten moments, seconds on the
-    budget's clock; distance: every held-out frame's scores beside its distance from the training states."""
+def _frame_rows(plan: ComparisonPlan, done: Sequence[Result]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The rows of `curves`, whose seconds are on the budget's clock, and of `distance`."""
     distances = distances_to_training(plan.capture)
     curves, distance = [], []
-    like = {"per_frame": {"given": {split: [{"frame": str} | dict.fromkeys(FRAME_SCORES, (float, None))]
-                                    for split in plan.splits}}}  # fmt: skip
+    frame = {"frame": str} | dict.fromkeys(FRAME_SCORES, (float, None))
+    like = {"per_frame": {"given": {split: [frame] for split in plan.splits}}}
     for job in done:
-        folder, names = (
-            job_folder(plan.spec.output, job["name"], job["seed"]),
-            {key: job[key] for key in ("name", "seed")},
-        )
+        folder = job_folder(plan.spec.output, job["name"], job["seed"])
+        names = {key: job[key] for key in ("name", "seed")}
         for row in read_json_lines(folder / CURVE_FILE):
             seconds = {"seconds": row[SECONDS_ON[plan.spec.budget.clock]]}
             curves.append(names | seconds | {key: row[key] for key in ("iteration", "split", "psnr")})
@@ -279,7 +306,7 @@ def _frame_rows(plan: ComparisonPlan, done: Sequence[Result]) -> dict[str, list[
             for row in frames[split]:
                 place = {"split": split, "frame": row["frame"], "distance": distances.get(row["frame"])}
                 distance.append(names | place | {key: row[key] for key in FRAME_SCORES})
-    return {"curves": curves, "distance": distance}
+    return curves, distance
 
 
 def distances_to_training(capture: Capture) -> dict[str, float]:
@@ -298,19 +325,20 @@ def distances_to_training(capture: Capture) -> dict[str, float]:
     return {frame.name: float(recorded.distances(frame.state).min()) for frame in others}
 
 
-def _measure(plan: ComparisonPlan, result: dict[str, Any], report: Progress) -> None:
-    """Add to comparison.json's `result` what is measured over all finished runs together: their masks, their speed."""
-    folder = plan.spec.output
-    done = [(job["name"], job["seed"]) for job in result["jobs"] if "error" not in job]
+def _measured(plan: ComparisonPlan, result: ComparisonResult, report: Progress) -> ComparisonResult:
+    """`result` with what is measured over all finished runs together: their masks, their speed."""
+    folder, masks, speed = plan.spec.output, result.masks, result.speed
+    done = [(job["name"], job["seed"]) for job in result.jobs if "error" not in job]
     runs = [(name, seed, job_folder(folder, name, seed)) for name, seed in done]
     if runs:
         splits = splits_with_truth(plan.capture, plan.splits)
         device = device_of(plan.spec.device)
         scored = score_runs(runs, folder, plan.capture, splits, device, partial(report, "scoring masks"))
-        result["masks"] = [*plan.given_masks, *scored]
+        masks = [*masks, *scored]
         opened = [(name, seed, load_run(path)) for name, seed, path in runs]
-        result["speed"] = measure_speed(opened, plan.capture, device, partial(report, "measuring speed"))
-    result["summary"] = summarise(plan.names, plan.splits, result["jobs"], result["speed"]["rows"], result["masks"])
+        speed = measure_speed(opened, plan.capture, device, partial(report, "measuring speed"))
+    summary = summarise(plan.names, plan.splits, result.jobs, speed["rows"], masks)
+    return replace(result, complete=True, summary=summary, speed=speed, masks=masks)
 
 
 def summarise(
@@ -344,11 +372,11 @@ def summarise(
     return rows
 
 
-def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
+def tables_of(comparison: ComparisonResult) -> list[Table]:
     """One table per split, then the methods' own. Columns that nobody has a number for are left out."""
-    finished = {job["name"] for job in comparison["jobs"] if "error" not in job}
+    finished = {job["name"] for job in comparison.jobs if "error" not in job}
     reasons: dict[str, str] = {}  # of methods of which no seed finished
-    for job in comparison["jobs"]:
+    for job in comparison.jobs:
         if "error" in job and job["name"] not in finished:
             reasons.setdefault(job["name"], job["error"])
 
@@ -357,77 +385,63 @@ def tables_of(comparison: Mapping[str, Any]) -> list[Table]:
         return summary_table(title, ("method",), columns, entries)
 
     tables = []
-    for split in comparison["splits"]:
-        rows = [row for row in comparison["summary"] if row["split"] == split]
+    for split in comparison.splits:
+        rows = [row for row in comparison.summary if row["split"] == split]
         scored = any(row["iou"]["n"] for row in rows)  # the same number, for other people's masks too
         ours = [column for column in SPLIT_COLUMNS if not (scored and column.key == "mask_iou")]
         tables.append(table(f"split {split}", (*ours, *MASK_COLUMNS), rows))
-    trained, first = trained_methods(comparison), comparison["splits"][0]
-    rows = [row for row in comparison["summary"] if row["split"] == first and row["name"] in trained]
+    trained, first = comparison.trained, comparison.splits[0]
+    rows = [row for row in comparison.summary if row["split"] == first and row["name"] in trained]
     return [*tables, table("training and drawing", RUN_COLUMNS, rows)]
 
 
-def trained_methods(comparison: Mapping[str, Any]) -> list[str]:
-    """The methods by name, without the folders of masks."""
-    return [entry["name"] for entry in comparison["methods"] if entry["source"] == "train"]
-
-
-def absent_notes(comparison: Mapping[str, Any]) -> list[str]:
+def absent_notes(comparison: ComparisonResult) -> list[str]:
     """What the tables lack, and why."""
-    notes = list(comparison["notes"])
+    notes = list(comparison.notes)
     for key in SPLIT_METRICS:
-        known = any(row[key]["n"] for row in comparison["summary"])
+        known = any(row[key]["n"] for row in comparison.summary)
         if not known and not any(note.startswith(key) for note in notes):
             notes.append(f"{key}: nobody has it: {ABSENT.get(key, 'no run finished')}")
-    if not any(row["seconds"]["std"] is not None for row in comparison["summary"]):
+    if not any(row["seconds"]["std"] is not None for row in comparison.summary):
         notes.append("no ± is given: one seed has no standard deviation; give --seeds 2 or more")
     return notes
 
 
-def budget_words(comparison: Mapping[str, Any]) -> str:
+def budget_words(comparison: ComparisonResult) -> str:
     """What every run was given, and how often."""
-    seeds = len(comparison["seeds"])
-    return f"{Budget(**comparison['budget'])} each, {seeds} seed{'s' if seeds > 1 else ''}"
+    seeds = len(comparison.seeds)
+    return f"{Budget(**comparison.budget)} each, {seeds} seed{'s' if seeds > 1 else ''}"
 
 
-def markdown_text(comparison: Mapping[str, Any]) -> str:
-    """Markdown: a heading, one table per split, the methods' own, and what is absent."""
-    lead = f"{budget_words(comparison)}. {machine_words(comparison['machine'])}."
-    title = f"Comparison on {Path(comparison['capture']).name}"
-    return markdown_document(title, lead, tables_of(comparison), "seeds", absent_notes(comparison))
+def table_texts(comparison: ComparisonResult) -> dict[str, str]:
+    """The tables and what they lack by suffix: csv (unrounded), md, and tex for the package booktabs."""
+    tables, notes, name = tables_of(comparison), absent_notes(comparison), Path(comparison.capture).name
+    budget, computer = budget_words(comparison), machine_words(comparison.machine)
+    return {
+        "csv": comparison_csv(comparison),
+        "md": markdown_document(f"Comparison on {name}", f"{budget}. {computer}.", tables, "seeds", notes),
+        "tex": latex_document(f"{name}, {{}}. {budget}.", tables, [computer], notes),
+    }
 
 
-def latex_text(comparison: Mapping[str, Any]) -> str:
-    """LaTeX tables for the package booktabs, one per split and one of the methods' own."""
-    caption = f"{Path(comparison['capture']).name}, {{}}. {budget_words(comparison)}."
-    lead = [machine_words(comparison["machine"])]
-    return latex_document(caption, tables_of(comparison), lead, absent_notes(comparison))
-
-
-def comparison_csv(comparison: Mapping[str, Any]) -> str:
+def comparison_csv(comparison: ComparisonResult) -> str:
     """One line per method and split, unrounded; unknown numbers are empty."""
     metrics = (*SPLIT_METRICS, *MASK_METRICS, *RUN_METRICS)
-    return summary_csv(["name", "split", "failed"], metrics, comparison["summary"])
+    return summary_csv(["name", "split", "failed"], metrics, comparison.summary)
 
 
-def data_files(comparison: Mapping[str, Any]) -> dict[str, str]:
+def data_files(comparison: ComparisonResult) -> dict[str, str]:
     """The CSV files of `data/` by name: every run's numbers, and what the figures are drawn from."""
     job_columns = ["name", "method", "seed", "split", *SPLIT_METRICS, "frames", *RUN_METRICS, "error"]
     jobs = [
         {**job, **numbers, "split": split}
-        for job in comparison["jobs"]
+        for job in comparison.jobs
         for split, numbers in (job["splits"] or {"": {}}).items()
     ]
     speed_columns = ["name", "seed", "method", "backend", "fps", "milliseconds", "draws", "num_gaussians"]
     return {
         "jobs.csv": csv_text(job_columns, jobs),
-        "curves.csv": csv_text(["name", "seed", "seconds", "iteration", "split", "psnr"], comparison["curves"]),
-        "distance.csv": csv_text(["name", "seed", "split", "frame", "distance", *FRAME_SCORES], comparison["distance"]),
-        "speed.csv": csv_text(speed_columns, comparison["speed"]["rows"]),
+        "curves.csv": csv_text(["name", "seed", "seconds", "iteration", "split", "psnr"], comparison.curves),
+        "distance.csv": csv_text(["name", "seed", "split", "frame", "distance", *FRAME_SCORES], comparison.distance),
+        "speed.csv": csv_text(speed_columns, comparison.speed["rows"]),
     }
-
-
-def write_tables(output: Path, comparison: Mapping[str, Any]) -> None:
-    """Write comparison.csv, .md and .tex, and data/*.csv behind them, into `output`."""
-    texts = {"csv": comparison_csv(comparison), "md": markdown_text(comparison), "tex": latex_text(comparison)}
-    write_files(output, "comparison", texts, data_files(comparison))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from neeco.files import write_text
@@ -208,7 +209,9 @@ def _texts(table: Table, escape: Callable[[str], str], bold: str, failed: str) -
     return headings + [""] * (width - len(headings)), rows
 
 
-def write_files(output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str]) -> None:
+def write_files(
+    output: Path, stem: str, texts: Mapping[str, str], data: Mapping[str, str] = MappingProxyType({})
+) -> None:
     """Write `texts` by suffix as STEM.csv, STEM.md and STEM.tex into `output`, and `data` by name into its data/."""
     files = {output / f"{stem}.{suffix}": text for suffix, text in texts.items()}
     for path, text in (files | {output / "data" / name: text for name, text in data.items()}).items():

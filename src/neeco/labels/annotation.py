@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -45,9 +45,8 @@ class Shape:
     polygons: list[list[list[float]]]  # outer contours, largest first
 
 
-@dataclass(frozen=True)
-class Keypoint:
-    """A projected keypoint."""
+class Keypoint(NamedTuple):
+    """A projected keypoint, px."""
 
     x: float
     y: float
@@ -72,7 +71,7 @@ class InstrumentLabel:
             "visibility": self.visibility,
             **(vars(self.shape) if self.shape else {"area": 0}),
             "parts": {part: dict(vars(shape)) for part, shape in self.parts.items()},
-            "keypoints": {name: [point.x, point.y, point.visibility] for name, point in self.keypoints.items()},
+            "keypoints": dict(self.keypoints),
             "camera_from_instrument": self.camera_from_instrument,
         }
 
@@ -109,12 +108,8 @@ def shape_of(mask: np.ndarray) -> Shape | None:
     rectangle = minimum_rectangle(mask)
     if rectangle is None:
         return None
-    return Shape(
-        area=int(mask.sum()),
-        box=bounding_box(mask),
-        rectangle=_rounded(rectangle, 2),
-        polygons=[_rounded(polygon, 2) for polygon in outer_polygons(mask)],
-    )
+    polygons = [_rounded(polygon, 2) for polygon in outer_polygons(mask)]
+    return Shape(int(mask.sum()), bounding_box(mask), _rounded(rectangle, 2), polygons)
 
 
 def visibility(seen: np.ndarray, unoccluded: np.ndarray) -> float:
@@ -142,14 +137,13 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
     projected = {}
     for name in sorted(points, key=lambda known: KEYPOINTS.index(known) if known in KEYPOINTS else len(KEYPOINTS)):
         place = place_in_image(to_numpy(points[name]), camera)
-        if absent or place is None:
-            projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
-            continue
-        x, y, z = place
-        row, column = int(y), int(x)
-        hidden = any(0 < depth[row, column] < z - OTHERS_MM for depth in others)
-        hidden |= 0 < drawing.layers[instrument].depth[row, column] < z - SELF_MM
-        projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
+        projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
+        if not absent and place is not None:
+            x, y, z = place
+            pixel = int(y), int(x)
+            hidden = any(0 < depth[pixel] < z - OTHERS_MM for depth in others)
+            hidden |= 0 < drawing.layers[instrument].depth[pixel] < z - SELF_MM
+            projected[name] = Keypoint(round(x, 2), round(y, 2), OCCLUDED if hidden else VISIBLE)
     return projected
 
 

@@ -8,7 +8,7 @@ moves is the instrument; it knows neither parts nor what stands in front.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
-from neeco.scene.deformations._moving import otsu
+from neeco.scene.deformations.base import otsu
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene
@@ -33,23 +33,6 @@ CLEAR_SHARES = 0.5, 0.9
 BLACK = 0.1  # RGB magnitude (norm) above which a pixel of the instrument drawn alone is the instrument
 THRESHOLD_STATES = 24  # recorded states that Otsu's method looks at
 DELTAS = ("means", "quats", "scales")
-
-
-class Labeller(Protocol):
-    """Says which Gaussian is which instrument's, and which pixel is which part."""
-
-    names: tuple[tuple[str, str], ...]  # (instrument, part) of part id 1, 2, ...
-
-    def owners(self, state: State, posed: Gaussians) -> Tensor:
-        """[N] int64: index of each Gaussian's instrument in `instruments_of(names)`, -1 for tissue."""
-        ...
-
-    def draw(
-        self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
-    ) -> tuple[Rendering, Tensor, Tensor]:
-        """The whole scene drawn, its part ids [H, W] uint8, and the share of instrument of each pixel [H, W]. Where
-        `unobserved` [N] is given, it is the rendering's last channel."""
-        ...
 
 
 def threshold_of(scene: Drawable) -> float:
@@ -87,7 +70,10 @@ def composited_labels(rendering: Rendering, threshold: float) -> tuple[Tensor, T
 
 
 class CompositedLabels:
-    """The labeller that goes by what every Gaussian carries (`scene.label_channels()`)."""
+    """The labeller that goes by what every Gaussian carries (`scene.label_channels()`).
+
+    names: (instrument, part) of part id 1, 2, ...
+    """
 
     def __init__(self, scene: Scene, threshold: float | None = None) -> None:
         self.names = tuple(scene.label_names)
@@ -106,13 +92,15 @@ class CompositedLabels:
         self._owners = torch.where(per_instrument.sum(dim=1) > 0.5, owner, -1)
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
-        """[N] the instrument that holds most of a Gaussian, -1 when the tissue holds half of it or more."""
+        """[N] int64: index in `instruments_of(names)` of the instrument that holds most of a Gaussian, -1 where the
+        tissue holds half of it or more."""
         return self._owners
 
     def draw(
         self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
-        """One pass: colour and label channels together."""
+        """The whole scene drawn, its part ids [H, W] uint8 and the share of instrument of each pixel [H, W], in one
+        pass. Where `unobserved` [N] is given, it is the rendering's last channel."""
         channels = self.channels if unobserved is None else torch.cat([self.channels, unobserved[:, None]], 1)
         rendering = rasterize(gaussians, camera, channels=channels)
         assert rendering.channels is not None
@@ -151,7 +139,7 @@ class ThresholdLabels:
         self.thresholds = thresholds or find_thresholds(scene)
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
-        """[N] the instrument nearest to a Gaussian that moved, -1 for one that did not."""
+        """[N] int64: index in `names` of the instrument nearest to a Gaussian that moved, -1 for one that did not."""
         moved = self.thresholds.moved(delta_magnitudes(self.scene, state))
         means = posed.means
         origins = torch.stack(
@@ -167,7 +155,7 @@ class ThresholdLabels:
     def draw(
         self, gaussians: Gaussians, camera: Camera, owners: Tensor, unobserved: Tensor | None = None
     ) -> tuple[Rendering, Tensor, Tensor]:
-        """Colour of the whole scene; ids and share (the alpha) from the moved Gaussians drawn alone."""
+        """As that of `CompositedLabels`; ids and share (the alpha) from the moved Gaussians drawn alone."""
         moved = owners >= 0
         shares = torch.nn.functional.one_hot(owners[moved], len(self.names)).to(gaussians.means)
         alone = rasterize(gaussians.select(moved), camera, channels=shares)
@@ -176,6 +164,9 @@ class ThresholdLabels:
         lit = alone.color.norm(dim=2) > self.black
         rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
         return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
+
+
+Labeller = CompositedLabels | ThresholdLabels
 
 
 @torch.no_grad()

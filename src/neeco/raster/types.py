@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.raster.rotations import as_pose
@@ -110,6 +112,20 @@ class Camera:
     width: int  # px
     height: int
     near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+
+    if TYPE_CHECKING:  # what may be given
+
+        def __init__(
+            self,
+            world_from_camera: ArrayLike | Tensor,
+            fx: float,
+            fy: float,
+            cx: float,
+            cy: float,
+            width: int,
+            height: int,
+            near: float = ...,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)

@@ -16,18 +16,25 @@ from neeco.capture.model import Capture, Frame
 from neeco.evaluation.image_metrics import FULL_SCALE, overlay_outline, psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.ablation_study import EVEN_DB, ablation_csv, agreement, grid, primary_split
-from neeco.experiments.ablations import ABLATIONS, PHASE_1_SHARE, PUBLISHED_STEPS
+from neeco.experiments.ablation_study import (
+    EVEN_DB,
+    AblationResult,
+    AblationTable,
+    ablation_csv,
+    agreement,
+    grid,
+    primary_split,
+)
+from neeco.experiments.ablations import PHASE_1_SHARE, PUBLISHED_STEPS, all_ablations
 from neeco.experiments.comparison import (
     MASK_METRICS,
+    ComparisonResult,
     absent_notes,
     budget_words,
     comparison_csv,
     data_files,
-    failures,
     job_folder,
     tables_of,
-    trained_methods,
 )
 from neeco.experiments.machine import hardware_words, machine_words
 from neeco.experiments.tables import UNKNOWN, Table, csv_text
@@ -88,7 +95,7 @@ class Section:
     listings: Sequence[tuple[str, str]] = ()
 
 
-def write_comparison_report(output: Path, comparison: dict[str, Any], capture: Capture) -> Path:
+def write_comparison_report(output: Path, comparison: ComparisonResult, capture: Capture) -> Path:
     """Write `report.html` and `data/*.csv` into `output`, the folder of a comparison, and return the page's path.
 
     comparison: what `compare` returned; the runs are taken from `output`. Every frame shown is drawn once per method.
@@ -98,8 +105,8 @@ def write_comparison_report(output: Path, comparison: dict[str, Any], capture: C
     files = {"summary.csv": comparison_csv(comparison), "frames.csv": frames, **data_files(comparison)}
     for name, text in files.items():
         write_text(output / "data" / name, text)
-    methods = trained_methods(comparison)
-    masks = ", ".join(entry["name"] for entry in comparison["methods"] if entry["source"] != "train")
+    methods = comparison.trained
+    masks = ", ".join(entry["name"] for entry in comparison.methods if entry["source"] != "train")
     intro = (
         f"{', '.join(methods) or 'no method'}: trained on the same {len(capture.split('train'))} frames, "
         f"{budget_words(comparison)}, and compared with recorded images that none of them saw."
@@ -123,7 +130,7 @@ def write_comparison_report(output: Path, comparison: dict[str, Any], capture: C
         shown = {"frames.csv": frames}
         sections += [Section(title="The same frame by every method", text=text, files=shown), *images]
     sections += [*_curves(comparison, files), *_distance(comparison, files), *_speed(comparison, files)]
-    if failed := failures(comparison):
+    if failed := comparison.failures:
         sections.append(Section(title="What failed", notes=failed))
     facts, configs = _facts(comparison, capture), _configs(comparison, output)
     return write_page(
@@ -132,33 +139,34 @@ def write_comparison_report(output: Path, comparison: dict[str, Any], capture: C
         title=f"{capture.root.name}: methods compared",
         name=capture.root.name,
         subtitle="methods compared",
-        version=comparison["version"],
-        stamps=[machine_words(comparison["machine"])],
+        version=comparison.version,
+        stamps=[machine_words(comparison.machine)],
         intro=[intro + (f" Masks of {masks} are scored beside theirs." if masks else "")],
-        findings=_split_findings(comparison),
+        findings=findings(comparison),
         sections=[*sections, Section(title="How it was made", facts=facts, listings=configs)],
     )
 
 
-def findings(comparison: Mapping[str, Any]) -> list[str]:
-    """Who is first on each split and by how much, who draws fastest, and what failed. Higher is better in all."""
-    sentences = []
-    for split in comparison["splits"]:
-        rows = [row for row in comparison["summary"] if row["split"] == split]
+def findings(comparison: ComparisonResult) -> list[tuple[str, str]]:
+    """(split or "", sentence): who is first on each split and by how much, who draws fastest, and what failed."""
+    found = []
+    for split in comparison.splits:
+        rows = [row for row in comparison.summary if row["split"] == split]
         clauses: dict[str, str] = {}  # by title: the first key that is known
         for key, title, unit, digits in FINDINGS:
             if title not in clauses and (clause := leader(rows, key, title, unit, digits)):
                 clauses[title] = clause
         if clauses:
-            sentences.append(f"{split}: {'; '.join(clauses.values())}.")
-    first_split = [row for row in comparison["summary"] if row["split"] == next(iter(comparison["splits"]), None)]
+            found.append((split, f"{'; '.join(clauses.values())}."))
+    first_split = [row for row in comparison.summary if row["split"] == next(iter(comparison.splits), None)]
     if fastest := leader(first_split, "fps", "drawing speed", " FPS", 1):
-        sentences.append(f"{fastest}.")
-    if sentences and any(row["psnr"]["n"] and row["psnr"]["std"] is None for row in comparison["summary"]):
-        sentences.append("Of one seed the spread is not known: a small lead may be chance.")
-    if failed := failures(comparison):
-        sentences.append(f"{len(failed)} of {len(comparison['jobs'])} runs failed; they are listed below.")
-    return sentences
+        found.append(("", f"{fastest}."))
+    if found and any(row["psnr"]["n"] and row["psnr"]["std"] is None for row in comparison.summary):
+        found.append(("", "Of one seed the spread is not known: a small lead may be chance."))
+    if failed := comparison.failures:
+        found.append(("", f"{len(failed)} of {len(comparison.jobs)} runs failed; they are listed below."))
+    unfinished = ("", "Not all runs are finished: these are the numbers so far.")
+    return found if comparison.complete else [unfinished, *found]
 
 
 def leader(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, digits: int) -> str | None:
@@ -183,18 +191,7 @@ def leader(rows: Sequence[Mapping[str, Any]], key: str, title: str, unit: str, d
     return f"{name} first in {title}, {value}, {lead} before {second} (clear of the seeds' spread)"
 
 
-def _split_findings(comparison: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """(split or "", sentence)."""
-    found = (
-        [] if comparison.get("complete", True) else [("", "Not all runs are finished: these are the numbers so far.")]
-    )
-    for sentence in findings(comparison):
-        split, _, rest = sentence.partition(": ")
-        found.append((split, rest) if rest and split in comparison["splits"] else ("", sentence))
-    return found
-
-
-def _result_sections(comparison: Mapping[str, Any]) -> list[Section]:
+def _result_sections(comparison: ComparisonResult) -> list[Section]:
     """Of each table the scores of images, and apart those of masks, with the methods that have a number in it."""
     sections = []
     for table in tables_of(comparison):
@@ -209,12 +206,12 @@ def _result_sections(comparison: Mapping[str, Any]) -> list[Section]:
     return sections
 
 
-def median_frame(comparison: Mapping[str, Any], capture: Capture, split: str) -> Frame | None:
+def median_frame(comparison: ComparisonResult, capture: Capture, split: str) -> Frame | None:
     """The frame in the middle of the split's by mean PSNR over methods and seeds; the split's own middle where nobody
     scored it; None when the split has no frame."""
     frames = capture.split(split)
     scores: dict[str, list[float | None]] = {}
-    for row in comparison["distance"]:
+    for row in comparison.distance:
         if row["split"] == split and row["psnr"] is not None:
             scores.setdefault(row["frame"], []).append(row["psnr"])
     ranked = sorted((frame for frame in frames if frame.name in scores), key=lambda frame: mean_of(scores[frame.name]))
@@ -222,13 +219,13 @@ def median_frame(comparison: Mapping[str, Any], capture: Capture, split: str) ->
     return among[len(among) // 2] if among else None
 
 
-def _frame_images(comparison: Mapping[str, Any], capture: Capture, output: Path) -> tuple[list[Section], str]:
+def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) -> tuple[list[Section], str]:
     """The median frame of every split, recorded and drawn by each method's first finished seed; PSNR as CSV."""
-    chosen = [frame for split in comparison["splits"] if (frame := median_frame(comparison, capture, split))]
+    chosen = [frame for split in comparison.splits if (frame := median_frame(comparison, capture, split))]
     images: list[list[Images]] = [[] for _ in chosen]
     scores: list[list[dict[str, Any]]] = [[] for _ in chosen]
     first_seeds: dict[str, int] = {}
-    for job in comparison["jobs"]:
+    for job in comparison.jobs:
         if "error" not in job:
             first_seeds.setdefault(job["name"], job["seed"])
     for name, seed in first_seeds.items():
@@ -255,16 +252,16 @@ def _frame_images(comparison: Mapping[str, Any], capture: Capture, output: Path)
     return sections, csv_text(["split", "frame", "name", "seed", "psnr"], [row for rows in scores for row in rows])
 
 
-def _curves(comparison: Mapping[str, Any], files: Mapping[str, str]) -> list[Section]:
+def _curves(comparison: ComparisonResult, files: Mapping[str, str]) -> list[Section]:
     """PSNR of held-out frames over training time, a chart per split: the mean over seeds, and each seed thin."""
     import pandas
 
-    if not comparison["curves"]:
+    if not comparison.curves:
         return []
-    names, rows = trained_methods(comparison), pandas.DataFrame(comparison["curves"]).dropna(subset="psnr")
-    minutes = max(row["seconds"] for row in comparison["curves"]) >= MINUTES_FROM
+    names, rows = comparison.trained, pandas.DataFrame(comparison.curves).dropna(subset="psnr")
+    minutes = max(row["seconds"] for row in comparison.curves) >= MINUTES_FROM
     scale, unit = (1 / 60, "minutes") if minutes else (1.0, "seconds")
-    clock = "CPU " if comparison["budget"]["clock"] == "processor" else ""
+    clock = "CPU " if comparison.budget["clock"] == "processor" else ""
     figures = []
     for split, of_split in rows.groupby("split", sort=False):
         series = []
@@ -281,13 +278,13 @@ def _curves(comparison: Mapping[str, Any], files: Mapping[str, str]) -> list[Sec
     return [_charted("PSNR over training time", text, figures, files, "curves.csv")] if figures else []
 
 
-def _distance(comparison: Mapping[str, Any], files: Mapping[str, str]) -> list[Section]:
+def _distance(comparison: ComparisonResult, files: Mapping[str, str]) -> list[Section]:
     """Quality of every held-out frame against its distance from the nearest training state."""
     import pandas
 
-    if not comparison["distance"]:
+    if not comparison.distance:
         return []
-    names, rows = trained_methods(comparison), pandas.DataFrame(comparison["distance"])
+    names, rows = comparison.trained, pandas.DataFrame(comparison.distance)
     figures = []
     for key, title in FRAME_SCORES:
         known = rows.dropna(subset=["distance", key])
@@ -315,11 +312,11 @@ def _charted(title: str, text: str, figures: Sequence[Figure], files: Mapping[st
     return Section(title=title, text=text, figures=figures, files={name: files[name]})
 
 
-def _speed(comparison: Mapping[str, Any], files: Mapping[str, str]) -> list[Section]:
+def _speed(comparison: ComparisonResult, files: Mapping[str, str]) -> list[Section]:
     """The table of speeds, and how they were taken."""
     import pandas
 
-    speed = comparison.get("speed") or {"rows": []}
+    speed = comparison.speed
     if not speed["rows"]:
         return []
     numbers = pandas.DataFrame(speed["rows"]).astype({"num_gaussians": float}).groupby(["name", "backend"], sort=False)
@@ -333,129 +330,130 @@ def _speed(comparison: Mapping[str, Any], files: Mapping[str, str]) -> list[Sect
         for key, row in numbers[["fps", "milliseconds", "num_gaussians"]].median().iterrows()
     ]
     size = f", {speed['image'][0]}x{speed['image'][1]} pixels" if "image" in speed else ""
-    text = f"{speed.get('how', '')}{size}; median over seeds. {machine_words(comparison['machine'])}."
+    text = f"{speed.get('how', '')}{size}; median over seeds. {machine_words(comparison.machine)}."
     head = ["method", "backend", "FPS ↑", "ms per image ↓", "Gaussians"]
     return [Section(title="Speed", text=text, head=head, rows=rows, files={"speed.csv": files["speed.csv"]})]
 
 
-def command_of(comparison: Mapping[str, Any]) -> str:
+def command_of(comparison: ComparisonResult) -> str:
     """The command that makes this comparison."""
-    budget = comparison["budget"]
-    words = ["neeco", "compare", comparison["capture"], "--methods", *trained_methods(comparison)]
-    words += ["--seeds", str(len(comparison["seeds"]))]
+    budget = comparison.budget
+    words = ["neeco", "compare", comparison.capture, "--methods", *comparison.trained]
+    words += ["--seeds", str(len(comparison.seeds))]
     if budget["iterations"] is not None:
         words += ["--iterations", str(budget["iterations"])]
     else:
         words += ["--cpu-minutes" if budget["clock"] == "processor" else "--minutes", f"{budget['minutes']:g}"]
-    words += ["--splits", *comparison["splits"]]
-    if comparison["transforms"] != "transforms.json":
-        words += ["--transforms", comparison["transforms"]]
-    words += [word for setting in comparison["settings"] for word in ("--set", setting)]
+    words += ["--splits", *comparison.splits]
+    if comparison.transforms != "transforms.json":
+        words += ["--transforms", comparison.transforms]
+    words += [word for setting in comparison.settings for word in ("--set", setting)]
     words += ["--output", "DIR"]
-    masks = [f"{entry['name']}={entry['folder']}" for entry in comparison["methods"] if entry["source"] == "masks"]
+    masks = [f"{entry['name']}={entry['folder']}" for entry in comparison.methods if entry["source"] == "masks"]
     return shlex.join([*words, *(word for folder in masks for word in ("--masks", folder))])
 
 
-def _facts(comparison: Mapping[str, Any], capture: Capture) -> list[tuple[str, str]]:
-    machine = comparison["machine"]
+def _facts(comparison: ComparisonResult, capture: Capture) -> list[tuple[str, str]]:
+    machine = comparison.machine
     return [
         ("command", command_of(comparison)),
-        ("capture", comparison["capture"]),
+        ("capture", comparison.capture),
         ("frames", split_counts(capture)),
         ("budget", budget_words(comparison)),
         ("machine", machine_words(machine)),
-        ("versions", f"neeco {comparison['version']}, Python {machine['python']}, torch {machine['torch']}"),
+        ("versions", f"neeco {comparison.version}, Python {machine['python']}, torch {machine['torch']}"),
         ("rasteriser", str(machine.get("backend", "–"))),
     ]
 
 
-def _configs(comparison: Mapping[str, Any], output: Path) -> list[tuple[str, str]]:
+def _configs(comparison: ComparisonResult, output: Path) -> list[tuple[str, str]]:
     """(title, config.yaml) of each method's first finished seed."""
     listings = []
-    for name in trained_methods(comparison):
-        seed = next((job["seed"] for job in comparison["jobs"] if job["name"] == name and "error" not in job), None)
+    for name in comparison.trained:
+        seed = next((job["seed"] for job in comparison.jobs if job["name"] == name and "error" not in job), None)
         config = job_folder(output, name, seed) / "config.yaml" if seed is not None else None
         if config is not None and config.is_file():
             listings.append((f"{name}: config.yaml", config.read_text(encoding="utf-8", errors="replace")))
     return listings
 
 
-def write_ablation_report(output: Path, ablation: dict[str, Any]) -> Path:
+def write_ablation_report(output: Path, ablation: AblationResult) -> Path:
     """Write DIR/report.html from what `run_ablations` returned; its path."""
-    name = Path(ablation["capture"]).name
-    steps = " and ".join(f"{count:,} steps of {method}" for method, count in ablation["iterations"].items())
-    settings = f", with {', '.join(ablation['settings'])}" if ablation["settings"] else ""
+    name = Path(ablation.capture).name
+    steps = " and ".join(f"{count:,} steps of {method}" for method, count in ablation.iterations.items())
+    settings = f", with {', '.join(ablation.settings)}" if ablation.settings else ""
     scaled = (
         f"The paper's schedule, stated for {PUBLISHED_STEPS:,}, is scaled to these runs, and phase 2 begins at "
         f"{PHASE_1_SHARE:.0%} of each; learning rates are not scaled. "
     )
     intro = [
         "What becomes of the result when one part is taken away or turned round. Runs have "
-        f"{steps}, seed {ablation['seed']}{settings}, on {hardware_words(ablation['machine'])}. "
-        f"{scaled if 'neeco' in ablation['iterations'] else ''}"
+        f"{steps}, seed {ablation.seed}{settings}, on {hardware_words(ablation.machine)}. "
+        f"{scaled if 'neeco' in ablation.iterations else ''}"
         "In brackets: the difference to the line in bold.",
         f"One seed: a difference below {EVEN_DB} dB is called even, and one little above it may still be chance. The "
         "paper's numbers come from other recordings and longer runs; only directions are compared.",
     ]
     sections = []
-    if ablation["failures"]:
-        failed = [f"{item['run']}: {item['error']}" for item in ablation["failures"]]
+    if ablation.failures:
+        failed = [f"{item['run']}: {item['error']}" for item in ablation.failures]
         sections.append(Section(title="Not measured", notes=failed))
-    if ablation["notes"]:
-        sections.append(Section(title="Notes", notes=ablation["notes"]))
-    if judged := [table for table in ablation["tables"] if table["judged"]]:
+    if ablation.notes:
+        sections.append(Section(title="Notes", notes=ablation.notes))
+    if judged := [table for table in ablation.tables if table.judged]:
         link = Markup('<a href="#{}">{}</a>')
-        held = [(link.format(table["name"], table["title"]), agreement(table)) for table in judged]
+        held = [(link.format(table.name, table.title), agreement(table)) for table in judged]
         sections.append(Section(title="Do the paper's directions hold?", head=("table", "directions"), rows=held))
-    for table in ablation["tables"]:
+    for table in ablation.tables:
         section = Section(
-            title=table["title"],
-            anchor=table["name"],
-            text=table["question"],
+            title=table.title,
+            anchor=table.name,
+            text=table.question,
             results=grid(table),
-            figures=[*_learning_curves(table, ablation), *_levels(table, ablation["splits"])],
-            files={f"{table['name']}.csv": ablation_csv(table)},
+            figures=[*_learning_curves(table, ablation), *_levels(table, ablation.splits)],
+            files={f"{table.name}.csv": ablation_csv(table)},
             notes=[directions] if (directions := agreement(table)) else [],
         )
         sections.append(section)
     keys = ("name", "iterations", "seconds", "processor_seconds", "num_gaussians")
-    rows = [[f"{run[key]:,.0f}" if key != "name" else run[key] for key in keys] for run in ablation["runs"]]
+    rows = [[f"{run[key]:,.0f}" if key != "name" else run[key] for key in keys] for run in ablation.runs]
     sections.append(Section(title="Runs", head=("run", "steps", "training s", "CPU s", "Gaussians"), rows=rows))
     page = {"title": f"{name}: ablations", "name": name, "subtitle": "ablations"}
     return write_page(output / REPORT_FILE, "study.html", **page, intro=intro, findings=[], sections=sections)
 
 
-def _learning_curves(table: dict[str, Any], ablation: dict[str, Any]) -> list[Figure]:
+def _learning_curves(table: AblationTable, ablation: AblationResult) -> list[Figure]:
     """Held-out PSNR over steps, a figure for every comparison of a table of the paper."""
-    split = primary_split(tuple(ablation["splits"]))
+    split = primary_split(ablation.splits)
     figures = []
-    for comparison in dict.fromkeys(row["comparison"] for row in table["curves"]):
-        rows = [row for row in table["curves"] if row["comparison"] == comparison]
+    for comparison in dict.fromkeys(row["comparison"] for row in table.curves):
+        rows = [row for row in table.curves if row["comparison"] == comparison]
         labels = list(dict.fromkeys(row["label"] for row in rows))
         series = _series(labels, [(row["label"], row["iteration"], row["psnr"]) for row in rows])
-        phase_2 = (PHASE_1_SHARE * ablation["iterations"]["neeco"], "phase 2")
+        phase_2 = (PHASE_1_SHARE * ablation.iterations["neeco"], "phase 2")
         chart = line_chart(f"{comparison}: PSNR on {split}, dB", "steps", series, starts=[phase_2])
         data = [{"setting": r["label"], "iteration": r["iteration"], f"psnr_{split}": r["psnr"]} for r in rows]
         words = "".join(letter if letter.isalnum() else "-" for letter in comparison)
-        figures.append(_figure(chart, labels, series, data, f"{table['name']}-{words}-curves.csv"))
+        figures.append(_figure(chart, labels, series, data, f"{table.name}-{words}-curves.csv"))
     return figures
 
 
-def _levels(table: dict[str, Any], splits: Sequence[str]) -> list[Figure]:
+def _levels(table: AblationTable, splits: Sequence[str]) -> list[Figure]:
     """PSNR and IoU over the entries of a table whose entries are amounts."""
-    levels, over = ABLATIONS[table["name"]].levels, ABLATIONS[table["name"]].level_name
+    definition = all_ablations()[table.name]
+    levels, over = definition.levels, definition.level_name
     figures = []
     for score, title in LEVEL_SCORES if levels else ():
         rows = [
-            (split, level, row["values"].get(f"{score}.{split}"))
+            (split, level, row.values.get(f"{score}.{split}"))
             for split in splits
-            for level, row in zip(levels, table["rows"], strict=True)
+            for level, row in zip(levels, table.rows, strict=True)
         ]
         series = _series(splits, rows)
         chart = line_chart(title, over, series)
         if chart:
             data = [{"split": split, "level": level, score: value} for split, level, value in rows]
-            figures.append(_figure(chart, splits, series, data, f"{table['name']}-{score}.csv"))
+            figures.append(_figure(chart, splits, series, data, f"{table.name}-{score}.csv"))
     return figures
 
 

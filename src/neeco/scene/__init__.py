@@ -1,8 +1,7 @@
 """The learned model and how it is posed."""
 
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import Drawable
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Drawable, Recorded
 from neeco.scene.scene import Scene, gaussian_scene
 
 __all__ = ["CanonicalGaussians", "Drawable", "Recorded", "Scene", "gaussian_scene"]

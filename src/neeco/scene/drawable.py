@@ -1,4 +1,4 @@
-"""What evaluation, reports and benchmarks ask of a scene, whether it is made of Gaussians or a field."""
+"""A learned scene as the rest of the program sees it, whether it is made of Gaussians or a field."""
 
 from __future__ import annotations
 
@@ -10,9 +10,32 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Camera, Instrument, State
+from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.types import Rendering
-from neeco.scene.recorded import Recorded
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Every training frame's name, split, state and camera."""
+
+    names: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ()
+    states: tuple[State, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], instruments: tuple[Instrument, ...]) -> Recorded:
+        """What `frames` record of `instruments`: only these, and of each only the joints named."""
+        states = []
+        for frame in frames:
+            chosen = {}
+            for instrument in instruments:
+                given = frame.state.instruments[instrument.name]
+                joints = {joint: given.joints[joint] for joint in instrument.joints}
+                chosen[instrument.name] = InstrumentState(given.pose, joints)
+            states.append(State(chosen, frame.state.time))
+        names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
+        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames))
 
 
 @dataclass(frozen=True)
@@ -22,9 +45,7 @@ class HingeMotion:
 
     log_scales: Tensor  # [N, 3], as drawn
     turns: Tensor  # [N, J, 2] rad by which joint j turns a Gaussian: at a reading of 0, and per unit of the reading
-    hinges: tuple[
-        tuple[tuple[Tensor, Tensor], ...], ...
-    ]  # per moving instrument and joint: pivot [3] mm, unit axis [3]
+    hinges: tuple[tuple[tuple[Tensor, Tensor], ...], ...]  # pivot [3] mm, unit axis [3] per moving instrument and joint
 
 
 class Drawable(Protocol):
@@ -48,9 +69,6 @@ class Drawable(Protocol):
     def num_gaussians(self) -> int | None:
         """How many Gaussians one drawing uses; None: the scene has none."""
 
-    def camera(self, camera: Camera) -> Camera:
-        """The camera to draw with for a recorded one."""
-
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
 
@@ -58,7 +76,7 @@ class Drawable(Protocol):
         """How the Gaussians move, where hinges say all of it; None otherwise."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where the scene is drawn."""
+        """Use as many of torch's threads as pay where the scene is drawn."""
 
 
 class Learned(Drawable, Protocol):

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Instrument
 from neeco.raster.native import torch_threads
-from neeco.scene.drawable import Learned
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.training_session import RunLength, Session
 from neeco.scene.training_views import TrainingViews
 
@@ -62,7 +61,7 @@ class Method:
 
     @classmethod
     def torch_threads(cls) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where scenes are posed and drawn: one, unless the operations are large."""
+        """Use one of torch's threads where scenes are posed and drawn, or all where the operations are large."""
         return nullcontext() if cls.large_operations else torch_threads(1)
 
     @classmethod

@@ -17,16 +17,24 @@ DEFAULT = "kinematic"
 
 
 def find_methods() -> dict[str, type[Method]]:
-    """Every class with a `method` name of its own that a public module of `deformations/` or `nerfies/` defines, by
-    that name.
-
-    DEFAULT comes first, the others in the order of their names. Raises NeecoError when two share one.
-    """
+    """Every class with its own `method` name that a public module of `deformations/` or `nerfies/` defines, by name:
+    DEFAULT first, the others sorted. Raises NeecoError when two share a name."""
     found = named_classes(Method, "method", deformations, nerfies)
     return dict(sorted(found.items(), key=lambda item: item[0] != DEFAULT))
 
 
 METHODS: dict[str, type[Method]] = find_methods()
+
+
+def add_method(kind: type[Method]) -> type[Method]:
+    """Make a method that is defined outside this package known to this process; usable as a decorator.
+
+    Raises NeecoError when another class has its name.
+    """
+    if METHODS.get(kind.method, kind) is not kind:
+        raise NeecoError(f"method: {kind.method!r} is there already; give {kind.__name__} another name")
+    METHODS[kind.method] = kind
+    return kind
 
 
 def method_class(method: str) -> type[Method]:

@@ -18,13 +18,11 @@ from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
-from neeco.scene.drawable import Drawable, HingeMotion
+from neeco.scene.drawable import Drawable, HingeMotion, Recorded
 from neeco.scene.method import Stored
-from neeco.scene.recorded import Recorded
-from neeco.scene.rim import MADE_UP
-from neeco.scene.seen import SEEN, made_up_of, measure_seen
+from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
-LAMPS = 3  # at most: what a laparoscope's light guides come to
+LAMPS = 3  # at most, as many as a laparoscope has light guides
 SHADOW_WIDTH = 0.01  # slope, at the start
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
@@ -140,20 +138,18 @@ class Scene(nn.Module):
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
 
-    def seen(self) -> Tensor:
-        """[N, 12] how well the training frames saw each Gaussian (see `neeco.scene.seen`). Found out at the end of
-        training; of a scene that is still learned, or was before that was done, here and now."""
-        if SEEN not in self.canonical.extras:
-            seen = measure_seen(self.canonical, self.recorded, self.at)
-            if MADE_UP in self.canonical.extras:  # the rim of what is continued reaches into images
-                seen *= 1 - self.canonical.extras[MADE_UP][:, None]
-            self.canonical = self.canonical.with_extras(**{SEEN: seen})
-        return self.canonical.extras[SEEN]
+    def visibility(self) -> Tensor:
+        """[N, 12] how well the training frames observed each Gaussian (see `neeco.scene.visibility`). Measured at the
+        end of training; otherwise here, once."""
+        if VISIBILITY not in self.canonical.extras:
+            measured = measure_visibility(self.canonical, self.recorded, self.at)
+            self.canonical = self.canonical.with_extras(**{VISIBILITY: measured})
+        return self.canonical.extras[VISIBILITY]
 
-    def made_up(self, posed: Gaussians, camera: Camera) -> Tensor:
-        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is made up: seen by no training frame, or not
-        from about there."""
-        return made_up_of(self.seen(), posed, camera)
+    def unobserved(self, posed: Gaussians, camera: Camera) -> Tensor:
+        """[N] in [0, 1] how far each posed Gaussian, as `camera` sees it, is unobserved: seen by no training frame, or
+        not from about there."""
+        return unobserved_share(self.visibility(), posed, camera)
 
     @property
     def casts_shadow(self) -> bool:
@@ -185,14 +181,10 @@ class Scene(nn.Module):
             moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
         return dataclasses.replace(state, instruments=moved)
 
-    def camera(self, camera: Camera) -> Camera:
-        """The camera to draw with. The recorded one: the correction is carried by the instruments."""
-        return camera
-
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""
         channels = self.label_channels() if labels and self.label_names else None
-        return rasterize(self.at(state), self.camera(camera), channels=channels)
+        return rasterize(self.at(state), camera, channels=channels)
 
     def hinge_motion(self) -> HingeMotion | None:
         """How the Gaussians move, where hinges say all of it; None otherwise."""
@@ -234,7 +226,7 @@ def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
 
 
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
+    """The Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():

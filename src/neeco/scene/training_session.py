@@ -18,8 +18,7 @@ from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
-from neeco.scene.hinges import Hinged
-from neeco.scene.swept import SweptVolume
+from neeco.scene.instruments import HingedInstruments, SweptVolume
 from neeco.scene.training_views import TrainingViews
 
 Report = Callable[[str], None]  # shows the user one line
@@ -72,6 +71,11 @@ def check_finite(total: float, iteration: int, where: str = "") -> None:
             f"training: the loss became {total} at iteration {iteration}{where}; run `neeco check` on the capture, or "
             "train anew with another --seed (the last checkpoint is kept)"
         )
+
+
+def members(tensors: Mapping[str, Tensor], group: str) -> dict[str, Tensor]:
+    """The tensors called GROUP/NAME, by NAME."""
+    return {key.removeprefix(f"{group}/"): t for key, t in tensors.items() if key.startswith(f"{group}/")}
 
 
 @dataclass
@@ -130,17 +134,17 @@ class InstrumentSearch:
     """Functions that find instruments and their joints in the training views, without masks, CAD or labels."""
 
     # carve every instrument, add its Gaussians to the scene as a body of its own, and start its hinges
-    find: Callable[[Hinged], None]
+    find: Callable[[HingedInstruments], None]
     # bound the volume by what the carved instruments sweep
     bound: Callable[[SweptVolume], None]
     # find where each shaft ends and the wrist begins
-    place_wrists: Callable[[Hinged], None]
+    place_wrists: Callable[[HingedInstruments], None]
     # find it again, and move a wrist where spinning the shaft behind it costs no more than before
-    replace_wrists: Callable[[Hinged], None]
+    replace_wrists: Callable[[HingedInstruments], None]
     # find lamps that explain the instruments' shadows, beside those found before
     find_shadow: Callable[[], None]
     # set each instrument's extent, prolong its shaft, and judge whether its joints were found
-    conclude: Callable[[Hinged], None]
+    conclude: Callable[[HingedInstruments], None]
 
 
 @dataclass

@@ -11,21 +11,21 @@ from torch import Tensor
 
 from neeco.capture.model import Frame
 
-FITS = 0.5  # of a CUDA device's free memory: what all pixels may take there
+MAX_MEMORY_SHARE = 0.5  # of a CUDA device's free memory that all pixels may take
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Frames, and for each its image and its mask. Cameras and states stay where the frames have them.
+    """Frames, each with its image and mask. Cameras and states stay on the frames' device.
 
-    `images` and `masks` are where `target` and `mask` are asked for, or, where that device is too small, in the host's
-    memory, from where `copies` brings them.
+    `images` and `masks` are on `device`, or, where that is too small, in the host's memory; `prefetcher` copies them
+    from there.
     """
 
     frames: tuple[Frame, ...]
     images: tuple[Tensor, ...]  # [H, W, 3] uint8 each
-    masks: tuple[Tensor | None, ...]  # [H, W] bool each, False where the loss does not look; None: it looks everywhere
-    copies: Copies | None = None
+    masks: tuple[Tensor | None, ...]  # [H, W] bool each, False where the loss ignores a pixel; None: it uses all
+    prefetcher: PixelPrefetcher | None = None
 
     @classmethod
     def read(cls, frames: Sequence[Frame]) -> TrainingViews:
@@ -38,21 +38,22 @@ class TrainingViews:
 
     @property
     def device(self) -> torch.device:
-        """Where targets and masks are given, and everything is computed."""
-        return self.images[0].device if self.copies is None else self.copies.device
+        """Device of targets and masks, where everything is computed."""
+        return self.images[0].device if self.prefetcher is None else self.prefetcher.device
 
     def to(self, device: torch.device) -> TrainingViews:
-        """The same views on `device`; their pixels stay in the host's memory if they would take more than FITS of what
-        is free of a CUDA device's."""
+        """The same views on `device`; their pixels stay in the host's memory if they would take more than
+        MAX_MEMORY_SHARE of a CUDA device's free memory."""
         if device.type == "cuda":
             size = sum(pixels.nbytes for pixels in (*self.images, *self.masks) if pixels is not None)
-            if size > FITS * torch.cuda.mem_get_info(device)[0]:
-                return self.copied_to(device)
+            if size > MAX_MEMORY_SHARE * torch.cuda.mem_get_info(device)[0]:
+                return self.prefetched_to(device)
         return self._with_pixels(lambda pixels: pixels.to(device))
 
-    def copied_to(self, device: torch.device) -> TrainingViews:
+    def prefetched_to(self, device: torch.device) -> TrainingViews:
         """The same views for `device`, their pixels in page-locked memory of the host."""
-        return replace(self._with_pixels(lambda pixels: pixels.cpu().pin_memory()), copies=Copies(device))
+        views = self._with_pixels(lambda pixels: pixels.cpu().pin_memory())
+        return replace(views, prefetcher=PixelPrefetcher(device))
 
     def _with_pixels(self, change: Callable[[Tensor], Tensor]) -> TrainingViews:
         masks = tuple(None if mask is None else change(mask) for mask in self.masks)
@@ -66,18 +67,18 @@ class TrainingViews:
         """The mask [H, W] bool of one frame, or None."""
         return self._pixels(index)[1]
 
-    def announce(self, index: int) -> None:
-        """Frame `index` is wanted next: where its pixels have to be copied, that begins now."""
-        if self.copies is not None:
-            self.copies.begin(index, self.images[index], self.masks[index])
+    def prefetch(self, index: int) -> None:
+        """Start to copy the pixels of frame `index`, which is used next, where they have to be copied."""
+        if self.prefetcher is not None:
+            self.prefetcher.start(index, self.images[index], self.masks[index])
 
     def _pixels(self, index: int) -> tuple[Tensor, Tensor | None]:
         image, mask = self.images[index], self.masks[index]
-        return (image, mask) if self.copies is None else self.copies.take(index, image, mask)
+        return (image, mask) if self.prefetcher is None else self.prefetcher.get(index, image, mask)
 
 
-class Copies:
-    """Pixels of one frame after another on their way to a device: on a CUDA device by a stream of their own, while it
+class PixelPrefetcher:
+    """Copies one frame's pixels after another to a device; to a CUDA device on a stream of its own, while it
     computes."""
 
     def __init__(self, device: torch.device) -> None:
@@ -86,7 +87,7 @@ class Copies:
         self._index = -1
         self._pixels: tuple[Tensor, ...] = ()
 
-    def begin(self, index: int, image: Tensor, mask: Tensor | None) -> None:
+    def start(self, index: int, image: Tensor, mask: Tensor | None) -> None:
         """Start to copy frame `index`, unless that was the last."""
         if index == self._index:
             return
@@ -95,9 +96,9 @@ class Copies:
             self._pixels = tuple(tensor.to(self.device, non_blocking=True) for tensor in pixels)
         self._index = index
 
-    def take(self, index: int, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    def get(self, index: int, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """The copies of frame `index`; the device waits for them, not the caller."""
-        self.begin(index, image, mask)
+        self.start(index, image, mask)
         if self.stream is not None:
             computing = torch.cuda.current_stream(self.device)
             computing.wait_stream(self.stream)

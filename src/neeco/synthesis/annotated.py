@@ -8,9 +8,8 @@ pixel may look as no tissue did in training frames: the label misses it. Trust i
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +22,13 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
-from neeco.files import own_folder, write_json
 from neeco.labels.annotation import annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.dataset import INFO, check_output, description, indexed_on_failure, with_image, write_indexes
+from neeco.synthesis.dataset import DataSetFolder, check_output, description, with_image
 from neeco.synthesis.settings import MIN_TRUST, Format, Settings
-from neeco.synthesis.writers.folder import Record, load_record, write_sample, write_skipped
+from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
@@ -90,29 +88,29 @@ def annotate_capture(
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
-    write = partial(write_indexes, output, info=info, scene=scene, labeller=labeller, formats=formats)
-    with own_folder(output):
-        with indexed_on_failure(output, len(capture.frames), begun, partial(write, complete=False)):
-            write_json(output / INFO, info | {"complete": False})
-            typical = typical_errors(scene, labeller, trained_on)
-            info["usual_errors"] = asdict(typical)
-            made: dict[int, Record] = {}
-            for index, record in _Annotator(scene, labeller, typical, min_trust, output).frames(capture.frames, begun):
-                made[index] = record
-                on_progress(len(made), len(capture.frames))
-            records = [made[index] for index in sorted(made)]
-            if not with_image(records):
-                best = max(record["trust"]["value"] for record in records)
-                raise NeecoError(
-                    f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
-                )
-        write(records, complete=True)
-        return Annotated(output, capture, records)
+    folder = DataSetFolder(output, len(capture.frames), begun, info, scene, labeller, formats)
+    with folder.being_written() as records:
+        typical = typical_errors(scene, labeller, trained_on)
+        info["usual_errors"] = asdict(typical)
+        annotator = _Annotator(scene, labeller, typical, min_trust, output)
+        start: Tensor | None = None  # each fit starts from that of the frame before it in time
+        in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
+        for done, index in enumerate(in_time, 1):
+            if index not in records:
+                records[index] = annotator.annotate(index, capture.frames[index], start)
+            start = torch.tensor(records[index]["increments"], dtype=torch.float64)
+            on_progress(done, len(in_time))
+        if not with_image(records.values()):
+            best = max(record["trust"]["value"] for record in records.values())
+            raise NeecoError(
+                f"--min-trust: no frame of {capture.root} is trusted by {min_trust}; the best is by {best}"
+            )
+    return Annotated(output, capture, [records[index] for index in sorted(records)])
 
 
 @dataclass(frozen=True)
 class _Annotator:
-    """Fits, draws, judges and writes frames, one after the other in time."""
+    """Fits, draws, judges and writes frames."""
 
     scene: Scene
     labeller: CompositedLabels
@@ -120,17 +118,8 @@ class _Annotator:
     min_trust: float
     output: Path
 
-    def frames(self, frames: Sequence[Frame], begun: bool) -> Iterator[tuple[int, Record]]:
-        """(index, record) of every frame, in the order of time: each fit starts from its predecessor's."""
-        start: Tensor | None = None
-        for index in sorted(range(len(frames)), key=lambda k: frames[k].state.time):
-            record = load_record(self.output, index) if begun else None
-            if record is None:
-                record = self._one(index, frames[index], start)
-            start = torch.tensor(record["increments"], dtype=torch.float64)
-            yield index, record
-
-    def _one(self, index: int, frame: Frame, start: Tensor | None) -> Record:
+    def annotate(self, index: int, frame: Frame, start: Tensor | None) -> Record:
+        """Write frame `index`, or that it is not trusted; `start`: a neighbour's increments."""
         image = frame.load_image()
         fit, drawing, trust = self._fitted(frame, image, start)
         if start is not None and trust.value < self.min_trust:  # the neighbour's start may have misled the fit

@@ -1,7 +1,7 @@
 """Camera effects of a data set: the ranges they are drawn from, motion blur, and what lens, sensor and file do.
 
 Light is linear, an image is stored by the sRGB curve: "stored" images and "linear" light are [H, W, 3] float32, 1 is
-white. Motion while the shutter is open is that of a recorded moment that is much alike.
+white. Motion while the shutter is open is that of a recorded frame with a like state.
 """
 
 from __future__ import annotations
@@ -299,24 +299,17 @@ def subframes(scene: Scene, drawing: LayeredDrawing, motion: Motion, shutter_s: 
     """States and cameras spread evenly over an exposure of which `drawing` is the middle: so many that nothing moves
     by more than SUBFRAME_PX from one to the next (MAX_SUBFRAMES at most), and an odd number, so that the middle is
     one of them."""
-    ends = [motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2) for side in (-1, 1)]
-    apart = _pixels_between(scene, drawing, *ends)
-    count = 2 * int(np.clip(np.ceil(apart / SUBFRAME_PX / 2), 0, MAX_SUBFRAMES // 2 - 1)) + 1
-    times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
-    return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
-
-
-def _pixels_between(
-    scene: Scene, drawing: LayeredDrawing, start: tuple[State, Camera], end: tuple[State, Camera]
-) -> float:
-    """The furthest that a working end or a place on the tissue moves in the image, in px."""
-    places = []
-    for state, camera in (start, end):
+    places = []  # where working ends and places on the tissue are in the image, at the start and at the end
+    for side in (-1, 1):
+        state, camera = motion.advanced(drawing.state, drawing.camera, side * shutter_s / 2)
         points = [point for ends in working_ends(scene, state).values() for point in ends]
         points += list(surface_points(drawing.tissue_depth, drawing.camera, TISSUE_STEP_PX))
         places.append([place_in_image(point, camera) for point in points])
     moved = [np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in zip(*places, strict=True) if a and b]
-    return float(max(moved, default=0.0))
+    apart = float(max(moved, default=0.0))
+    count = 2 * int(np.clip(np.ceil(apart / SUBFRAME_PX / 2), 0, MAX_SUBFRAMES // 2 - 1)) + 1
+    times = ((np.arange(count) + 0.5) / count - 0.5) * shutter_s
+    return [motion.advanced(drawing.state, drawing.camera, float(time)) for time in times]
 
 
 def motion_between(a: State, camera_a: Camera, b: State, camera_b: Camera) -> Motion:

@@ -10,16 +10,15 @@ import contextlib
 import hashlib
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import neeco
 from neeco import cluster
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_json, require_inside, write_json
+from neeco.files import is_vacant, own_folder, read_bytes, read_json, require_inside, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
@@ -61,6 +60,7 @@ if TYPE_CHECKING:
     from neeco.training.run import Run
 
 SCHEMA = "neeco-dataset/1"
+SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
 INFO = "dataset.json"
 SCENE_FILE = "scene.safetensors"
 
@@ -127,30 +127,23 @@ def synthesize(
     info["tissue_tolerance_mm"] = generator.acceptance.tolerance_mm
     if generator.gains:
         info["color_gains"] = [[round(value, 4) for value in gain] for gain in generator.gains]
-    write = partial(
-        write_indexes, output, info=info, scene=generator.scene, labeller=generator.labeller, formats=formats
-    )
-    with own_folder(output):
-        with indexed_on_failure(output, settings.count, begun, partial(write, complete=False)):
-            write_json(output / INFO, info | {"complete": False})
-            done = {k: record for k in range(settings.count) if begun and (record := load_record(output, k))}
-            if done:
-                on_progress(len(done))
-            missing = [k for k in range(settings.count) if k not in done]
-            scene_file, *others = (Path(given.path) / SCENE_FILE for given in runs)
-            spec = GeneratorSpec(scene_file, settings, str(scene.center.device), tuple(others))
-            made = 0
-            for record in _draw_all(generator, spec, output, missing, min(workers, len(missing))):
-                done[record["index"]] = record
-                made += not record.get("skipped")
-                on_progress(len(done))
-            records = [done[k] for k in range(settings.count)]
-            if not with_image(records):
-                refused = refusals(records)
-                remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
-                raise NeecoError(f"{settings.states}: every state was refused ({format_counts(refused)}); {remedies}")
-        write(records, complete=True)
-        return Synthesized(output, len(with_image(records)), made, refusals(records), skipped(records))
+    folder = DataSetFolder(output, settings.count, begun, info, generator.scene, generator.labeller, formats)
+    with folder.being_written() as records:
+        if records:
+            on_progress(len(records))
+        missing = [k for k in range(settings.count) if k not in records]
+        scene_file, *others = (Path(given.path) / SCENE_FILE for given in runs)
+        spec = GeneratorSpec(scene_file, settings, str(scene.center.device), tuple(others))
+        made = 0
+        for record in _draw_all(generator, spec, output, missing, min(workers, len(missing))):
+            records[record["index"]] = record
+            made += not record.get("skipped")
+            on_progress(len(records))
+        images, refused = with_image(records.values()), refusals(records.values())
+        if not images:
+            remedies = "; ".join(REMEDIES[reason] for reason in refused if reason in REMEDIES)
+            raise NeecoError(f"{settings.states}: every state was refused ({format_counts(refused)}); {remedies}")
+    return Synthesized(output, len(images), made, refused, skipped(records.values()))
 
 
 def _draw_all(
@@ -183,11 +176,8 @@ def description(run: Run, settings: dict[str, Any], instrument_runs: Sequence[Ru
 
 
 def _digest(run: Run) -> str:
-    scene_file = Path(run.path) / SCENE_FILE
-    try:
-        return hashlib.sha256(scene_file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise NeecoError(f"{scene_file}: cannot read: {error.strerror or error}; train the run first") from error
+    content = read_bytes(Path(run.path) / SCENE_FILE, "a learned scene", "no such file; train the run first")
+    return hashlib.sha256(content).hexdigest()
 
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
@@ -204,6 +194,8 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = Settings.with_new_names(begun["settings"])
+    if begun.get("version") in SAME_IMAGES:
+        begun["version"] = description["version"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
     # a version that wrote neither of these folders named neither: all its images are drawn anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
@@ -214,79 +206,98 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     return True
 
 
-@contextlib.contextmanager
-def indexed_on_failure(output: Path, count: int, begun: bool, write: Callable[[list[Record]], None]) -> Iterator[None]:
-    """For a block that makes images 0 to `count` - 1 of a data set. Interrupted (Ctrl-C) or failing, what is done stays
-    and is indexed by `write`, to be continued; where nothing was `begun` and no image made, nothing stays."""
-    try:
-        yield
-    except (KeyboardInterrupt, NeecoError):
-        records = [record for index in range(count) if (record := load_record(output, index)) is not None]
-        if begun or with_image(records):
-            with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to continue from
-                write(records)
-        else:
-            (output / INFO).unlink(missing_ok=True)
-            for folder in FOLDERS:
-                shutil.rmtree(output / folder, ignore_errors=True)
-        raise
+@dataclass(frozen=True)
+class DataSetFolder:
+    """The folder of a data set that is made now: what dataset.json says of the making (`info`), whether it was `begun`
+    before, and what its index files need."""
+
+    output: Path
+    count: int  # of records, once it is complete
+    begun: bool
+    info: dict[str, Any]
+    scene: Scene
+    labeller: Labeller
+    formats: tuple[Format, ...]
+
+    @contextlib.contextmanager
+    def being_written(self) -> Iterator[dict[int, Record]]:
+        """For a block that makes the images: the records of those that are there, by index, to which it adds the rest.
+
+        Then the index files are written. Interrupted (Ctrl-C) or failing, what is done stays and is indexed, to be
+        continued; where nothing was begun and no image made, nothing stays.
+        """
+        with own_folder(self.output):
+            try:
+                write_json(self.output / INFO, self.info | {"complete": False})
+                records = self._stored() if self.begun else {}
+                yield records
+            except (KeyboardInterrupt, NeecoError):
+                stored = self._stored()
+                if self.begun or with_image(stored.values()):
+                    with contextlib.suppress(NeecoError):  # a full disk, say: the records are enough to continue from
+                        self._write_indexes(list(stored.values()), complete=False)
+                else:
+                    (self.output / INFO).unlink(missing_ok=True)
+                    for folder in FOLDERS:
+                        shutil.rmtree(self.output / folder, ignore_errors=True)
+                raise
+            self._write_indexes([records[index] for index in sorted(records)], complete=True)
+
+    def _stored(self) -> dict[int, Record]:
+        return {k: record for k in range(self.count) if (record := load_record(self.output, k)) is not None}
+
+    def _write_indexes(self, records: list[Record], complete: bool) -> None:
+        """(Re)write everything that is about the whole data set, from the records."""
+        output, names, images = self.output, self.labeller.names, with_image(records)
+        instruments, keypoints = instruments_of(names), keypoint_names(self.scene)
+        write_states(output, images)
+        writers: dict[Format, Callable[[], None]] = {
+            "coco": lambda: write_coco(output, images, instruments, keypoints),
+            "yolo": lambda: write_yolo(output, images, instruments, keypoints),
+            "webdataset": lambda: write_webdataset(output, images),
+            "bop": lambda: write_bop(output, images, names),
+            "imagefolder": lambda: write_imagefolder(output, images, instruments),
+        }
+        for name in writers:
+            if name in self.formats:
+                writers[name]()
+        if images:
+            write_preview(output, images, names)
+        thresholds = self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None
+        info = self.info | {
+            "complete": complete,
+            "images": len(images),
+            "splits": dict(Counter(record["split"] for record in images)),
+            "formats": list(self.formats),
+            "ids": part_ids(names),
+            "keypoints": list(keypoints),
+            "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
+            "delta_thresholds": None if thresholds is None else asdict(thresholds),
+            "refused": refusals(records),
+            "skipped": skipped(records),
+        }
+        write_card(output, info)
+        write_json(output / INFO, info)
 
 
-def write_indexes(
-    output: Path,
-    records: list[Record],
-    info: dict[str, Any],
-    scene: Scene,
-    labeller: Labeller,
-    formats: tuple[Format, ...],
-    complete: bool,
-) -> None:
-    """(Re)write everything that is about the whole data set, from the records."""
-    images = with_image(records)
-    instruments = instruments_of(labeller.names)
-    keypoints = keypoint_names(scene)
-    write_states(output, images)
-    writers: dict[Format, Callable[[], None]] = {
-        "coco": lambda: write_coco(output, images, instruments, keypoints),
-        "yolo": lambda: write_yolo(output, images, instruments, keypoints),
-        "webdataset": lambda: write_webdataset(output, images),
-        "bop": lambda: write_bop(output, images, labeller.names),
-        "imagefolder": lambda: write_imagefolder(output, images, instruments),
-    }
-    for name, writer in writers.items():
-        if name in formats:
-            writer()
-    if images:
-        write_preview(output, images, labeller.names)
-    thresholds = labeller.thresholds if isinstance(labeller, ThresholdLabels) else None
-    info = info | {
-        "complete": complete,
-        "images": len(images),
-        "splits": dict(Counter(record["split"] for record in images)),
-        "formats": list(formats),
-        "ids": [{"id": 0, "part": "tissue"}]
-        + [{"id": k + 1, "instrument": name, "part": part} for k, (name, part) in enumerate(labeller.names)],
-        "keypoints": list(keypoints),
-        "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},
-        "delta_thresholds": None if thresholds is None else asdict(thresholds),
-        "refused": refusals(records),
-        "skipped": skipped(records),
-    }
-    write_card(output, info)
-    write_json(output / INFO, info)
+def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
+    """What part ids mean, for files; names: (instrument, part) of part id 1, 2, ..."""
+    return [{"id": 0, "part": "tissue"}] + [
+        {"id": k, "instrument": instrument, "part": part} for k, (instrument, part) in enumerate(names, 1)
+    ]
 
 
-def with_image(records: Sequence[Record]) -> list[Record]:
+def with_image(records: Iterable[Record]) -> list[Record]:
     """The records of images that were written."""
     return [record for record in records if not record.get("skipped")]
 
 
-def skipped(records: Sequence[Record]) -> list[int]:
+def skipped(records: Iterable[Record]) -> list[int]:
     """Indices without an image."""
     return [record["index"] for record in records if record.get("skipped")]
 
 
-def refusals(records: Sequence[Record]) -> dict[str, int]:
+def refusals(records: Iterable[Record]) -> dict[str, int]:
     """How many states were refused, by reason."""
     refused: Counter[str] = Counter()
     for record in records:

@@ -138,15 +138,19 @@ class SampleGenerator:
             groups = tuple(frozenset(item.name for item in given.instruments) for given in instrument_scenes)
         else:
             sampler = make_sampler(scene, settings.states, settings.margin, settings.views, settings.count)
-        labeller = make_labeller(scene, settings)
+        labeller: Labeller
+        if settings.labels == "composited":
+            labeller = CompositedLabels(scene, settings.label_threshold)
+        else:
+            deltas = settings.delta_thresholds
+            labeller = ThresholdLabels(scene, None if deltas is None else DeltaThresholds(*deltas))
         effects, motion = None, None
         if settings.camera_effects is not None:
             effects = read_effects(Path(settings.camera_effects))
             motion = _motion(tissue, instrument_scenes, settings) if effects.moves else None
-        tolerance = None
-        if settings.tissue_check:
-            tolerance = settings.tissue_tolerance_mm
-            tolerance = find_tolerance(scene, labeller) if tolerance is None else tolerance
+        tolerance = settings.tissue_tolerance_mm if settings.tissue_check else None
+        if settings.tissue_check and tolerance is None:
+            tolerance = find_tolerance(scene, labeller)
         acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
         return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
 
@@ -245,14 +249,6 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
             return write_skipped(output, index, error.refused)
         raise NeecoError(f"{output}: {error}") from None
     return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts)
-
-
-def make_labeller(scene: Scene, settings: Settings) -> Labeller:
-    """The way of labelling that the settings ask for."""
-    if settings.labels == "composited":
-        return CompositedLabels(scene, settings.label_threshold)
-    given = settings.delta_thresholds
-    return ThresholdLabels(scene, None if given is None else DeltaThresholds(*given))
 
 
 def find_tolerance(scene: Scene, labeller: Labeller) -> float:

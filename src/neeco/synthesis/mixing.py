@@ -27,9 +27,9 @@ from neeco.raster.sh import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformations.base import Deformation
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
-from neeco.scene.seen import SEEN
+from neeco.scene.visibility import VISIBILITY
 from neeco.synthesis.samplers import Sampler, make_sampler
 
 if TYPE_CHECKING:
@@ -219,10 +219,10 @@ def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[t
 def _body(scene: Scene, index: int, deformation: Deformation) -> CanonicalGaussians:
     """One body alone, with what the mixed scene's `deformation` knows of each Gaussian, and how well it was seen."""
     canonical, rows = scene.canonical, scene.canonical.body(index)
-    seen = scene.seen()[rows]
+    seen = scene.visibility()[rows]
     extras = deformation.fit_extras({name: tensor[rows] for name, tensor in canonical.extras.items()})
     alone = dataclasses.replace(canonical, extras={}).map(lambda tensor: tensor[rows], (len(seen),))
-    return alone.with_extras(**extras, **{SEEN: seen})
+    return alone.with_extras(**extras, **{VISIBILITY: seen})
 
 
 def _brightened(body: CanonicalGaussians, gain: tuple[float, float, float]) -> CanonicalGaussians:

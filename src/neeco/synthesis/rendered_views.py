@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from neeco.capture import read_capture
 from neeco.capture.images import write_image, write_labels
-from neeco.capture.model import Frame, State
+from neeco.capture.model import State
 from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
+from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import moved_camera, states_file
 
 if TYPE_CHECKING:
@@ -37,8 +38,7 @@ class Rendered:
     labelled: bool  # False: the scene's method learns no labels, so there are no part ids and masks
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """One image to draw."""
 
     name: str
@@ -56,8 +56,13 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
     if not frames:
         known = ", ".join(capture.splits) or "none"
         raise NeecoError(f"{capture.root}: split {split!r} has no frames; the capture has {known}")
-    names = _unique_names(frames, capture.root)
-    return [View(name, frame.state, frame.camera) for name, frame in zip(names, frames, strict=True)]
+    counts = Counter(frame.name for frame in frames)
+    views = []
+    for frame in frames:
+        path = frame.image_path.with_suffix("")
+        folders = path.relative_to(capture.root).parts if path.is_relative_to(capture.root) else path.parts[-2:]
+        views.append(View(frame.name if counts[frame.name] == 1 else "_".join(folders), frame.state, frame.camera))
+    return views
 
 
 def state_views(scene: Drawable, path: Path) -> list[View]:
@@ -71,12 +76,10 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
 
 
 def render(
-    scene: Drawable, views: Iterable[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
+    scene: Drawable, views: Sequence[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
 ) -> Rendered:
     """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
     mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
-    labelled = bool(scene.label_names)
-    done = 0
     for done, view in enumerate(views, 1):
         drawing = draw(scene, view.state, view.camera)
         write_image(folder / f"{view.name}.png", drawing.image)
@@ -84,21 +87,6 @@ def render(
             write_labels(folder / f"{view.name}_parts.png", drawing.parts)
             write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)
         on_progress(done)
-    if labelled:
-        names = [
-            {"id": index + 1, "instrument": name, "part": part} for index, (name, part) in enumerate(scene.label_names)
-        ]
-        write_json(folder / PARTS_FILE, {"ids": [{"id": 0, "part": "tissue"}, *names]})
-    return Rendered(folder, done, labelled)
-
-
-def _unique_names(frames: tuple[Frame, ...], root: Path) -> list[str]:
-    counts = Counter(frame.name for frame in frames)
-    names = []
-    for frame in frames:
-        if counts[frame.name] == 1:
-            names.append(frame.name)
-            continue
-        path = frame.image_path.with_suffix("")
-        names.append("_".join(path.relative_to(root).parts if path.is_relative_to(root) else path.parts[-2:]))
-    return names
+    if scene.label_names:
+        write_json(folder / PARTS_FILE, {"ids": part_ids(scene.label_names)})
+    return Rendered(folder, len(views), bool(scene.label_names))

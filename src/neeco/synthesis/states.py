@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,16 +21,6 @@ from neeco.labels.drawing import to_numpy
 
 AT_ZERO = 0.05  # of a joint's range: what lies past 0 by less is noise of its sensor
 JITTER = 0.02  # of the recorded spread: keeps a sample off the exact line between two recorded states
-
-
-class StateSampler(Protocol):
-    """Draws the state of image `index`."""
-
-    prescribed: bool  # the state of an index is given, not random: another attempt can only change the view
-
-    def __call__(self, index: int, rng: Generator) -> State:
-        """The state of image `index`; a random sampler draws anew on every call with the same generator."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -104,12 +93,6 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
     return State(instruments, (1 - weight) * first.time + weight * second.time)
 
 
-def mean_pose(poses: Sequence[np.ndarray]) -> np.ndarray:
-    """The mean of poses [4, 4]: mean position and the chordal mean of the rotations."""
-    rotation = Rotation.from_matrix(np.stack([pose[:3, :3] for pose in poses])).mean().as_matrix()
-    return rigid(rotation, np.mean([pose[:3, 3] for pose in poses], axis=0))
-
-
 def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
     """The range of every joint, by (instrument, joint), over recorded states."""
     readings: dict[tuple[str, str], list[float]] = {}
@@ -120,13 +103,10 @@ def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
     return {key: JointRange(min(values), max(values)) for key, values in readings.items()}
 
 
-def _usable(states: Sequence[State]) -> list[State]:
-    usable = [state for state in states if state.instruments]
-    if not usable:
-        raise NeecoError(
-            "states: the scene was trained without instrument states; train on a capture that records them"
-        )
-    return usable
+def _with_instruments(states: Sequence[State]) -> list[State]:
+    if found := [state for state in states if state.instruments]:
+        return found
+    raise NeecoError("states: the scene was trained without instrument states; train on a capture that records them")
 
 
 class InterpolatedStates:
@@ -140,18 +120,21 @@ class InterpolatedStates:
     prescribed = False
 
     def __init__(self, states: Sequence[State]) -> None:
-        self.states = _usable(states)
+        self.states = _with_instruments(states)
         self.ranges = joint_ranges(self.states)
-        self.means: dict[str, np.ndarray] = {}
+        self.means: dict[str, np.ndarray] = {}  # mean position and the chordal mean of the rotations
         self.bounds: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        turns = []  # rad, the largest from the mean rotation
         for name in {name for state in self.states for name in state.instruments}:
-            poses = [to_numpy(s.instruments[name].pose) for s in self.states if name in s.instruments]
-            positions = np.stack([pose[:3, 3] for pose in poses])
-            self.means[name] = mean_pose(poses)
+            poses = np.stack([to_numpy(s.instruments[name].pose) for s in self.states if name in s.instruments])
+            rotations, positions = Rotation.from_matrix(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+            mean = rotations.mean().as_matrix()
+            self.means[name] = rigid(mean, positions.mean(axis=0))
             self.bounds[name] = positions.min(0), positions.max(0)
+            turns.append(float((Rotation.from_matrix(mean).inv() * rotations).magnitude().max()))
         spans = [upper - lower for lower, upper in self.bounds.values()]
         self.jitter_mm = JITTER * float(np.linalg.norm(np.mean(spans, axis=0)))
-        self.jitter_rad = JITTER * float(np.mean([self._angular_spread(name) for name in self.means]))
+        self.jitter_rad = JITTER * float(np.mean(turns))
 
     def __call__(self, index: int, rng: Generator) -> State:
         first, second = (self.states[k] for k in rng.integers(len(self.states), size=2))
@@ -160,11 +143,6 @@ class InterpolatedStates:
         state = interpolate_state(first, second, float(rng.random()))
         state = self._jittered(state, rng)
         return with_joints(state, lambda name, joint: self.ranges[name, joint].at(rng.random()))
-
-    def _angular_spread(self, name: str) -> float:
-        mean = Rotation.from_matrix(self.means[name][:3, :3])
-        poses = [to_numpy(s.instruments[name].pose)[:3, :3] for s in self.states if name in s.instruments]
-        return float((mean.inv() * Rotation.from_matrix(np.stack(poses))).magnitude().max())
 
     def _jittered(self, state: State, rng: Generator) -> State:
         centre = np.mean([to_numpy(given.pose)[:3, 3] for given in state.instruments.values()], axis=0)
@@ -219,7 +197,7 @@ class GridStates:
         rolls: int = 5,
         roll_rad: float = np.pi / 6,
     ) -> None:
-        self.states = _usable(states)
+        self.states = _with_instruments(states)
         self.ranges = joint_ranges(self.states)
         self.axes = axes
         self.fractions = np.linspace(0, 1, joint_values) if joint_values > 1 else np.array([0.5])
@@ -264,6 +242,9 @@ class ListedStates:
 
     def __call__(self, index: int, rng: Generator) -> State:
         return self.states[index % len(self.states)]
+
+
+StateSampler = InterpolatedStates | GridStates | PathStates | ListedStates
 
 
 def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> State:

@@ -47,7 +47,6 @@ from neeco.labels.labelled_image import LabelledImage
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera
-from neeco.scene import Drawable
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import Scene, gaussian_scene
 from neeco.settings import with_fields
@@ -317,8 +316,8 @@ def _opened(given: SceneLike) -> tuple[Scene, Path | None]:
             return gaussian_scene(load_scene(path), ASKED_BY), path
         given = load_run(path)
     folder = getattr(given, "path", None)  # a run has one
-    drawable: Drawable = getattr(given, "scene", given)  # type: ignore[arg-type]
-    scene = gaussian_scene(drawable, ASKED_BY)
+    drawable: Any = getattr(given, "scene", given)
+    scene = gaussian_scene(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
     return scene, None if folder is None else Path(folder) / SCENE_FILE
 
 

@@ -1,16 +1,53 @@
-"""How to train: one config, and what each method sets differently."""
+"""Settings of a training run: the dataclasses, what each method sets differently, and their reading from command-line
+values and config.yaml."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import math
+import typing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
+
+import yaml
 
 from neeco.errors import NeecoError
 from neeco.scene.methods import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
-from neeco.settings import plain, structure, with_fields
-from neeco.training.schedule import ScheduleConfig
+from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
+from neeco.training.schedule import Part, ScheduleConfig
+
+ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
+LOG_INTERVAL = 50
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam's learning rates, but for those of the deformation's own parameters."""
+
+    position_rate: float = 1.6e-4  # of means, times the scene's extent (3DGS); falls log-linearly
+    rotation_rate: float = 1e-3  # of quaternions
+    scale_rate: float = 5e-3  # of log scales
+    opacity_rate: float = 5e-2  # of logits
+    color_rate: float = 2.5e-3  # of the spherical harmonics' constant term
+    sh_rate: float = 1.25e-4  # of the others
+    light_rate: float = 3e-3  # of falloff and vignette
+    shadow_offset_rate: float = 3e-2  # mm, of each lamp's place beside the lens
+    shadow_strength_rate: float = 2e-3
+    shadow_width_rate: float = 2e-5  # slope
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Density control beside what the schedule says of its intervals and thresholds."""
+
+    min_opacity: float = 0.005  # Gaussians below are pruned
+    dense_size: float = 0.01  # times the scene's extent: smaller Gaussians are cloned, larger ones split
+    split_shrink: float = 1.6  # by which the halves of a split Gaussian are smaller
+    reset_opacity: float = 0.01  # to which opacity resets clamp
+    prune_interval: int = 200  # iterations between prunings, and between re-centrings of the refinement
+    prune_stop: float = 0.95  # share of the run
 
 
 @dataclass(frozen=True)
@@ -22,28 +59,78 @@ class RefineConfig:
     frame_poses: bool = False  # every training frame's instrument pose, smooth in time
     cameras: bool = False  # every training frame's camera
     start: int = 400  # iteration
+    rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
+    translation_rate: float = 4e-2  # mm
+    camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
+    latency_rate: float = 2e-5  # s
+    prior_weight: float = 2e-5
+    prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
+    prior_translation: float = 0.3  # mm
+    registration_rotation_rate: float = 1e-4  # rad
+    registration_translation_rate: float = 1e-2  # mm
+    registration_scale_rate: float = 1e-4  # of the log scale
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """The search for instruments, their joints and their shadows in the training views."""
+
+    tissue_steps: int = 500  # of the short tissue-only fit whose residual is the evidence
+    long_tissue_steps: int = 1500  # of the one with density control, where the short one leaves too much
+    max_evidence: float = 0.25  # mean evidence that the short fit may leave
+    evidence_frames: int = 120  # training frames looked at, at most
+    evidence_floor: float = 0.04  # residual at which evidence begins (images in [0, 1])
+    evidence_range: float = 0.06  # residual above that at which it saturates
+    grid: int = 48  # voxels per side of the carving grid
+    fine_grid: int = 72  # of the one for thin instruments, tried where the first finds too few
+    pose_shifts: int = 4  # exchanges of poses among frames that evidence is compared with
+    motion_ratio: float = 1.5  # evidence under an instrument's own poses to that under exchanged ones, at least
+    seeds: int = 3000  # Gaussians per instrument at the start
+    hinge_angles: int = 36  # hinge directions tried over half a turn
+    hinge_depths: int = 10  # hinge places tried along the front half
+    max_pose_explained: float = 0.98  # share of a joint's variance that its instrument's pose may explain
+    min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains, at least
+    border_frames: int = 40  # frames whose colours along the shaft are looked at
+    spin_frames: int = 16  # frames in which shafts are spun to test their symmetry
+    spin_angle: float = 0.5  # rad: small, so that visible sides stay in view
+    lamp_frames: int = 12  # frames in which lamps are tried
+    lamp_directions: int = 8  # tried around the lens
+    min_lamp_agreement: float = 0.75  # share of the frames that the first lamps found improve, at least
+    min_further_agreement: float = 0.5  # of others beside them
+    min_lamp_explained: float = 0.005  # share of the squared error beside the instruments that each lamp explains
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of one run. Zero or None means: as the method has it."""
+    """Settings of one run."""
+
+    renamed: ClassVar[Mapping[str, str]] = {
+        "views_per_step": "batch_size",
+        "tissue_budget": "max_tissue_gaussians",
+        "instrument_budget": "max_instrument_gaussians",
+    }
 
     method: str = DEFAULT
-    iterations: int = 6000  # frames drawn and learned from
-    views_per_step: int = 1  # of them, between two updates
-    minutes: float | None = None  # stop in time with a finished run
+    iterations: int = 6000  # frames rendered and learned from
+    batch_size: int = 1  # frames between two optimiser steps
+    minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0
     transforms: str = "transforms.json"
-    tissue_budget: int = 20_000  # most Gaussians of the tissue
-    initial_points: int | None = None  # most sparse points to begin with; None: as many as the tissue may have
-    instrument_budget: int = 4_000  # most Gaussians of each instrument
+    max_tissue_gaussians: int = 20_000
+    initial_points: int | None = None  # most sparse points to begin with; None: max_tissue_gaussians
+    max_instrument_gaussians: int = 4_000  # of each instrument
     ssim_weight: float = 0.1  # lambda of the paper
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     density_start: int = 500
-    density_stop: float = 0.5  # fraction of the run
+    density_stop: float = 0.5  # share of the run
     deformation: Any = None  # the method's own settings, an instance of its `Settings`; None: its defaults
     joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    log_interval: int = LOG_INTERVAL  # iterations averaged into one row of metrics.jsonl
+    checkpoint_interval: int = 500  # iterations
 
     def __post_init__(self) -> None:
         if self.deformation is None:
@@ -75,3 +162,137 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     settings = method_settings(method, own)
     config = structure(TrainConfig, {**values, "deformation": None}, owner="the training config")
     return with_fields(config, {"deformation": settings})
+
+
+def _variant_defaults(name: str) -> TrainConfig:
+    """The config that METHOD or METHOD+dta starts from: with +dta every part of the paper's dynamic training adjustment
+    is on. A part that does not apply to the method (noise, where nothing is encoded) has no effect."""
+    method, plus, _ = name.partition("+")
+    base = method_defaults(method)
+    if not plus:
+        return base
+    if not name.endswith(ADJUSTED) or name.count("+") > 1:
+        raise NeecoError(f"method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
+    if not method_class(method).has_gaussians:
+        raise NeecoError(
+            f"method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
+        )
+    adjusted: TrainConfig = with_fields(base, {f"schedule.{part}": "on" for part in schedule_parts()})
+    if adjusted == base:
+        raise NeecoError(f"method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
+    return adjusted
+
+
+def schedule_parts() -> tuple[str, ...]:
+    """Names of the schedule's fields that are parts of the dynamic training adjustment."""
+    return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
+
+
+def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment), changed by
+    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
+
+    Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
+    variant, or one that is the method itself.
+    """
+    given = {field: value for field, value in values.items() if value is not None}
+    config: TrainConfig = with_fields(_variant_defaults(name), given)
+    _check_length(config)
+    changed = config_to_dict(config)
+    for assignment in assignments:
+        _assign(changed, config, assignment)
+    try:
+        config = config_from_dict(changed)
+    except NeecoError as error:
+        raise NeecoError(f"--set: {error}") from None
+    check_ranges(config)
+    return config
+
+
+def check_ranges(config: TrainConfig) -> None:
+    """Raise NeecoError naming the option of a number that nothing can be trained with."""
+    _check_length(config)
+    _check_published_steps(config)
+    if config.batch_size > 1 and not method_class(config.method).has_gaussians:
+        raise NeecoError(
+            f"--batch-size: method {config.method} draws rays of all frames in every step; "
+            "use --set deformation.rays=NUMBER"
+        )
+    options = {"seed": 0, "batch_size": 1, "max_tissue_gaussians": 1, "max_instrument_gaussians": 1}
+    for name, least in options.items():
+        if getattr(config, name) < least:
+            raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
+    schedule, density = config.schedule, config.density
+    least_one: dict[str, int | None] = {
+        name: getattr(config, name) for name in ("initial_points", "log_interval", "checkpoint_interval")
+    }
+    for name in ("phase_1", "phase_2", "plain_density"):
+        least_one[f"schedule.{name}.interval"] = getattr(schedule, name).interval
+    for group in ("density", "search"):
+        numbers = vars(getattr(config, group)).items()
+        least_one |= {f"{group}.{name}": value for name, value in numbers if isinstance(value, int)}
+    for name, value in least_one.items():
+        if value is not None and value < 1:
+            raise NeecoError(f"--set {name}: {value} is too small; give at least 1")
+    for name, limit in (("split_shrink", math.inf), ("reset_opacity", 1.0)):
+        if not 0 < getattr(density, name) < limit:
+            raise NeecoError(f"--set density.{name}: {getattr(density, name)} is not between 0 and {limit}")
+
+
+def _check_length(config: TrainConfig) -> None:
+    if config.iterations < 1:
+        raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
+    if config.minutes is not None and not config.minutes > 0:
+        raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
+
+
+def _check_published_steps(config: TrainConfig) -> None:
+    """A schedule scales with the run's length, which has to be known."""
+    steps = config.schedule.published_steps
+    if steps is None:
+        return
+    if steps < 1:
+        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
+    if config.minutes is not None:
+        raise NeecoError(
+            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
+            "open; give --iterations alone"
+        )
+
+
+def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:
+    """Set what NAME=VALUE says in `values`, those of `config` as plain dicts; whether the value fits its type is
+    checked later. Fields may be named as they were called before, with a warning."""
+    given, text = name_and_value("--set", assignment, "ssim_weight=0.2")
+    name = _new_path(config, given)
+    warn_renamed(f"--set {given}", f"--set {name}")
+    *path, last = name.split(".")
+    target: Any = values
+    for part in path:
+        target = target.get(part) if isinstance(target, dict) else None
+    open_ended = path == ["deformation"]
+    if not isinstance(target, dict) or (last not in target and not open_ended):
+        raise NeecoError(f"--set: unknown field {name!r}; see config.yaml of any run for the names")
+    if path == [] and last == "method":
+        raise NeecoError("--set method: would keep the other method's settings; use --method")
+    old = target.get(last)
+    if isinstance(old, str):  # taken literally: YAML reads on and off as truth values
+        target[last] = text
+        return
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise NeecoError(f"--set {name}: {text!r} is not a value; quote it as in YAML") from None
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):  # 1e-4 is a word to YAML
+            value = float(value)
+    if isinstance(old, dict) and not isinstance(value, dict):
+        raise NeecoError(f"--set {name}: is a group of fields; give one of {', '.join(old) or 'them'}, as {name}.FIELD")
+    target[last] = value
+
+
+def _new_path(settings: Any, path: str) -> str:
+    """`path`, a field of `settings` (dots reach into nested ones), as it is called now."""
+    first, dot, rest = path.partition(".")
+    name = new_name(type(settings), first)
+    return f"{name}.{_new_path(getattr(settings, name, None), rest)}" if dot else name

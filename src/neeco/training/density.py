@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -12,13 +12,11 @@ from neeco.raster.devices import constant
 from neeco.raster.optimizer import Adam
 from neeco.raster.rotations import quat_to_matrix
 from neeco.scene.canonical import CanonicalGaussians
-
-MIN_OPACITY = 0.005
-SPLIT_SHRINK = 1.6
+from neeco.training.config import DensityConfig
 
 
 class GradientStatistics:
-    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images in which it was drawn."""
+    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images that show it."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self.total = torch.zeros(count, device=device)
@@ -35,44 +33,39 @@ class GradientStatistics:
         return self.total / self.seen.clamp_min(1)
 
 
-@dataclass(frozen=True)
-class BodyLimit:
-    """How many Gaussians one body may have, and the size (mm) that divides cloning from splitting."""
-
-    most: int
-    dense_size: float
-
-
 @torch.no_grad()
 def control_density(
     canonical: CanonicalGaussians,
     adam: Adam,
     statistics: GradientStatistics,
-    limits: list[BodyLimit],
+    max_gaussians: Sequence[int],
+    dense_size: float,
     threshold: float,
     generator: torch.Generator,
-    lost: Tensor | None = None,
+    config: DensityConfig,
+    unsupported: Tensor | None = None,
 ) -> CanonicalGaussians:
-    """Prune the transparent and those `lost` [N] bool, clone small and split large Gaussians whose gradient exceeds
-    `threshold`, strongest first.
+    """Prune transparent and `unsupported` [N] bool Gaussians, clone small and split large ones whose gradient exceeds
+    `threshold`, strongest first. Each body has at most its `max_gaussians`.
 
-    `threshold` = inf only prunes. Adam's moments follow their rows; new rows start at zero.
+    Gaussians up to `dense_size` mm are cloned, larger ones split. `threshold` = inf only prunes. Adam's moments follow
+    their rows; new rows start at zero.
     """
     gradients, bodies = statistics.mean(), canonical.bodies
     size = canonical.log_scales.max(1).values.exp()
-    dense = size.new_tensor([limit.dense_size for limit in limits])[bodies]
-    keep = torch.sigmoid(canonical.opacity_logits) > MIN_OPACITY
-    if lost is not None:
-        keep &= ~lost
+    small = size <= size.new_tensor(dense_size)
+    keep = torch.sigmoid(canonical.opacity_logits) > config.min_opacity
+    if unsupported is not None:
+        keep &= ~unsupported
     grow = keep & (gradients > threshold)
-    for body, limit in enumerate(limits):
+    for body, limit in enumerate(max_gaussians):
         rows = bodies == body
-        room = max(0, limit.most - int((keep & rows).sum()))
+        room = max(0, limit - int((keep & rows).sum()))
         wanted = torch.nonzero(grow & rows)[:, 0]
         if len(wanted) > room:
             strongest = gradients[wanted].argsort(descending=True, stable=True)
             grow[wanted[strongest[room:]]] = False
-    clone, split = grow & (size <= dense), grow & (size > dense)
+    clone, split = grow & small, grow & ~small
     kept, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
     index = torch.cat([kept, cloned, halves, halves])
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
@@ -81,24 +74,24 @@ def control_density(
     is_half[len(kept) + len(cloned) :] = True
     order = bodies[index].argsort(stable=True)  # bodies stay contiguous
     index, fresh, is_half = index[order], fresh[order], is_half[order]
-    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(limits)))
+    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(max_gaussians)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
-    _scatter_halves(changed, is_half, generator)
+    _scatter_halves(changed, is_half, config.split_shrink, generator)
     return changed
 
 
-def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, generator: torch.Generator) -> None:
-    """Move each half of a split Gaussian to a random place inside its parent and shrink it."""
+def _scatter_halves(canonical: CanonicalGaussians, is_half: Tensor, shrink: float, generator: torch.Generator) -> None:
+    """Move each half of a split Gaussian to a random place inside its parent and divide its scales by `shrink`."""
     rotation = quat_to_matrix(torch.nn.functional.normalize(canonical.quats[is_half], dim=-1))
     scales = canonical.log_scales[is_half].exp()
     offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales
     canonical.means[is_half] += (rotation @ offset[..., None])[..., 0]
-    canonical.log_scales[is_half] -= math.log(SPLIT_SHRINK)
+    canonical.log_scales[is_half] -= math.log(shrink)
 
 
 @torch.no_grad()
-def reset_opacity(canonical: CanonicalGaussians, adam: Adam, ceiling: float = 0.01) -> None:
+def reset_opacity(canonical: CanonicalGaussians, adam: Adam, ceiling: float) -> None:
     """Clamp every opacity to `ceiling` and forget its momentum (3DGS)."""
     canonical.opacity_logits.clamp_(max=math.log(ceiling / (1 - ceiling)))
     adam.forget("opacity_logits")

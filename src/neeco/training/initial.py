@@ -1,4 +1,4 @@
-"""The session before its first step, and the scene it begins with."""
+"""The session before its first step, and its initial scene."""
 
 from __future__ import annotations
 
@@ -11,53 +11,41 @@ from neeco.capture.images import has_alpha
 from neeco.capture.model import Capture, Frame, Instrument
 from neeco.errors import NeecoError
 from neeco.scene.canonical import neighbour_spacing, seed_gaussians
-from neeco.scene.drawable import Learned
+from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.methods import make_deformation, method_class
-from neeco.scene.recorded import Recorded
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import InstrumentSearch, Report, Session
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
-from neeco.training.instruments.discovery import find_instruments
+from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
-from neeco.training.instruments.gate import close_gate
-from neeco.training.instruments.light import find_shadow
+from neeco.training.instruments.shadow import find_shadow
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
-from neeco.training.session import GaussianSession, new_session
-
-REDUNDANT = 0.98  # share of a joint's variance that the pose explains, above which it lies upstream of the tracked body
+from neeco.training.session import new_session
 
 
 def begin_session(
     capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Learned | None = None
 ) -> Session:
-    """A session at iteration 0, of any method, on the device of the views: around a new scene, or around `scene`, which
-    a checkpoint held."""
+    """A session at iteration 0, of any method, on the device of the views: around `scene`, which a checkpoint held, or
+    around a new one, for which the method's `begin` is called."""
     method = method_class(config.method)
-    if method.has_gaussians:
-        assert scene is None or isinstance(scene, Scene)
-        return gaussian_session(capture, views, config, report, scene)
-    return method.session(capture, views, config.deformation, config.length, config.seed, scene)
-
-
-def gaussian_session(
-    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Scene | None = None
-) -> GaussianSession:
-    """A session at iteration 0 of any method that deforms Gaussians, on the device of the views: around `scene`, or
-    around a new one, which the method's hooks have begun."""
-    begins = scene is None
+    if not method.has_gaussians:
+        return method.session(capture, views, config.deformation, config.length, config.seed, scene)
+    is_new = scene is None
     if scene is None:
         scene = initial_scene(capture, views.frames, config, report)
+    assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.instruments = InstrumentSearch(
         find=partial(find_instruments, session),
-        bound=partial(close_gate, session),
+        bound=partial(bound_volume, session),
         place_wrists=partial(place_wrists, session),
         replace_wrists=partial(replace_wrists, session),
         find_shadow=partial(find_shadow, session),
         conclude=partial(conclude, session),
     )
-    if begins:
+    if is_new:
         scene.deformation.begin(session)
     session.start()
     return session
@@ -65,10 +53,12 @@ def gaussian_session(
 
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
     """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
-    alone. Raises NeecoError when a joint asked for is unknown."""
-    background = _background(frames)  # first: files may go once training has begun
+    alone. Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read."""
+    # first, as files may be deleted once training has begun: the grey behind transparent images, which need not be
+    # learned then; black for opaque images
+    background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(
-        Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config.joints, report)})
+        Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
         for i in capture.instruments
     )
     recorded = Recorded.of(frames, instruments)
@@ -83,17 +73,11 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     return scene
 
 
-def _background(frames: tuple[Frame, ...]) -> float:
-    """The grey [0, 1] that transparent images were laid on, so that it need not be learned; black where images fill
-    their frame. Raises NeecoError when an image cannot be read."""
-    return next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
-
-
 def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, or the tissue's
-    budget."""
+    """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as many as
+    the tissue may have Gaussians."""
     positions, colors = capture.points.positions, capture.points.colors
-    most = min(config.tissue_budget, config.initial_points or config.tissue_budget)
+    most = min(config.max_tissue_gaussians, config.initial_points or config.max_tissue_gaussians)
     if len(positions) > most:
         chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
@@ -101,13 +85,14 @@ def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, 
 
 
 def moving_joints(
-    instrument: Instrument, frames: tuple[Frame, ...], wanted: tuple[str, ...] | None, report: Report
+    instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
 ) -> tuple[str, ...]:
-    """Joints that may move parts of the tracked body: those asked for, or those its pose does not already explain.
+    """Joints that may move parts of the tracked body: `config.joints`, or those its pose does not already explain.
 
     A robot arm's joints upstream of the tracked frame are a function of its pose; a jaw angle is not.
     Raises NeecoError for an unknown name.
     """
+    wanted = config.joints
     if wanted is not None:
         unknown = [joint for joint in wanted if joint not in instrument.joints]
         if unknown:
@@ -119,14 +104,14 @@ def moving_joints(
     poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
     distinct, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
     design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
-    kept = []
+    moving = []
     for joint in instrument.joints:
         reading = np.array([states[i].joints[joint] for i in first])
         spread = reading.var()
         fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]
         explained = 1 - (reading - fitted).var() / spread if spread > 1e-8 else 0.0
-        if explained > REDUNDANT:
+        if explained > config.search.max_pose_explained:
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:
-            kept.append(joint)
-    return tuple(kept)
+            moving.append(joint)
+    return tuple(moving)

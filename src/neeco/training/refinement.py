@@ -16,11 +16,7 @@ from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
 from neeco.training.config import RefineConfig
 
-RATES = torch.tensor([6e-4] * 3 + [4e-2] * 3)  # rad, mm
-PRIOR_SIGMA = torch.tensor([4.4e-3] * 3 + [0.3] * 3)  # a tracker's 0.25 deg and 0.3 mm
-PRIOR_WEIGHT = 2e-5
-CAMERA_RATE = 0.2  # of the instruments' rates: SfM cameras are better than tracked instruments
-LATENCY_RATE = 2e-5  # s
+STATE = ("poses", "cameras", "latency", "frame_steps")  # tensors of a checkpoint beside the moments
 
 
 class Refinement:
@@ -38,16 +34,20 @@ class Refinement:
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
         self.velocities = _velocities(frames, instruments).to(device)  # [F, I, 6] per s, body frame
-        self.rates = {"poses": RATES, "cameras": RATES * CAMERA_RATE, "latency": torch.tensor(LATENCY_RATE)}
-        self.rates = {name: rate.to(device) for name, rate in self.rates.items()}
-        self.prior_sigma = PRIOR_SIGMA.to(device)
-        self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
-        self.frame_steps = torch.zeros(len(frames))  # on the CPU: every step asks
+        rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
+        self.rates = {
+            "poses": rates.to(device),
+            "cameras": (rates * config.camera_rate).to(device),
+            "latency": torch.tensor(config.latency_rate, device=device),
+        }
+        self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
+        self.moments = {
+            f"{order}.{name}": torch.zeros_like(getattr(self, name))
+            for order in ("first", "second")
+            for name in ("poses", "cameras", "latency")
+        }
+        self.frame_steps = torch.zeros(len(frames))  # on the CPU: read in every step
         self._leaves: dict[str, Tensor] = {}
-
-    def _moment_shapes(self) -> dict[str, Tensor]:
-        tensors = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency}
-        return {f"{order}.{name}": tensor for order in ("first", "second") for name, tensor in tensors.items()}
 
     def apply(self, index: int, state: State, camera: Camera, iteration: int) -> tuple[State, Camera, Tensor | None]:
         """The corrected state and camera of frame `index`, and the prior's penalty; leaves wait for `step`."""
@@ -60,7 +60,7 @@ class Refinement:
             if self.config.frame_poses:
                 leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
                 offset = offset + leaf
-                penalty = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
+                penalty = self._prior(leaf)
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
                 offset = offset + self.velocities[index] * leaf
@@ -73,9 +73,12 @@ class Refinement:
             leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
             corrected = camera.world_from_camera.to(leaf) @ rigid_from_vector(leaf)
             camera = replace(camera, world_from_camera=corrected)
-            prior = PRIOR_WEIGHT * (leaf / self.prior_sigma).square().mean()
-            penalty = prior if penalty is None else penalty + prior
+            penalty = self._prior(leaf) if penalty is None else penalty + self._prior(leaf)
         return state, camera, penalty
+
+    def _prior(self, correction: Tensor) -> Tensor:
+        """Penalty [] on a correction [..., 6]."""
+        return self.config.prior_weight * (correction / self.prior_sigma).square().mean()
 
     @torch.no_grad()
     def step(self, index: int, progress: float) -> None:
@@ -83,15 +86,16 @@ class Refinement:
         if not self._leaves:
             return
         self.frame_steps[index] += 1
-        count = float(self.frame_steps[index])
         decay = log_linear(1.0, 0.1, progress)
         for name, leaf in self._leaves.items():
             if leaf.grad is None:
                 continue
-            row = slice(None) if name == "latency" else index
-            steps = float(self.frame_steps.sum()) if name == "latency" else count
+            # the latency is shared by all frames
+            row, steps = (
+                (slice(None), self.frame_steps.sum()) if name == "latency" else (index, self.frame_steps[index])
+            )
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
-            update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
+            update = adam_update(leaf.grad, first, second, float(steps), (0.9, 0.99), 1e-12)
             getattr(self, name)[row] -= decay * self.rates[name] * update
         self._leaves = {}
 
@@ -106,16 +110,14 @@ class Refinement:
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that changes, for a checkpoint."""
-        plain = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency, "frame_steps": self.frame_steps}
-        return plain | self.moments
+        return {name: getattr(self, name) for name in STATE} | self.moments
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """The inverse of `tensors`. Raises ValueError for those of other shapes."""
-        own = self.tensors()
-        for name, tensor in own.items():
+        for name, tensor in self.tensors().items():
             if tensors[name].shape != tensor.shape:
                 raise ValueError(f"{name}: {list(tensors[name].shape)}, not {list(tensor.shape)}")
-        for name in ("poses", "cameras", "latency", "frame_steps"):
+        for name in STATE:
             setattr(self, name, tensors[name].cpu() if name == "frame_steps" else tensors[name])
         self.moments = {name: tensors[name] for name in self.moments}
 

@@ -1,7 +1,9 @@
-"""Run folders: config.yaml, scene.safetensors, checkpoint/, metrics.jsonl."""
+"""Run folders: config.yaml, scene.safetensors, checkpoint/ (all that a session needs to go on bit for bit),
+metrics.jsonl."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -11,18 +13,22 @@ from typing import Any
 
 import torch
 import yaml
+from safetensors import safe_open
+from torch import Tensor
 
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_inside, require_like, write_text
+from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, write_text
 from neeco.scene.drawable import Learned
-from neeco.scene.io import load_scene
-from neeco.training.config import TrainConfig, config_from_dict, config_to_dict
-from neeco.training.options import check_ranges
+from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
+from neeco.scene.training_session import Session, StepResult, members
+from neeco.training.config import TrainConfig, check_ranges, config_from_dict, config_to_dict
 
 SCHEMA = "neeco-run/1"
 CAPTURE_DIGEST = "capture_sha256"
+CHECKPOINT_SCHEMA = "neeco-checkpoint/1"
+CHECKPOINT_HEADER = {"schema": str, "scene": {}, "iteration": int, "seconds": float}
 
 
 @dataclass(frozen=True)
@@ -110,3 +116,85 @@ def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     except NeecoError as error:
         raise NeecoError(f"{path / 'config.yaml'}: {error}; train again") from None
     return config
+
+
+def checkpoint_path(run: Path) -> Path:
+    """Where a run keeps its checkpoint."""
+    return run / "checkpoint" / "session.safetensors"
+
+
+def save_checkpoint(session: Session, run: Path) -> None:
+    """Write the session's whole state atomically."""
+    scene_tensors, scene_header = pack_scene(session.scene)
+    session_tensors, fields = session.pack()
+    tensors = {f"scene/{name}": tensor for name, tensor in scene_tensors.items()} | session_tensors
+    tensors |= {f"adam/{name}": tensor for name, tensor in session.adam.tensors().items()}
+    device = session.generator.device
+    tensors |= {"random/torch": torch.get_rng_state(), "random/generator": session.generator.get_state()}
+    if device.type == "cuda":
+        tensors["random/cuda"] = torch.cuda.get_rng_state(device)
+    header = {
+        "schema": CHECKPOINT_SCHEMA,
+        "scene": scene_header,
+        "device": device.type,
+        "adam_steps": session.adam.steps,
+        "iteration": session.iteration,
+        "seconds": session.seconds,
+        "window": [[step.loss, step.psnr] for step in session.window],
+    }
+    metadata = {"neeco": json.dumps(header | fields)}
+    save_tensors(
+        {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
+    )
+
+
+def read_checkpoint(run: Path) -> tuple[Learned, dict[str, Any], dict[str, Tensor]]:
+    """(scene, header, other tensors) of a run's checkpoint. Raises NeecoError when damaged or of another version."""
+    path = checkpoint_path(run)
+    require_file(path, "a checkpoint of `neeco train`")
+    with reporting_damage(path):
+        with safe_open(path, framework="pt") as stream:
+            header = json.loads((stream.metadata() or {})["neeco"])
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+        require_like(header, CHECKPOINT_HEADER, f"{path}: header", "train again without --resume")
+        if header["schema"] != CHECKPOINT_SCHEMA:
+            raise ValueError(f"schema {header['schema']!r}, this version reads {CHECKPOINT_SCHEMA!r}")
+        parts = {name.removeprefix("scene/"): t for name, t in tensors.items() if name.startswith("scene/")}
+        try:
+            scene = unpack_scene(parts, header["scene"])
+        except NeecoError as error:  # which knows no file
+            raise ValueError(str(error)) from None
+    return scene, header, {name: t for name, t in tensors.items() if not name.startswith("scene/")}
+
+
+@contextmanager
+def reporting_damage(path: Path) -> Iterator[None]:
+    """For a block that reads the checkpoint in `path`: raises NeecoError where its content does not fit."""
+    try:
+        yield
+    except DAMAGED as error:
+        reason = " ".join(str(error).split())
+        raise NeecoError(
+            f"{path}: cannot resume from this checkpoint ({reason}); train again without --resume"
+        ) from None
+
+
+def restore_session(session: Session, header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Put a fresh session, made around the checkpoint's scene, where the checkpoint was.
+
+    Raises NeecoError on another kind of device: its random numbers would not go on.
+    """
+    device = session.generator.device
+    before = header.get("device", "cpu")  # not in older checkpoints
+    if before != device.type:
+        raise NeecoError(f"--device: the run was begun on {before}; go on with --device {before}")
+    moved = {name: tensor.to(device) for name, tensor in tensors.items() if not name.startswith("random/")}
+    session.adam.restore(members(moved, "adam"), header["adam_steps"])
+    session.restore(moved, header)
+    session.generator.set_state(tensors["random/generator"])
+    torch.set_rng_state(tensors["random/torch"])
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(tensors["random/cuda"], device)
+    window = header.get("window", [])  # not in older checkpoints
+    session.window = [StepResult(float(loss), float(psnr)) for loss, psnr in window]
+    session.iteration, session.seconds = header["iteration"], header["seconds"]

@@ -18,18 +18,18 @@ Part = Literal["on", "off", "inverse"]
 
 @dataclass(frozen=True)
 class DensityPhase:
-    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC)."""
+    """When density control acts: every `interval` iterations on mean image-space gradients above `threshold` (NDC).
+    `opacity_reset`: iterations between opacity resets; 0: none."""
 
     interval: int
     opacity_reset: int
     threshold: float
 
 
-NEECO_PHASES = {1: DensityPhase(500, 10_000, 4e-4), 2: DensityPhase(200, 3_000, 2e-4)}
-GAUSSIAN_SPLATTING = DensityPhase(100, 3_000, 2e-4)
-# Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's length, so
-# neither does that: with resets closer than twice this, the scene would stay transparent and never show the instrument.
-CLOSEST_RESETS = 300
+# Iterations. Opacity, at its learning rate, is back about 150 steps after a reset. Rates do not scale with the run's
+# length, so neither does that: with resets closer than twice this, the scene would stay transparent and never show the
+# instrument.
+MIN_RESET_INTERVAL = 300
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,16 @@ class ScheduleConfig:
     latest_fraction: float = 0.4  # of the run; then phase 2 is forced
     sh_interval: int = 1_000  # iterations between SH orders in phase 2
     max_sh_degree: int = 3
-    plain_density: DensityPhase = GAUSSIAN_SPLATTING  # what the three parts of density control are when off
-    # Numbers of iterations here, in NEECO_PHASES and in TrainConfig.density_start are stated for a run of so many
-    # steps and scale with the run's length; None: they stand as they are, however short the run.
+    plain_density: DensityPhase = DensityPhase(100, 3_000, 2e-4)  # 3DGS's: the parts of density control that are off
+    phase_1: DensityPhase = DensityPhase(500, 10_000, 4e-4)
+    phase_2: DensityPhase = DensityPhase(200, 3_000, 2e-4)
+    # Numbers of iterations here and in TrainConfig.density_start are stated for a run of so many steps and scale with
+    # the run's length; None: they stand as they are, however short the run.
     published_steps: int | None = None
 
 
 class Schedule:
-    """What to do at each iteration of a run of `iterations` steps. `observe` after every step; everything else asks."""
+    """What to do at each iteration of a run of `iterations` steps. Call `observe` after every step."""
 
     def __init__(self, config: ScheduleConfig, iterations: int | None = None) -> None:
         if config.published_steps is not None and iterations is None:
@@ -94,7 +96,8 @@ class Schedule:
         return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
 
     def _acting_phase(self, part: Part) -> int:
-        return self.phase if part == "on" else 3 - self.phase
+        """The phase whose settings of `part` are in force; 0: off, as in 3DGS."""
+        return {"off": 0, "on": self.phase, "inverse": 3 - self.phase}[part]
 
     def density(self) -> DensityPhase:
         """The density settings in force, in iterations of this run."""
@@ -106,33 +109,32 @@ class Schedule:
         )
 
     def _reset_interval(self, published: int) -> int:
-        """Scaled, but not below CLOSEST_RESETS, or what was published where that is less."""
-        return max(self.scaled(published), min(published, CLOSEST_RESETS))
+        """Scaled, but not below MIN_RESET_INTERVAL, or what was published where that is less."""
+        return max(self.scaled(published), min(published, MIN_RESET_INTERVAL))
 
     def _density_of(self, part: Part) -> DensityPhase:
-        return self.config.plain_density if part == "off" else NEECO_PHASES[self._acting_phase(part)]
+        return (self.config.plain_density, self.config.phase_1, self.config.phase_2)[self._acting_phase(part)]
 
     def sh_degree(self, iteration: int) -> int:
         """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
         (3DGS)."""
-        config = self.config
-        if config.sh_order != "off" and self._acting_phase(config.sh_order) == 1:
+        config, acting = self.config, self._acting_phase(self.config.sh_order)
+        if acting == 1:
             return 0
-        since = 0 if config.sh_order == "off" else self.phase_started
+        since = self.phase_started if acting else 0
         return min(config.max_sh_degree, (iteration - since) // self.scaled(config.sh_interval))
 
     def state_noise(self, progress: float) -> float:
         """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in
         its phase."""
         config = self.config
-        if config.compensation == "off" or self._acting_phase(config.compensation) == 2:
+        if self._acting_phase(config.compensation) != 1:
             return 0.0
         return config.sigma * config.beta * max(0.0, 1.0 - progress)
 
     def frames(self, pose_order: np.ndarray, rng: np.random.Generator) -> list[int]:
         """One epoch of frame indices: sorted by instrument pose (either way round), or at random."""
-        part = self.config.frame_order
-        if part != "off" and self._acting_phase(part) == 1:
+        if self._acting_phase(self.config.frame_order) == 1:
             return list(map(int, pose_order if rng.random() < 0.5 else pose_order[::-1]))
         return list(map(int, rng.permutation(len(pose_order))))
 

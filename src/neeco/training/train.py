@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,28 +23,34 @@ from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.methods import method_class, unmet_need
-from neeco.scene.training_session import Session
+from neeco.scene.training_session import Session, StepResult
 from neeco.scene.training_views import TrainingViews
-from neeco.training.checkpoint import checkpoint_path, read_checkpoint, restore_session, save_checkpoint, telling_damage
 from neeco.training.config import TrainConfig
 from neeco.training.initial import begin_session
-from neeco.training.interrupt import StopRequest, hearing_stops
-from neeco.training.run import read_config, require_same_capture, stored_config, write_config
+from neeco.training.run import (
+    checkpoint_path,
+    read_checkpoint,
+    read_config,
+    reporting_damage,
+    require_same_capture,
+    restore_session,
+    save_checkpoint,
+    stored_config,
+    write_config,
+)
 from neeco.training.schedule import due
 
-CHECKPOINT_INTERVAL = 500  # iterations
 CPU = torch.device("cpu")
-ROW_INTERVAL = 50  # iterations averaged into one row of metrics.jsonl
 
 
 @dataclass(frozen=True)
 class ProgressRow:
-    """One row of metrics.jsonl, and what a progress bar shows. `progress` in [0, 1]; `note` is news in words."""
+    """One row of metrics.jsonl, and what a progress bar shows. `progress` in [0, 1]; `note` is a line for the user."""
 
     iteration: int
     loss: float
     psnr: float
-    num_gaussians: int | None  # None: the method has none
+    num_gaussians: int | None  # None: the method has no Gaussians
     phase: int
     seconds: float
     progress: float
@@ -49,7 +58,7 @@ class ProgressRow:
 
 
 ShowRow = Callable[[ProgressRow], None]
-Watch = Callable[[Session], None]  # after every step; may draw the scene, must not change it
+Watch = Callable[[Session], None]  # called after every step; may render the scene, must not change it
 
 
 def train(
@@ -66,21 +75,21 @@ def train(
 ) -> Path:
     """Learn a scene from the `train` split of a capture; returns the run folder.
 
-    `capture`: what `read_checked` made of the path, where that is known. `device` is where it computes; a run goes on
-    on the kind of device it was begun on. Writes config.yaml, metrics.jsonl, checkpoint/ while running and
-    scene.safetensors at the end. `resume` continues an interrupted run under the settings it was started with. The same
-    seed gives the same scene on a CPU, interrupted or not, unless `minutes` is set: minutes of `clock` (s;
-    time.process_time counts the processor's), without what `watch` takes. Raises NeecoError for a capture that
-    `neeco check` refuses, a non-empty `output` without `resume`, or a loss that is no number.
+    `capture`: what `read_checked` returned for the path, where it was read already. A run must be resumed on the kind
+    of device it was begun on. Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the
+    end. `resume` continues an interrupted run under the settings it was started with. The same seed gives the same
+    scene on a CPU, interrupted or not, unless `minutes` is set: minutes of `clock` (s; time.process_time counts CPU
+    time), without the time of `watch`. Raises NeecoError for a capture that `neeco check` refuses, a non-empty
+    `output` without `resume`, or a loss that is not finite.
 
-    SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way
-    KeyboardInterrupt says how to go on. What fails before the first step leaves no run folder behind.
+    SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way the message of
+    KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind.
     """
     capture_path, output = Path(capture_path), Path(output)
     if resume and (output / "config.yaml").exists():
         config = _stored_config(output, capture_path)
         if (output / "scene.safetensors").exists():
-            with own_folder(output):  # rid of what a process killed after its last step left
+            with own_folder(output):  # removes temporary files of a process killed after its last step
                 return output
     elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
@@ -98,8 +107,8 @@ def train(
             raise KeyboardInterrupt("before the first step; run the same command again") from None
         if not (output / "config.yaml").exists():
             write_config(output, capture_path, config, digest)
-        with hearing_stops() as stop:
-            _run(session, output, log, stop, go_on)
+        with deferred_interrupts() as stop:
+            _run(session, output, config, log, stop, go_on)
         try:
             log.note("finishing: labels, shaft, diagnostics")
             _check_finite(session)
@@ -130,18 +139,18 @@ def _begin(
     resume: bool,
     log: _Log,
 ) -> Session:
-    """The session before its first step, or where the checkpoint in `output` left it."""
+    """The session before its first step, or as the checkpoint in `output` holds it."""
     views = TrainingViews.read(frames).to(device)
     started = log.clock()
     torch.manual_seed(config.seed)
     if resume and checkpoint_path(output).exists():
         scene, header, tensors = read_checkpoint(output)
-        with telling_damage(checkpoint_path(output)):
+        with reporting_damage(checkpoint_path(output)):
             session = begin_session(capture, views, config, log.note, scene)
             restore_session(session, header, tensors)
-    else:  # interrupted before its first checkpoint, a resumed run begins again
+    else:  # a run interrupted before its first checkpoint begins again
         session = begin_session(capture, views, config, log.note)
-    log.keep_until(session.iteration)
+    log.truncate(session.iteration)
     session.seconds += log.clock() - started
     return session
 
@@ -160,8 +169,8 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
     return capture.split("train")
 
 
-def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: str) -> None:
-    """Step until done; a row every ROW_INTERVAL, a checkpoint every CHECKPOINT_INTERVAL and at the end."""
+def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: threading.Event, go_on: str) -> None:
+    """Step until done; write rows and checkpoints at their intervals, and a checkpoint at the end."""
     phase = session.phase
     last = log.clock()
     try:
@@ -174,16 +183,16 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
                 phase = session.phase
                 log.note(f"phase {phase} begins" + (" (forced)" if session.forced else ""))
             session.between_steps(before)
-            if due(ROW_INTERVAL, iteration, session.iteration):
+            if due(config.log_interval, iteration, session.iteration):
                 log.row(session)
             if log.watch:
-                # before the checkpoint: what it saw of a step is never missing when the run goes on behind it
+                # before the checkpoint, so that a resumed run has shown every step of the checkpoint to `watch`
                 began = log.clock()
                 log.watch(session)
                 last += log.clock() - began
-            if stop.heard or due(CHECKPOINT_INTERVAL, iteration, session.iteration):
+            if stop.is_set() or due(config.checkpoint_interval, iteration, session.iteration):
                 save_checkpoint(session, output)
-            if stop.heard:
+            if stop.is_set():
                 raise KeyboardInterrupt
         save_checkpoint(session, output)
     except KeyboardInterrupt:
@@ -191,8 +200,8 @@ def _run(session: Session, output: Path, log: _Log, stop: StopRequest, go_on: st
 
 
 def _check_finite(session: Session) -> None:
-    """Raises NeecoError when a number that was learned is not finite."""
-    # buffers may well be infinite: a shaft whose wrist was not found begins its wrist at minus infinity
+    """Raises NeecoError when a learned number is not finite."""
+    # buffers may be infinite: an unknown wrist starts at minus infinity
     buffers = {f"module.{name}" for name, _ in session.scene.named_buffers()}
     tensors = pack_scene(session.scene)[0]
     if not all(bool(torch.isfinite(tensor).all()) for name, tensor in tensors.items() if name not in buffers):
@@ -202,8 +211,36 @@ def _check_finite(session: Session) -> None:
         )
 
 
+@contextmanager
+def deferred_interrupts() -> Iterator[threading.Event]:
+    """Until the end of the block, the first SIGINT or SIGTERM only sets the event; a second raises KeyboardInterrupt.
+
+    Signals that are ignored (a background job of a script) stay ignored. Outside the main thread, where Python allows
+    no handlers, signals are not caught.
+    """
+    stop = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if handler not in (signal.SIG_IGN, None):
+                before[number] = handler
+                signal.signal(number, handle)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 class _Log:
-    """metrics.jsonl, the callbacks, and the clock that all rows are timed by."""
+    """metrics.jsonl, the callbacks, and the clock of all rows."""
 
     def __init__(self, path: Path, progress: ShowRow | None, watch: Watch | None, clock: Callable[[], float]) -> None:
         self.path = path
@@ -214,13 +251,12 @@ class _Log:
 
     def row(self, session: Session) -> None:
         """Write the means over the session's window, and empty it."""
-        loss = sum(step.loss for step in session.window) / len(session.window)
-        psnr = sum(step.psnr for step in session.window) / len(session.window)
+        mean = StepResult.mean(session.window)
         session.window.clear()
         self.last = ProgressRow(
             session.iteration,
-            round(loss, 6),
-            round(psnr, 3),
+            round(mean.loss, 6),
+            round(mean.psnr, 3),
             session.scene.num_gaussians,
             session.phase,
             round(session.seconds, 2),
@@ -239,16 +275,15 @@ class _Log:
         if self.progress:
             self.progress(replace(self.last, note=text))
 
-    def keep_until(self, iteration: int) -> None:
-        """Drop rows beyond the checkpoint: they will be written again."""
+    def truncate(self, iteration: int) -> None:
+        """Drop rows after `iteration`, that of the checkpoint: they will be written again."""
         if self.path.exists():
             lines = read_text(self.path, "one JSON object per line").splitlines()
-            kept = [line for line in lines if _iteration(line) <= iteration]
-            write_text(self.path, "".join(line + "\n" for line in kept))
+            write_text(self.path, "".join(line + "\n" for line in lines if _iteration(line) <= iteration))
 
 
 def _iteration(line: str) -> float:
-    """Of a row of metrics.jsonl; infinite where it is damaged, as a full disk leaves the last one."""
+    """Of a row of metrics.jsonl; infinite where it is damaged, as the last one may be after a full disk."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):

@@ -1,4 +1,9 @@
-"""`neeco view RUN --export FILE.html`: one file that carries the scene and draws it, without server, network or GPU."""
+"""`neeco view RUN --export FILE.html`: one file that carries the scene and draws it, without server, network or GPU.
+
+The scene is packed as `neeco-page/1` (docs/viewer.md): every number of a Gaussian becomes a plane of its own, low bytes
+before high ones, so that deflate finds the likeness of neighbours. What moves rigidly about hinges can be packed; what
+a network moves cannot.
+"""
 
 from __future__ import annotations
 
@@ -6,29 +11,41 @@ import base64
 import hashlib
 import json
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from torch import Tensor
+from torch.nn.functional import normalize
 
 import neeco
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.files import read_json, write_text
-from neeco.scene import Scene
+from neeco.labels.labellers import threshold_of
+from neeco.raster.sh import SH_C0
+from neeco.scene import Drawable, Scene
+from neeco.scene.drawable import HingeMotion
 from neeco.scene.scene import gaussian_scene
 from neeco.training.run import Run, load_run
-from neeco.viewer.packed import pack, why_not
+from neeco.viewer.controls import perpendicular_axes, shafts_of, slider_ranges
 
+SCHEMA = "neeco-page/1"
 SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main.js")  # in this order, as one module
 WORKER, STYLE, WASM = "worker.js", "page.css", "viewer.wasm"
-MOST_DEGREE = 3
+MAX_DEGREE = 3
 EMBEDDED_DEGREE = 1  # in a report: half the size, and for a first look
-NUMBERS = (
+MAX_INSTRUMENTS, MAX_JOINTS, MAX_LABELS = 8, 4, 32  # that the page's rasteriser has room for; joints of one instrument
+THINNEST_MM = 0.01  # thinner than any pixel
+POSITION_STEPS = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
+BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
+SCORES = (
     ("psnr", "PSNR", "{:.1f} dB"),
     ("psnr_instrument", "in instrument", "{:.1f} dB"),
     ("mask_iou", "IoU", "{:.3f}"),
@@ -41,8 +58,8 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -
     sh_degree: of the spherical harmonics that are kept, 0 to 3. Raises NeecoError for a run that is unfinished or whose
     method asks a network for every state, and where the file cannot be written.
     """
-    if not 0 <= sh_degree <= MOST_DEGREE:
-        raise NeecoError(f"--sh: {sh_degree} is no degree of harmonics; give 0 to {MOST_DEGREE}")
+    if not 0 <= sh_degree <= MAX_DEGREE:
+        raise NeecoError(f"--sh: {sh_degree} is no degree of harmonics; give 0 to {MAX_DEGREE}")
     trained = load_run(run, device)
     page = page_of_run(trained, sh_degree)
     write_text(Path(output), page)
@@ -59,12 +76,22 @@ def page_of_run(run: Run, sh_degree: int) -> str:
     if refusal := why_not(run.scene):
         raise NeecoError(f"--export: {refusal}")
     scene = gaussian_scene(run.scene, "--export")
-    header, planes = pack(scene, sh_degree)
-    return page_of(header, planes, Path(run.path).resolve().name, facts_of(run, scene))
+    facts = [
+        ("capture", Path(run.config["capture"]).name),
+        ("method", scene.method),
+        ("Gaussians", f"{len(scene.canonical):,}"),
+        ("frames trained on", str(len(scene.recorded.names))),
+    ]
+    iterations = scene.diagnostics.get("iterations")
+    if isinstance(iterations, int):
+        facts.append(("iterations", f"{iterations:,}"))
+    facts += [*_scores(Path(run.path) / EVALUATION_FILE), ("made with", f"neeco {neeco.__version__}")]
+    return page_of(*pack(scene, sh_degree), Path(run.path).resolve().name, facts)
 
 
 def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple[str, str]]) -> str:
-    """The whole page. Everything that comes from the run is escaped, or packed so that it holds no markup."""
+    """The whole page; facts: (name, value) of what it says of itself. Everything that comes from the run is escaped, or
+    packed so that it holds no markup."""
     script, style = _source(*SCRIPTS), _source(STYLE)
     return (
         _templates()
@@ -85,35 +112,19 @@ def page_of(header: dict[str, Any], planes: bytes, title: str, facts: list[tuple
     )
 
 
-def facts_of(run: Run, scene: Scene) -> list[tuple[str, str]]:
-    """What the page says of itself: (name, value)."""
-    facts = [
-        ("capture", Path(run.config["capture"]).name),
-        ("method", scene.method),
-        ("Gaussians", f"{len(scene.canonical):,}"),
-        ("frames trained on", str(len(scene.recorded.names))),
-    ]
-    iterations = scene.diagnostics.get("iterations")
-    if isinstance(iterations, int):
-        facts.append(("iterations", f"{iterations:,}"))
-    return [*facts, *_scores(Path(run.path) / EVALUATION_FILE), ("made with", f"neeco {neeco.__version__}")]
-
-
 def _scores(path: Path) -> list[tuple[str, str]]:
     """A line per split of evaluation.json; none where the run was not evaluated."""
     if not path.is_file():
         return []
     try:
-        given = read_json(path)["given"]
-        return [(split, _written(scores)) for split, scores in given.items()]
+        lines = []
+        for split, scores in read_json(path)["given"].items():
+            known = [f"{name} {form.format(scores[key])}" for key, name, form in SCORES if scores.get(key) is not None]
+            lines.append((split, ", ".join(known)))
+        return lines
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        said = " ".join(str(error).split())
-        raise NeecoError(f"{path}: not what `neeco evaluate` writes ({said}); evaluate again") from None
-
-
-def _written(scores: dict[str, Any]) -> str:
-    known = [(name, form.format(scores[key])) for key, name, form in NUMBERS if scores.get(key) is not None]
-    return ", ".join(f"{name} {value}" for name, value in known)
+        reason = " ".join(str(error).split())
+        raise NeecoError(f"{path}: not what `neeco evaluate` writes ({reason}); evaluate again") from None
 
 
 def _source(*names: str) -> str:
@@ -133,3 +144,157 @@ def _deflated(data: bytes) -> str:
 @cache
 def _templates() -> Environment:
     return Environment(loader=PackageLoader("neeco.viewer", "page"), autoescape=True, undefined=StrictUndefined)
+
+
+def why_not(scene: Drawable) -> str | None:
+    """Why a page cannot hold `scene`, in a line that says what can show it; None where it can."""
+    if scene.hinge_motion() is None:
+        return (
+            f"method {scene.method} asks a network for every state, which a page cannot; "
+            "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"
+        )
+    joints = max((len(item.joints) for item in scene.instruments), default=0)
+    for name, found, most in (
+        ("instruments", len(scene.instruments), MAX_INSTRUMENTS),
+        ("joints of an instrument", joints, MAX_JOINTS),
+        ("labels", len(scene.label_names), MAX_LABELS),
+    ):
+        if found > most:
+            return f"{found} {name}: a page has room for {most}; look at it with `neeco view RUN`"
+    return None
+
+
+@torch.no_grad()
+def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
+    """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
+    there are more instruments, joints or labels than the page has room for."""
+    canonical, motion = scene.canonical, scene.hinge_motion()
+    if (refusal := why_not(scene)) or motion is None:
+        raise NeecoError(f"--export: {refusal}")
+    degree = min(sh_degree, scene.sh_degree)
+    means, boxes = _in_boxes(canonical.means, canonical.counts)
+    scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(THINNEST_MM))), 255)
+    base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
+    turns = [_quantized(column[:, None], 65535) for column in motion.turns.flatten(1).unbind(1)]
+    harmonics, bands = _harmonics(canonical.sh_rest, degree)
+    fields = (  # name, whole numbers [N, K], type
+        ("mean", means, "uint24"),
+        ("quat", _rounded(normalize(canonical.quats, dim=1) * 127), "int8"),
+        ("scale", scales, "uint8"),
+        ("opacity", _rounded(torch.sigmoid(canonical.opacity_logits)[:, None] * 255), "uint8"),
+        ("base", base, "uint16"),
+        ("turn", _columns(canonical.means, [numbers for numbers, _ in turns]), "uint16"),
+        ("label", _rounded(scene.label_channels() * 255), "uint8"),
+        ("sh", harmonics, "int8"),
+    )
+    turn_ranges = [ends for _, ends in turns]
+    header = {
+        "schema": SCHEMA,
+        "counts": list(canonical.counts),
+        "degree": degree,
+        "fields": [[name, numbers.shape[1], kind] for name, numbers, kind in fields],
+        "ranges": {"mean": boxes, "scale": scale_range, "base": base_range, "turn": turn_ranges, "sh": bands},
+        "light": _light(scene),
+        "threshold": threshold_of(scene),
+        "labels": [list(name) for name in scene.label_names],
+        "instruments": _instruments(scene, motion),
+        "recorded": _recorded(scene, motion),
+    }
+    return header, b"".join(_planes(numbers, kind) for _, numbers, kind in fields)
+
+
+def _planes(numbers: np.ndarray, kind: str) -> bytes:
+    """K planes of N numbers [N, K], all low bytes before the high ones."""
+    split = np.ascontiguousarray(numbers.T, "<i4")[..., None].view(np.uint8)  # [K, N, 4]
+    return np.ascontiguousarray(split[..., : BYTES[kind]].transpose(2, 0, 1)).tobytes()
+
+
+def _columns(rows: Tensor, blocks: Sequence[np.ndarray]) -> np.ndarray:
+    """Blocks [N, K] beside one another, also where there are none: whole numbers of as many rows as `rows` has."""
+    return np.concatenate([np.zeros((len(rows), 0), np.int64), *blocks], 1)
+
+
+def _harmonics(rest: Tensor, degree: int) -> tuple[np.ndarray, list[float]]:
+    """[N, 3 K] in -127 to 127 of harmonics [N, 15, 3], the first left out, and what 127 stands for in every degree: its
+    largest."""
+    blocks, bands = [], []
+    for d in range(1, degree + 1):
+        band = rest[:, d * d - 1 : (d + 1) ** 2 - 1]
+        largest = max(float(band.abs().max()) if band.numel() else 0.0, 1e-9)
+        blocks.append(_rounded(band / largest * 127).reshape(len(rest), -1))
+        bands.append(largest)
+    return _columns(rest, blocks), bands
+
+
+def _in_boxes(means: Tensor, counts: Sequence[int]) -> tuple[np.ndarray, list[list[list[float]]]]:
+    """[N, 3] of positions within the box of each body, and the boxes' corners."""
+    rows, boxes = [], []
+    for body in torch.split(means, list(counts)):
+        low, high = (body.amin(0), body.amax(0)) if len(body) else (means.new_zeros(3), means.new_ones(3))
+        rows.append(_rounded((body - low) / (high - low).clamp_min(1e-9) * POSITION_STEPS))
+        boxes.append([low.tolist(), high.tolist()])
+    return np.concatenate(rows), boxes
+
+
+def _quantized(values: Tensor, steps: int) -> tuple[np.ndarray, list[float]]:
+    """Numbers [N, K] in so many steps of their common range, and the range."""
+    low, high = (float(values.min()), float(values.max())) if values.numel() else (0.0, 1.0)
+    return _rounded((values - low) / max(high - low, 1e-9) * steps), [low, high]
+
+
+def _rounded(values: Tensor) -> np.ndarray:
+    return np.rint(values.double().cpu().numpy()).astype(np.int64)
+
+
+def _light(scene: Scene) -> dict[str, Any]:
+    lamps = zip(scene.shadow_offsets.tolist(), scene.shadow_strengths.clamp(0, 1).tolist(), strict=True)
+    return {
+        "falloff": scene.falloff.tolist(),
+        "vignette": scene.vignette.tolist(),
+        "background": scene.background,
+        "shadow_width": float(scene.shadow_width),
+        "lamps": [[*offset, strength] for offset, strength in lamps if strength > 0] if scene.casts_shadow else [],
+    }
+
+
+def _instruments(scene: Scene, motion: HingeMotion) -> list[dict[str, Any]]:
+    """Name, shaft and hinges of every instrument that moves, in its own frame, mm and rad: the page steers by them."""
+    if not motion.hinges:
+        return []
+    shafts, ranges = shafts_of(scene), slider_ranges(scene.instruments, scene.recorded.states)
+    found = []
+    for instrument, hinges in zip(scene.instruments, motion.hinges, strict=False):
+        joints = []
+        for name, (pivot, axis) in zip(instrument.joints, hinges, strict=True):
+            span = ranges[instrument.name, name]
+            ends = [span.lower, span.upper]
+            joints.append({"name": name, "pivot": pivot.tolist(), "axis": axis.tolist(), "range": ends})
+        shaft = shafts[instrument.name]
+        side, up = perpendicular_axes(shaft.along)
+        axes = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
+        known = {name: vector.tolist() for name, vector in axes.items()}
+        found.append({"name": instrument.name, "shaft": known, "joints": joints})
+    return found
+
+
+def _recorded(scene: Scene, motion: HingeMotion) -> dict[str, Any]:
+    """Names, cameras and states of the frames trained on; matrices are the first three rows, 12 numbers."""
+    moving = scene.instruments[: len(motion.hinges)]
+    states = [scene.registered(state) for state in scene.recorded.states]
+    return {
+        "names": list(scene.recorded.names),
+        "cameras": [_rows(camera.world_from_camera) for camera in scene.recorded.cameras],
+        "lenses": [
+            [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near]
+            for camera in scene.recorded.cameras
+        ],
+        "poses": [[_rows(state.instruments[item.name].pose) for item in moving] for state in states],
+        "joints": [
+            [[state.instruments[item.name].joints[joint] for joint in item.joints] for item in moving]
+            for state in states
+        ],
+    }
+
+
+def _rows(matrix: Tensor) -> list[float]:
+    return [round(value, 5) for value in matrix[:3].double().flatten().tolist()]

@@ -1,53 +1,55 @@
-"""The control panel of one browser. What comes from a run is shown as text, never as markup."""
+"""The control panel of one browser, and its status. What comes from a run is shown as text, never as markup."""
 
 from __future__ import annotations
 
+import html
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neeco.viewer.instrument_panel import InstrumentPanel
-from neeco.viewer.source import Loaded
-from neeco.viewer.status import LINE, message_html
-from neeco.viewer.steering import Wishes, slider_ranges
-from neeco.viewer.timeline import Timeline
-from neeco.viewer.views import IMAGE, views_of
+from neeco.capture.model import Instrument, InstrumentState
+from neeco.synthesis.states import JointRange
+from neeco.viewer.controls import Controls, InstrumentControls, Shaft, slider_ranges
+from neeco.viewer.runs import LoadedRun, Timeline
+from neeco.viewer.views import IMAGE, RunPicture, views_of
 
 if TYPE_CHECKING:
     import viser
 
-    from neeco.viewer.overlays import Overlays
+    from neeco.viewer.viser_scene import Overlays
 
-MOST_INSTRUMENTS = 8  # that get controls
+MAX_INSTRUMENTS, MAX_JOINTS = 8, 24  # instruments that get controls; joints of one that get a slider
+SLIDE_MM, YAW_DEG = 30.0, 45.0
 SPLIT, BESIDE = "split picture", "side by side"
 NONE_CHOSEN = "—"
 PLOTS_EVERY_S = 0.5  # while more becomes known
 PLOT_HEIGHT = 140  # px
 PLOT_COLORS = ("#228be6", "#f76707")
+LINE = 80  # characters of a name or message that are shown
 
 
 @dataclass(frozen=True)
 class Actions:
-    """What the panel asks for when the user does something."""
+    """What the panel calls when the user does something."""
 
     changed: Callable[[], None]
     go_to: Callable[[int], None]  # the camera of a frame
-    gripped: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
-    keep: Callable[[], None]
-    forget: Callable[[], None]
-    save: Callable[[], None]
+    toggle_gizmo: Callable[[str, int, bool], None]  # an instrument's name and number, and whether its gizmo appears
+    save_state: Callable[[], None]
+    remove_state: Callable[[], None]
+    save_image: Callable[[], None]
     dark: Callable[[bool], None]
 
 
 class Panel:
     """Made of the first run that is looked at; `runs` are all."""
 
-    def __init__(self, client: viser.ClientHandle, runs: Sequence[Loaded], actions: Actions) -> None:
+    def __init__(self, client: viser.ClientHandle, runs: Sequence[LoadedRun], actions: Actions) -> None:
         self._gui, self._runs, self._actions = client.gui, tuple(runs), actions
         self._worst: list[int] = []
         self._plotted: tuple[tuple[int, int], ...] = ()  # what is known of the frames, as it was shown last
@@ -58,12 +60,12 @@ class Panel:
         self._add_recording()
         self.instruments = self._add_instruments()
         self._add_timeline()
-        self._add_keeping()
+        self._add_saving()
 
-    def wishes(self, overlays: Overlays) -> Wishes:
+    def controls(self, overlays: Overlays) -> Controls:
         """What the sliders say."""
-        steered = {item.name: item.steered(overlays.pose(item.name)) for item in self.instruments}
-        return Wishes(self.place, steered)
+        instruments = {item.name: item.controls(overlays.gizmo_pose(item.name)) for item in self.instruments}
+        return Controls(self.place, instruments)
 
     @property
     def place(self) -> float:
@@ -85,23 +87,16 @@ class Panel:
         if so_far == self._plotted or (grows and now - self._plotted_at < PLOTS_EVERY_S):
             return
         self._plotted, self._plotted_at = so_far, now
-        first = self._runs[0]
-        known = [timeline.known() for timeline in timelines]
-        same = [timeline.loaded.recorded.names == first.recorded.names for timeline in timelines]
-        frames = [
-            shown[0]
-            for shown, of_same in zip(known, same, strict=True)
-            if of_same  # of another recording there is no frame in common
-        ]
-        common = frames[0]
-        for others in frames[1:]:
-            common = np.intersect1d(common, others)
+        names, splits = self._runs[0].recorded.names, self._runs[0].recorded.splits
+        # of another recording there is no frame in common
+        known = [timeline.known() for timeline in timelines if timeline.loaded.recorded.names == names]
+        if not known:  # the run has changed, and this panel not yet
+            return
+        common = reduce(np.intersect1d, [frames for frames, _ in known])
         if len(common) < 2:
             return
-        values = [psnr[np.isin(at, common)] for (at, psnr), ok in zip(known, same, strict=True) if ok]
-        self._draw_plot((common.astype(np.float64), *values))
+        self._draw_plot((common.astype(np.float64), *(psnr[np.isin(frames, common)] for frames, psnr in known)))
         worst = timelines[0].worst()
-        names, splits = first.recorded.names, first.recorded.splits
         options = [f"{frame}: {psnr:.1f} dB, {splits[frame]}, {names[frame]}" for frame, psnr in worst]
         if self.worst.value == NONE_CHOSEN and (NONE_CHOSEN, *options) != tuple(self.worst.options):
             self._worst = [frame for frame, _ in worst]
@@ -126,6 +121,7 @@ class Panel:
     def _add_recording(self) -> None:
         gui, first = self._gui, self._runs[0]
         last = len(first.recorded.states) - 1
+        poses = [camera.world_from_camera for camera in first.recorded.cameras]
         with gui.add_folder("Recording"):
             hint = "Between two frames the state is interpolated."
             if any(len(run.recorded.states) != last + 1 for run in self._runs):
@@ -133,21 +129,21 @@ class Panel:
             self.frame = gui.add_slider("frame", 0.0, float(last), 0.1, 0.0, hint=hint)
             self.play = gui.add_checkbox("play", False)
             self.follows = gui.add_checkbox(
-                "camera of the frame", _cameras_move(first), hint="The camera goes along with the frames."
+                "camera of the frame",
+                any(not pose.equal(poses[0]) for pose in poses),
+                hint="The camera goes along with the frames.",
             )
             self.go = gui.add_button("go to this frame's camera")
             self.cameras = gui.add_checkbox("recorded cameras", False, hint="Click one to stand there.")
             self.points = gui.add_checkbox("sparse points", False, visible=first.capture is not None)
         self.frame.on_update(self._moved)
-        self.play.on_update(self._moved)
-        self.follows.on_update(self._moved)
-        for control in (self.cameras, self.points):
+        for control in (self.play, self.follows, self.cameras, self.points):
             control.on_update(self._moved)
         self.go.on_click(lambda _: self._actions.go_to(round(self.place)))
 
     def _add_instruments(self) -> list[InstrumentPanel]:
         first = self._runs[0]
-        if (more := len(first.scene.instruments) - MOST_INSTRUMENTS) > 0:
+        if (more := len(first.scene.instruments) - MAX_INSTRUMENTS) > 0:
             self._gui.add_html(message_html(f"{more} more instruments stay as recorded: no room for their sliders"))
         ranges = slider_ranges(first.scene.instruments, first.recorded.states)
         return [
@@ -157,9 +153,9 @@ class Panel:
                 ranges,
                 first.shafts[instrument.name],
                 self._actions.changed,
-                partial(self._actions.gripped, instrument.name, number),
+                partial(self._actions.toggle_gizmo, instrument.name, number),
             )
-            for number, instrument in enumerate(first.scene.instruments[:MOST_INSTRUMENTS])
+            for number, instrument in enumerate(first.scene.instruments[:MAX_INSTRUMENTS])
         ]
 
     def _add_timeline(self) -> None:
@@ -171,20 +167,20 @@ class Panel:
             )
         self.worst.on_update(self._worst_chosen)
 
-    def _add_keeping(self) -> None:
+    def _add_saving(self) -> None:
         gui = self._gui
         labelled = bool(self._runs[0].scene.label_names)
         with gui.add_folder("Keep"):
-            self.keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
-            self.forget = gui.add_button("forget the last kept")
-            self.save = gui.add_button(
+            keep = gui.add_button("keep this state", hint="And this camera, for neeco synthesize --states.")
+            forget = gui.add_button("forget the last kept")
+            save = gui.add_button(
                 "save labelled image", disabled=not labelled, hint="As neeco synthesize writes one, from here."
             )
-            self.kept = gui.add_html("")
+            self.saved = gui.add_html("")
         dark = gui.add_checkbox("dark", True)
-        self.keep.on_click(lambda _: self._actions.keep())
-        self.forget.on_click(lambda _: self._actions.forget())
-        self.save.on_click(lambda _: self._actions.save())
+        keep.on_click(lambda _: self._actions.save_state())
+        forget.on_click(lambda _: self._actions.remove_state())
+        save.on_click(lambda _: self._actions.save_image())
         dark.on_update(lambda _: self._actions.dark(bool(dark.value)))
 
     def _draw_plot(self, data: tuple[np.ndarray, ...]) -> None:
@@ -193,9 +189,8 @@ class Panel:
             return
         series: list[dict[str, Any]] = [{"label": "frame"}]
         for color, run in zip(PLOT_COLORS, self._runs, strict=False):
-            series.append(
-                {"label": f"{run.name} (dB)"[:LINE], "stroke": color, "width": 1.5, "points": {"show": False}}
-            )
+            label = f"{run.name} (dB)"[:LINE]
+            series.append({"label": label, "stroke": color, "width": 1.5, "points": {"show": False}})
         with self._timeline_folder:
             self._plot = self._gui.add_uplot(
                 data,
@@ -208,7 +203,7 @@ class Panel:
             )
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
+        if event.client is not None:  # else the program moved it
             self._actions.changed()
 
     def _layout_changed(self, event: viser.GuiEvent[Any]) -> None:
@@ -227,6 +222,146 @@ class Panel:
         self._actions.go_to(frame)
 
 
-def _cameras_move(loaded: Loaded) -> bool:
-    first = loaded.recorded.cameras[0].world_from_camera
-    return any(not camera.world_from_camera.equal(first) for camera in loaded.recorded.cameras)
+class InstrumentPanel:
+    """Sliders of one instrument. They follow the recording until the user moves one."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        instrument: Instrument,
+        ranges: Mapping[tuple[str, str], JointRange],
+        shaft: Shaft,
+        changed: Callable[[], None],
+        toggle_gizmo: Callable[[bool], None],
+    ) -> None:
+        """changed: called when the user moved something; toggle_gizmo: when the gizmo is to appear or to go."""
+        self.name = instrument.name
+        self._changed, self._toggle_gizmo = changed, toggle_gizmo
+        self._ranges = {joint: ranges[self.name, joint] for joint in instrument.joints if (self.name, joint) in ranges}
+        with gui.add_folder(f"Instrument {self.name}"):
+            self._joints = {
+                joint: _degrees_slider(gui, joint, span) for joint, span in list(self._ranges.items())[:MAX_JOINTS]
+            }
+            self.as_recorded = gui.add_checkbox(
+                "joints as recorded", True, visible=bool(self._joints), hint="Off as soon as a joint is moved."
+            )
+            about = "the learned shaft" if shaft.learned else "the tracked frame's z axis (no shaft is known)"
+            self.slide = gui.add_slider("along shaft (mm)", -SLIDE_MM, SLIDE_MM, 0.5, 0.0, hint=f"Along {about}.")
+            self.roll = gui.add_slider("roll (°)", -180.0, 180.0, 1.0, 0.0, hint=f"About {about}.")
+            self.yaw = gui.add_slider("yaw (°)", -YAW_DEG, YAW_DEG, 0.5, 0.0, hint="About the shaft's end.")
+            self.pitch = gui.add_slider("pitch (°)", -YAW_DEG, YAW_DEG, 0.5, 0.0, hint="About the shaft's end.")
+            self.gizmo = gui.add_checkbox(
+                "drag it in the scene",
+                False,
+                hint="Arrows and rings move and turn the instrument; sliders add to that.",
+            )
+            self.back = gui.add_button("back to the recording")
+        for slider in self._joints.values():
+            slider.on_update(self._joint_moved)
+        for control in (self.slide, self.roll, self.yaw, self.pitch, self.as_recorded):
+            control.on_update(self._moved)
+        self.gizmo.on_update(self._gizmo_toggled)
+        self.back.on_click(lambda _: self.reset())
+
+    def controls(self, pose: np.ndarray | None) -> InstrumentControls:
+        """What the sliders say; pose [4, 4]: where the gizmo stands, mm, or None where there is none."""
+        joints = {}
+        if not self.as_recorded.value:
+            for joint, slider in self._joints.items():
+                span = self._ranges[joint]
+                # a degree and back may lie a hair outside the limits
+                joints[joint] = min(max(math.radians(slider.value), span.lower), span.upper)
+        return InstrumentControls(
+            joints,
+            float(self.slide.value),
+            math.radians(self.roll.value),
+            math.radians(self.yaw.value),
+            math.radians(self.pitch.value),
+            pose if self.gizmo.value else None,
+        )
+
+    def follow(self, state: InstrumentState) -> None:
+        """Show the recorded readings, unless the user has set others."""
+        if self.as_recorded.value:
+            for joint, slider in self._joints.items():
+                on_step = round(math.degrees(state.joints[joint]) / slider.step) * slider.step
+                shown = min(max(round(on_step, 6), slider.min), slider.max)
+                if shown != slider.value:
+                    slider.value = shown
+
+    def straighten(self) -> None:
+        """Reset slide and turns: the pose they led to has become the one they start from."""
+        for slider in (self.slide, self.roll, self.yaw, self.pitch):
+            slider.value = 0.0
+
+    def reset(self) -> None:
+        """Be as recorded again."""
+        self.straighten()
+        self.as_recorded.value = True
+        if self.gizmo.value:
+            self.gizmo.value = False
+            self._toggle_gizmo(False)
+        self._changed()
+
+    def _joint_moved(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is None:  # it followed the recording
+            return
+        self.as_recorded.value = False
+        self._changed()
+
+    def _moved(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self._changed()
+
+    def _gizmo_toggled(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self._toggle_gizmo(bool(self.gizmo.value))
+            self._changed()
+
+
+def _degrees_slider(gui: viser.GuiApi, joint: str, span: JointRange) -> viser.GuiSliderHandle[float]:
+    """Ends are rounded outwards; what lies outside the range there is drawn at its end."""
+    lower, upper = math.degrees(span.lower), math.degrees(span.upper)
+    digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
+    step = 10.0**-digits
+    lower, upper = round(math.floor(lower / step) * step, digits), round(math.ceil(upper / step) * step, digits)
+    return gui.add_slider(f"{joint} (°)", lower, upper, step, min(max(0.0, lower), upper))
+
+
+def status_html(parts: Sequence[RunPicture], seconds: float, size: tuple[int, int], note: str) -> str:
+    """HTML of the status: what is shown, how well, how fast. seconds: of the rendering; size: (width, height) in px;
+    note: what else is to be known."""
+    lines = []
+    for part in parts:
+        loaded, scene = part.loaded, part.loaded.scene
+        frame = min(max(round(part.frame), 0), len(loaded.recorded.names) - 1)
+        count = "no Gaussians" if scene.num_gaussians is None else f"{scene.num_gaussians:,} Gaussians"
+        training = [] if loaded.iteration is None else [f"iteration {loaded.iteration:,}, still training"]
+        place = f"{part.frame:g} ({_text(loaded.recorded.names[frame])}, {_text(loaded.recorded.splits[frame])})"
+        lines += [
+            f"<b>{_text(loaded.name)}</b>",
+            " · ".join([_text(scene.method), count, *training]),
+            f"frame {place}" + ("" if part.exact else ", steered or between frames"),
+        ]
+        if part.score is not None:
+            overlap = "" if part.score.iou is None else f" · IoU {part.score.iou:.3f}"
+            lines.append(f"PSNR {part.score.psnr:.2f} dB{overlap}")
+        if part.trouble:
+            lines.append(_text(part.trouble, 3 * LINE))
+    lines.append(f"{seconds * 1e3:.0f} ms at {size[0]} × {size[1]}")
+    return _block([*lines, _text(note, 3 * LINE)] if note else lines)
+
+
+def message_html(text: str) -> str:
+    """HTML of one message."""
+    return _block([_text(text, 4 * LINE)]) if text else ""
+
+
+def _text(text: str, most: int = LINE) -> str:
+    """As it reads, on one line, not longer than `most`, escaped."""
+    line = " ".join(str(text).split())
+    return html.escape(line if len(line) <= most else line[: most - 1] + "…")
+
+
+def _block(lines: Sequence[str]) -> str:
+    return f'<div style="padding:0.2em 1em;font-size:0.8em;overflow-wrap:anywhere">{"<br>".join(lines)}</div>'

@@ -1,80 +1,203 @@
-"""`neeco view`: a web server that shows runs and lets them be steered, to every browser that comes."""
+"""`neeco view`: a web server that shows runs and lets them be steered, to every browser that connects.
+
+viser serves the page. Every request passes our access control first, and no tunnel or other host is ever asked for.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import gzip
+import http
+import io
+import logging
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
-from neeco.viewer.guard import Guard, address_of, free_port, is_loopback
-from neeco.viewer.serving import guarded_server, require_viser, stop
-from neeco.viewer.studio import Studio
-from neeco.viewer.visitor import Visitor
-from neeco.viewer.window import field_of_view, upward
+from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
+from neeco.viewer.runs import ViewedRuns
+from neeco.viewer.saving import SavedStates
+from neeco.viewer.session import ClientSession, RenderThread
+from neeco.viewer.viser_scene import field_of_view, upward
 
 if TYPE_CHECKING:
     import viser
 
 HOST, PORT = "127.0.0.1", 8080
-MOST_RUNS = 2
+MAX_RUNS = 2
 TOKEN_BYTES = 24
-HEARS_EVERY_S = 0.5
+POLL_S = 0.5  # between two looks for Ctrl-C
+MISSING = "view: needs viser; install neeco[view]"
+MAX_BROWSERS = 32  # at once
+MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
+
+log = logging.getLogger(__name__)
 
 
-class Viewer:
+class ViewerServer:
     """A running server; `address` is what to open. Use as a context manager, or call `stop`."""
 
     def __init__(
         self, runs: Sequence[Path], host: str = HOST, port: int = PORT, device: torch.device | None = None
     ) -> None:
         """One run, or two to compare. port: or the next that is free. Raises NeecoError."""
-        if not 1 <= len(runs) <= MOST_RUNS:
+        if not 1 <= len(runs) <= MAX_RUNS:
             raise NeecoError(f"view: {len(runs)} runs given; give one, or two to compare")
         require_viser()
-        self.studio = Studio(runs, device)
+        self.runs = ViewedRuns(runs, device)
+        self.saved = SavedStates(runs[0])
+        self.render_thread = RenderThread(self.runs.advance_timelines)
         port = free_port(host, port)
         self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
-        self._server = guarded_server(Guard(self.token, f"neeco_{port}"), host, port)
-        self.address = address_of(host, self._server.get_port(), self.token)
+        self._server = _start_server(AccessControl(self.token, f"neeco_{port}"), host, port)
+        self.address = url_of(host, self._server.get_port(), self.token)
         self._prepare_scene()
-        self._server.on_client_connect(self._come)
-        self._server.on_client_disconnect(lambda client: self.studio.artist.leave(client.client_id))
-        self.studio.start()
+        self._server.on_client_connect(self._connect)
+        self._server.on_client_disconnect(lambda client: self.render_thread.remove(client.client_id))
+        self.render_thread.start()
+        self.runs.watch(self.render_thread.request)
 
-    def __enter__(self) -> Viewer:
+    def __enter__(self) -> ViewerServer:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
 
     def stop(self) -> None:
-        """End the drawing, then the server."""
-        self.studio.stop()
-        stop(self._server)
+        """End the rendering, then the server."""
+        self.runs.end_watch()
+        self.render_thread.stop()
+        _stop_server(self._server)
 
     def wait(self) -> None:
         """Until Ctrl-C."""
         while True:  # in short waits: a signal that comes just before one begins is heard after it
-            time.sleep(HEARS_EVERY_S)
+            time.sleep(POLL_S)
 
     def _prepare_scene(self) -> None:
         """What all browsers share: which way is up, where a new one and the home button stand."""
-        first, unit = self.studio.loaded[0], self.studio.unit
+        first, unit = self.runs.loaded[0], self.runs.unit
         camera = first.recorded.cameras[0]
         pose = to_numpy(camera.world_from_camera)
         scene, initial = self._server.scene, self._server.initial_camera
-        scene.set_up_direction(tuple(upward(first)))
+        scene.set_up_direction(tuple(upward(first.recorded.cameras)))
         scene.world_axes.visible = False
         initial.position = tuple(pose[:3, 3] * unit)
-        initial.look_at = tuple((pose[:3, 3] + self.studio.distance * pose[:3, 2]) * unit)
+        initial.look_at = tuple((pose[:3, 3] + self.runs.distance * pose[:3, 2]) * unit)
         initial.up = tuple(-pose[:3, 1])
         initial.fov = field_of_view(camera)
 
-    def _come(self, client: viser.ClientHandle) -> None:
-        self.studio.artist.seat(Visitor(client, self.studio, lambda: client.client_id in self._server.get_clients()))
+    def _connect(self, client: viser.ClientHandle) -> None:
+        def connected() -> bool:
+            return client.client_id in self._server.get_clients()
+
+        self.render_thread.add(ClientSession(client, self.runs, self.saved, self.render_thread, connected))
+
+
+def require_viser() -> None:
+    """Raises NeecoError where viser is not installed, or is too old."""
+    try:
+        import viser
+    except ImportError:
+        raise NeecoError(MISSING) from None
+    if tuple(int(part) for part in viser.__version__.split(".")[:2]) < (1, 1):
+        raise NeecoError(f"view: viser {viser.__version__} is too old; install neeco[view], or viser>=1.1,<2")
+
+
+def _start_server(access: AccessControl, host: str, port: int) -> viser.ViserServer:
+    """viser's server, whose every request `access` has allowed. Raises NeecoError."""
+    import viser
+
+    class Server(viser.ViserServer):
+        """Never asks for a tunnel: a browser may request one without any button."""
+
+        def request_share_url(self, verbose: bool = True) -> None:
+            return None
+
+    # viser's own banner would name an address without the token
+    with _controlled_sockets(access) as opened, contextlib.redirect_stdout(io.StringIO()):
+        server = Server(host=host, port=port, label="neeco", verbose=False)
+    if not opened:
+        _stop_server(server)
+        raise NeecoError(
+            f"view: viser {viser.__version__} opens its port in a way that is not known; install viser 1.1"
+        )
+    return server
+
+
+def _stop_server(server: viser.ViserServer) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):  # without viser's farewell
+        server.stop()
+
+
+@contextlib.contextmanager
+def _controlled_sockets(access: AccessControl) -> Iterator[list[bool]]:
+    """Inside the block, a web socket server that is opened asks `access` about every request. viser has no setting for
+    that, so `websockets.serve` is replaced. Yields a list that is empty as long as none was opened."""
+    import websockets.asyncio.server as websocket_server
+
+    opened: list[bool] = []
+    serve = websocket_server.serve
+
+    def serve_controlled(
+        handler: Callable[..., Any], *given: Any, process_request: Callable[..., Any], **named: Any
+    ) -> Any:
+        opened.append(True)
+
+        def answer(connection: Any, request: Any) -> Any:
+            headers: dict[str, list[str]] = {}
+            for name, value in request.headers.raw_items():
+                headers.setdefault(name.lower(), []).append(value)
+            reason = access.refusal(request.path, headers)
+            if reason is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"neeco view: refused: {reason}\n")
+            if "upgrade" in headers and len(connection.server.connections) >= MAX_BROWSERS:
+                return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "neeco view: too many browsers\n")
+            try:
+                response = process_request(connection, request)
+            except (LookupError, OSError, ValueError):  # a header given twice, a name that no file can have
+                return connection.respond(http.HTTPStatus.BAD_REQUEST, "neeco view: not understood\n")
+            if response is not None:
+                page = response.body
+                if response.headers.get("Content-Encoding") == "gzip":
+                    page = gzip.decompress(page)
+                for name, value in access.page_headers(request.path, page, headers["host"][0]).items():
+                    response.headers[name] = value
+            return response
+
+        return serve(_closing_on_error(handler), *given, process_request=answer, **named | {"max_size": MAX_MESSAGE})
+
+    websocket_server.serve = serve_controlled
+    try:
+        yield opened
+    finally:
+        websocket_server.serve = serve
+
+
+def _closing_on_error(handler: Callable[..., Any]) -> Callable[..., Any]:
+    """viser's handler of a web socket: what it does not understand ends the connection, in a line and no traceback."""
+
+    async def handle(connection: Any) -> None:
+        # a message that is understood, but asks for what cannot be, fails in a task of its own
+        asyncio.get_running_loop().set_exception_handler(
+            lambda _, context: _log_misunderstood(context.get("exception"))
+        )
+        try:
+            await handler(connection)
+        except Exception as error:
+            _log_misunderstood(error)
+            await connection.close(1002, "not understood")
+
+    return handle
+
+
+def _log_misunderstood(error: BaseException | None) -> None:
+    log.warning("neeco view: a browser's message was not understood (%s)", type(error).__name__)
+    log.debug("", exc_info=error)

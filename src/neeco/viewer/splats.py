@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from neeco.scene import Scene
 
 Format = Literal["ply", "spz"]
-ASKED = 64  # directions by which harmonics are turned: four times their number
+DIRECTIONS = 64  # by which harmonics are rotated: four times as many as there are harmonics
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
 SPZ_FRACTION = 12  # bits of a mm: positions reach 2 m
 SPZ_COLOR = 0.15  # of the first harmonic, per unit of what is stored
@@ -49,7 +49,7 @@ class Splats:
     sh: np.ndarray  # [N, K, 3], world frame
 
 
-def standing(scene: Scene, frame: int, states: Path | None) -> tuple[State, Camera]:
+def exported_state(scene: Scene, frame: int, states: Path | None) -> tuple[State, Camera]:
     """State and camera of a frame trained on; of the first line of a file of states where that is given, whose camera
     is the frame's unless it names one. Raises NeecoError for a file that does not fit."""
     state, camera = scene.recorded.states[frame], scene.recorded.cameras[frame]
@@ -132,11 +132,11 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def _in_world(posed: Gaussians) -> Tensor:
-    """[N, K, 3] harmonics turned out of the frames of their parts: those that agree with them in ASKED directions."""
+    """[N, K, 3] harmonics rotated out of the frames of their parts: a least-squares fit over DIRECTIONS directions."""
     count = posed.sh.shape[1]
     if posed.sh_frames is None or count == 1:
         return posed.sh
-    directions = _spread_directions(ASKED).to(posed.sh)  # [D, 3]
+    directions = _spread_directions(DIRECTIONS).to(posed.sh)  # [D, 3]
     back = torch.linalg.pinv(sh_basis(directions, count))  # [K, D]
     frames, which = torch.unique(posed.sh_frames, dim=0, return_inverse=True)  # most stand still, all alike
     local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]

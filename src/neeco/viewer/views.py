@@ -1,4 +1,4 @@
-"""The pictures: what a scene looks like in a state, and what else there is to see of it."""
+"""The views of a scene in a state (image, labels, depth, ...), and a run's part of a browser's window."""
 
 from __future__ import annotations
 
@@ -14,19 +14,24 @@ from neeco.evaluation.image_metrics import Pixels, difference_map, overlay_parts
 from neeco.labels.drawing import surface_depth
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster import rasterize
+from neeco.raster.devices import readable_failures
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.scene import gaussian_scene
+from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
+from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns
+from neeco.viewer.viser_scene import carried_over, stands_at
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
 
 IMAGE, OVERLAY, PARTS = "image", "labels over image", "parts"
-DEPTH, MADE_UP, DIFFERENCE = "depth", "made up", "difference to the photograph"
-VIEWS = (IMAGE, OVERLAY, PARTS, DEPTH, MADE_UP, DIFFERENCE)
+DEPTH, UNOBSERVED, DIFFERENCE = "depth", "unobserved", "difference to the recorded image"
+VIEWS = (IMAGE, OVERLAY, PARTS, DEPTH, UNOBSERVED, DIFFERENCE)
 LABELLED = (OVERLAY, PARTS)
+ONLY_RECORDED = "difference: only of a recorded state seen by its camera; press “go to this frame's camera”"
 
-MADE_UP_COLOR = np.array([255.0, 0.0, 255.0])  # nothing inside a body has it
-DEPTH_SHARES = 2, 98  # percentiles that are white and black
+UNOBSERVED_COLOR = np.array([255.0, 0.0, 255.0])  # nothing inside a body has it
+DEPTH_PERCENTILES = 2, 98  # that are white and black
 DIMMED = 0.35  # of its light is left of what cannot be compared
 
 
@@ -36,24 +41,39 @@ class Picture:
 
     pixels: Pixels  # uint8 [H, W, 3]
     depth: np.ndarray  # [H, W] mm, 0 = nothing there
-    said: str = ""  # what the colours mean, where that differs from picture to picture
+    note: str = ""  # what the colours mean, where that differs from picture to picture
 
 
-def views_of(scene: Drawable, photographs: bool) -> tuple[str, ...]:
-    """Which of VIEWS there are of a scene; `photographs`: the capture is at hand."""
-    there = {IMAGE, DEPTH}
-    if scene.label_names:
-        there |= set(LABELLED)
-    if scene.has_gaussians:
-        there.add(MADE_UP)
-    if photographs:
-        there.add(DIFFERENCE)
-    return tuple(view for view in VIEWS if view in there)
+@dataclass(frozen=True)
+class RunPicture:
+    """A run's part of the window, and what the status says of it."""
+
+    number: int  # of the run
+    loaded: LoadedRun
+    picture: Picture
+    frame: float  # where in the recording
+    exact: bool  # the state is that of the frame
+    seen_as_recorded: bool = False  # so is the camera
+    note: str = ""
+    trouble: str = ""  # what of the run could not be read
+    score: FrameScore | None = None
+
+
+def views_of(scene: Drawable, has_images: bool) -> tuple[str, ...]:
+    """Which of VIEWS there are of a scene; has_images: the capture is at hand."""
+    absent = set()
+    if not scene.label_names:
+        absent |= set(LABELLED)
+    if not scene.has_gaussians:
+        absent.add(UNOBSERVED)
+    if not has_images:
+        absent.add(DIFFERENCE)
+    return tuple(view for view in VIEWS if view not in absent)
 
 
 @torch.no_grad()
 def picture(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None = None) -> Picture:
-    """One of VIEWS but DIFFERENCE of `state` as `camera` sees it. `labels` [N, L]: the scene's label channels, where
+    """One of VIEWS but DIFFERENCE of `state` as `camera` sees it. labels [N, L]: the scene's label channels, where
     they are at hand; they take time."""
     rendering = _rendering(scene, state, camera, view, labels)
     color, depth = rendering.color.clamp(0, 1).cpu().numpy(), surface_depth(rendering)
@@ -64,23 +84,27 @@ def picture(scene: Drawable, state: State, camera: Camera, view: str, labels: Te
         return Picture(overlay_parts(color, parts), depth)
     if view == DEPTH:
         return _depth_picture(depth)
-    if view == MADE_UP:
+    if view == UNOBSERVED:
         assert rendering.channels is not None
         share = rendering.channels[..., -1:].clamp(0, 1).cpu().numpy()
-        said = f"magenta: made up; {share.mean():.1%} of the picture"
-        return Picture(_uint8((1 - share) * color * 255 + share * MADE_UP_COLOR), depth, said)
+        note = f"magenta: unobserved; {share.mean():.1%} of the picture"
+        return Picture(_uint8((1 - share) * color * 255 + share * UNOBSERVED_COLOR), depth, note)
     return Picture(_uint8(color * 255), depth)
 
 
 @torch.no_grad()
-def difference(scene: Drawable, state: State, taken_by: Camera, photograph: np.ndarray, window: Camera) -> Picture:
-    """How far what the camera that took `photograph` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
-    camera at the same place with the same vertical field of view. What it shows beside the photograph is black."""
-    rendering = scene.render(state, taken_by)
-    compared = difference_map(rendering.color.clamp(0, 1).cpu().numpy(), photograph, legend=False)
-    rows, columns = _same_rays(taken_by, window)
-    inside = (rows >= 0) & (rows < taken_by.height) & (columns >= 0) & (columns < taken_by.width)
-    rows, columns = rows.clip(0, taken_by.height - 1), columns.clip(0, taken_by.width - 1)
+def difference(scene: Drawable, state: State, recorded_by: Camera, image: np.ndarray, window: Camera) -> Picture:
+    """How far what the camera that recorded `image` [H, W, 3] in [0, 1] would see is from it, as `window` shows it: a
+    camera at the same place with the same vertical field of view. What it shows beside the image is black."""
+    rendering = scene.render(state, recorded_by)
+    compared = difference_map(rendering.color.clamp(0, 1).cpu().numpy(), image, legend=False)
+    # the recorded pixel [H, W] that looks where each of the window's pixels does
+    rows, columns = np.mgrid[0 : window.height, 0 : window.width] + 0.5
+    down, right = (rows - window.cy) / window.fy, (columns - window.cx) / window.fx
+    rows = np.floor(down * recorded_by.fy + recorded_by.cy).astype(int)
+    columns = np.floor(right * recorded_by.fx + recorded_by.cx).astype(int)
+    inside = (rows >= 0) & (rows < recorded_by.height) & (columns >= 0) & (columns < recorded_by.width)
+    rows, columns = rows.clip(0, recorded_by.height - 1), columns.clip(0, recorded_by.width - 1)
     pixels = np.where(inside[..., None], compared[rows, columns], 0).astype(np.uint8)
     return Picture(pixels, np.where(inside, surface_depth(rendering)[rows, columns], 0.0))
 
@@ -97,8 +121,7 @@ def beside(pictures: list[Picture]) -> Picture:
     pixels = np.concatenate([shown.pixels for shown in pictures], 1)
     for edge in np.cumsum([shown.pixels.shape[1] for shown in pictures])[:-1]:
         pixels[:, edge - 1 : edge + 1] = 255
-    said = "; ".join(dict.fromkeys(shown.said for shown in pictures if shown.said))
-    return Picture(pixels, np.concatenate([shown.depth for shown in pictures], 1), said)
+    return Picture(pixels, np.concatenate([shown.depth for shown in pictures], 1), _joined_notes(pictures))
 
 
 def split(left: Picture, right: Picture, share: float) -> Picture:
@@ -107,17 +130,71 @@ def split(left: Picture, right: Picture, share: float) -> Picture:
     pixels = np.concatenate([left.pixels[:, :edge], right.pixels[:, edge:]], 1)
     pixels[:, max(0, edge - 1) : edge + 1] = 255
     depth = np.concatenate([left.depth[:, :edge], right.depth[:, edge:]], 1)
-    return Picture(pixels, depth, "; ".join(dict.fromkeys(shown.said for shown in (left, right) if shown.said)))
+    return Picture(pixels, depth, _joined_notes([left, right]))
+
+
+def render_run(
+    runs: ViewedRuns, number: int, controls: Controls, camera: Camera, camera_frame: int, view: str
+) -> RunPicture:
+    """Render run `number` as the controls, made for the first run, say and `camera` sees it. Raises NeecoError.
+
+    A run of another capture has a world of its own: there the camera has gone, from the frame that belongs to
+    `camera_frame`, the way that `camera` went from that frame.
+    """
+    loaded = runs.loaded[number]
+    controls, camera = _in_world_of(loaded, runs.loaded[0], controls, camera, camera_frame)
+    scene, state = loaded.scene, controlled_state(loaded.recorded.states, loaded.shafts, controls)
+    frame = controls.recorded_frame
+    as_recorded = frame is not None and stands_at(camera, loaded.recorded.cameras[frame], loaded.distance)
+    note = ""
+    with scene.torch_threads(), readable_failures():
+        if view == DIFFERENCE and frame is not None and as_recorded and loaded.frames:
+            image = runs.recorded_image(number, loaded, frame)
+            shown = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
+        elif view in views_of(scene, False):
+            shown = picture(scene, state, camera, view, loaded.labels)
+        else:
+            shown = dimmed(picture(scene, state, camera, IMAGE))
+            note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
+    trouble = runs.watched[number].trouble or loaded.trouble
+    return RunPicture(
+        number, loaded, shown, controls.frame, frame is not None, as_recorded, note or shown.note, trouble
+    )
+
+
+def _in_world_of(
+    loaded: LoadedRun, first: LoadedRun, controls: Controls, camera: Camera, camera_frame: int
+) -> tuple[Controls, Camera]:
+    """Controls and camera, made for the first run, for another."""
+    frames = len(first.recorded.states), len(loaded.recorded.states)
+    controls = replace(controls, frame=corresponding_frame(controls.frame, *frames))
+    if loaded.world == first.world:
+        return controls, camera
+    # a place in the first run's world means nothing in this one
+    unplaced = {name: replace(item, pose=None) for name, item in controls.instruments.items()}
+    start = loaded.recorded.cameras[int(corresponding_frame(camera_frame, *frames))]
+    scale = loaded.distance / first.distance
+    return replace(controls, instruments=unplaced), carried_over(
+        camera, first.recorded.cameras[camera_frame], start, scale
+    )
+
+
+def scored(runs: ViewedRuns, shown: RunPicture) -> RunPicture:
+    """The same with its score, where the frame is seen as recorded. Raises NeecoError."""
+    if not shown.seen_as_recorded:
+        return shown
+    with shown.loaded.scene.torch_threads():
+        return replace(shown, score=runs.score(shown.number, shown.loaded, int(shown.frame)))
 
 
 def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
     if view in LABELLED and labels is None:
         return scene.render(state, camera, labels=True)
-    if view not in (*LABELLED, MADE_UP):
+    if view not in (*LABELLED, UNOBSERVED):
         return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
-    gaussians, camera = posing.at(state), posing.camera(camera)
-    channels = labels if view in LABELLED else posing.made_up(gaussians, camera)[:, None]
+    gaussians = posing.at(state)
+    channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 
 
@@ -125,21 +202,14 @@ def _depth_picture(depth: np.ndarray) -> Picture:
     there = depth > 0
     if not there.any():
         return Picture(np.zeros((*depth.shape, 3), np.uint8), depth, "nothing in view")
-    near, far = np.percentile(depth[there], DEPTH_SHARES)
+    near, far = np.percentile(depth[there], DEPTH_PERCENTILES)
     grey = np.clip((far - depth) / max(far - near, 1e-6), 0, 1) * there
-    return Picture(
-        _uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, f"white {near:.1f} mm or nearer, black {far:.1f} mm"
-    )
+    note = f"white {near:.1f} mm or nearer, black {far:.1f} mm"
+    return Picture(_uint8(np.repeat(grey[..., None], 3, 2) * 255), depth, note)
 
 
-def _same_rays(taken_by: Camera, window: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column [H, W] of `taken_by`'s pixel that looks where each of `window`'s pixels does."""
-    rows, columns = np.mgrid[0 : window.height, 0 : window.width] + 0.5
-    down, right = (rows - window.cy) / window.fy, (columns - window.cx) / window.fx
-    return (
-        np.floor(down * taken_by.fy + taken_by.cy).astype(int),
-        np.floor(right * taken_by.fx + taken_by.cx).astype(int),
-    )
+def _joined_notes(pictures: list[Picture]) -> str:
+    return "; ".join(dict.fromkeys(shown.note for shown in pictures if shown.note))
 
 
 def _uint8(pixels: np.ndarray) -> Pixels:

@@ -5,20 +5,18 @@ are, in each resolution, the product of what it meets in the six, and all resolu
 a head for each attribute makes (d_mu, d_r, d_s) of them, added before activation. L1 alone is the image loss; planes
 are kept smooth in space and time, and those with time near 1, where they change nothing.
 
-Where it departs from its source:
-- Static Gaussians alone for 3,000 of 17,000 iterations (the source's coarse stage) are a share of the run here, which
-  is shorter; so are the falling learning rates, 1.6e-3 to 1.6e-4 for planes and a tenth of both for the network.
-- The heads end in zeros, so that waking them changes nothing. The source starts them at random.
-- The planes span a cube about the sparse points that is a fifth wider than they are along their longest side: an
-  instrument moves before the tissue, where no points lie. The source takes the box of the points. Its scenes' half
-  extent is about 1; here the points' half extent is the unit of d_mu.
-- The source multiplies these rates by how far its cameras are spread, 4 to 5 in the units of D-NeRF's scenes. Here the
-  factor is `rate_scale`, 5, as Deformable-3DGS has it.
-- Time runs over the whole of its axis, from the first to the last training frame.
-- 16 channels, the smaller of the source's settings, for speed on a processor.
-- With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
-  xt yt zt at that time, one normal number per plane and channel.
-- The number of Gaussians has a ceiling (`tissue_budget`).
+Departures from the source:
+- The static stage (3,000 of 17,000 iterations) and the fall of the learning rates (1.6e-3 to 1.6e-4 for planes, a tenth
+  of both for the network) are shares of the run, which is shorter here.
+- The heads end in zeros, so that the end of the warm-up changes nothing. The source starts them at random.
+- The planes span a cube around the sparse points, a fifth wider than their longest side: instruments move in front of
+  the tissue, where no points lie. The source takes the box of the points. The unit of d_mu is the points' half extent.
+- `rate_scale`, 5 as in Deformable-3DGS, replaces the source's factor, the spread of its cameras (4 to 5 for D-NeRF).
+- Time runs over its whole axis, from the first to the last training frame.
+- 16 channels, the smaller of the source's settings, for speed on a CPU.
+- With the dynamic training adjustment, the compensation is added to the rows of the planes xt yt zt at the state's
+  time, one normal number per plane and channel.
+- The number of Gaussians is limited (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
@@ -35,31 +33,42 @@ from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
 from neeco.raster.types import Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import LabelledByMotion
-from neeco.scene.deformations._times import RecordedTimes
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation, Posed, check_warm_up, log_linear, point_box
+from neeco.scene.deformations.base import (
+    UNPERTURBED,
+    LabelledByMotion,
+    Perturbation,
+    Posed,
+    RecordedTimes,
+    check_warm_up,
+    log_linear,
+    robust_bounds,
+)
 from neeco.scene.method import PLAIN_TRAINING
 
 MARGIN = 1.2  # the cube's side, in those of the points' longest
-SPACE_SMOOTHNESS, TIME_SMOOTHNESS, TIME_L1 = 1e-4, 1e-2, 1e-4  # weights of the regularisation
 
 
 @dataclass(frozen=True)
 class HexPlaneSettings:
-    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `moments`, the
-    resolution of time; `width` of the network; `warm_up`: share of the training over which all of it rests;
-    `rate_scale` multiplies the learning rates."""
+    """`channels` per plane and resolution; `resolution` of space, doubled `levels` - 1 times; `time_resolution`;
+    `width` of the network; `warm_up`: share of the training over which all of it is off; `rate_scale` multiplies the
+    learning rates; `space_smoothness`, `time_smoothness`, `time_l1`: weights of the regularisation."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"moments": "time_resolution"}
 
     channels: int = 16
     resolution: int = 64
     levels: int = 2
-    moments: int = 25
+    time_resolution: int = 25
     width: int = 64
     warm_up: float = 3 / 17
     rate_scale: float = 5.0
+    space_smoothness: float = 1e-4
+    time_smoothness: float = 1e-2
+    time_l1: float = 1e-4
 
     def __post_init__(self) -> None:
-        for name, least in (("resolution", 3), ("moments", 3), ("levels", 1)):
+        for name, least in (("resolution", 3), ("time_resolution", 3), ("levels", 1)):
             if getattr(self, name) < least:
                 raise NeecoError(f"deformation.{name}: {getattr(self, name)} is too small; give at least {least}")
         check_warm_up(self.warm_up)
@@ -80,14 +89,14 @@ class HexPlane(LabelledByMotion):
     def __init__(self, instruments: tuple[Instrument, ...], settings: HexPlaneSettings | None = None) -> None:
         super().__init__(instruments, settings)
         sizes: HexPlaneSettings = self.settings
-        channels, moments, width = sizes.channels, sizes.moments, sizes.width
+        channels, steps, width = sizes.channels, sizes.time_resolution, sizes.width
         self.warm_up = sizes.warm_up
         self.times = RecordedTimes()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("half_extent", torch.ones(()))
         sides = [sizes.resolution * 2**level for level in range(sizes.levels)]
         self.space = nn.ParameterList(torch.empty(3, channels, side, side).uniform_(0.1, 0.5) for side in sides)
-        self.time = nn.ParameterList(torch.ones(3, channels, moments, side) for side in sides)
+        self.time = nn.ParameterList(torch.ones(3, channels, steps, side) for side in sides)
         self.trunk = nn.Linear(channels * sizes.levels, width)
         self.heads = nn.ModuleList(_head(width, size) for size in (3, 4, 3))
         nn.init.xavier_uniform_(self.trunk.weight)
@@ -95,15 +104,15 @@ class HexPlane(LabelledByMotion):
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Time from 0 to 1 over the recording; the cube about the points [P, 3]."""
         self.times.fit(states)
-        self.center, self.half_extent = point_box(means)
+        self.center, self.half_extent = robust_bounds(means)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        if self.resting:
+        if self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        places = (canonical.means - self.center) / (MARGIN * self.half_extent)
+        positions = (canonical.means - self.center) / (MARGIN * self.half_extent)
         rows = self.rows_at(self.times.share(state), perturbation.state_noise)
-        features = self.features(places, rows)
-        with tf32_products(places.device):
+        features = self.features(positions, rows)
+        with tf32_products(positions.device):
             hidden = self.trunk(features)
             d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()
@@ -122,10 +131,10 @@ class HexPlane(LabelledByMotion):
             rows.append(row + noise * torch.randn(*row.shape[:2], 1, device=row.device) if noise > 0 else row)
         return rows
 
-    def features(self, places: Tensor, rows: list[Tensor]) -> Tensor:
-        """[N, levels * C] of places [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
-        pairs = torch.stack([places[:, [0, 1]], places[:, [0, 2]], places[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
-        across = places.T[:, None, :, None]
+    def features(self, positions: Tensor, rows: list[Tensor]) -> Tensor:
+        """[N, levels * C] of positions [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
+        pairs = torch.stack([positions[:, [0, 1]], positions[:, [0, 2]], positions[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
+        across = positions.T[:, None, :, None]
         lines = torch.cat([across, torch.zeros_like(across)], -1)  # [3, 1, N, 2]
         found = []
         for plane, row in zip(self.space, rows, strict=True):
@@ -135,11 +144,17 @@ class HexPlane(LabelledByMotion):
 
     def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor:
         """Second differences squared, of the planes of space and along time, and the distance of time's from 1."""
+        weights: HexPlaneSettings = self.settings
         total = canonical.means.new_zeros(())
         for space, time in zip(self.space, self.time, strict=True):
             smooth, steady = _curvature(space), _curvature(time)
             near_one = 3 * (1 - time).abs().mean()
-            total = total + SPACE_SMOOTHNESS * smooth + TIME_SMOOTHNESS * steady + TIME_L1 * near_one
+            total = (
+                total
+                + weights.space_smoothness * smooth
+                + weights.time_smoothness * steady
+                + weights.time_l1 * near_one
+            )
         return total
 
     def learning_rates(self, progress: float) -> dict[str, float]:
@@ -159,10 +174,10 @@ def _head(width: int, size: int) -> nn.Sequential:
     return nn.Sequential(nn.ReLU(), inner, nn.ReLU(), last)
 
 
-def _sample(planes: Tensor, places: Tensor) -> Tensor:
-    """Bilinear: planes [3, C, H, W] at places [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
+def _sample(planes: Tensor, positions: Tensor) -> Tensor:
+    """Bilinear: planes [3, C, H, W] at positions [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
     [3, C, N]."""
-    return nn.functional.grid_sample(planes, places, align_corners=True, padding_mode="border")[:, :, 0]
+    return nn.functional.grid_sample(planes, positions, align_corners=True, padding_mode="border")[:, :, 0]
 
 
 def _curvature(planes: Tensor) -> Tensor:

@@ -30,34 +30,50 @@ from neeco.scene.deformations.base import (
     state_of,
 )
 from neeco.scene.drawable import HingeMotion
-from neeco.scene.hinges import PART_LOGITS, Hinges
+from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges
 from neeco.scene.method import PLAIN_TRAINING
-from neeco.scene.rim import continue_tissue, never_in_view
 from neeco.scene.training_session import GaussianTraining
+from neeco.scene.visibility import extrapolate_tissue, outside_all_views
 
-LOOKS_AGAIN_AT = (0.4, 0.6, 0.8)  # of the run, for wrists and shadows: there is shape, and time is left to learn on
-SHARPENS_FROM = 1000  # iteration
-SHADOW_AT = (1000, 1500)  # iterations: instruments have shape, and no shadow is learned yet as a part of them
-RELAXES_FROM = 1500  # iteration from which a tenth of the opacity penalty is left
+WRISTS_AT = 0.4  # of the run: the shape is there, and time is left to learn
+WRISTS_AGAIN_AT = (0.6, 0.8)  # of the run
+RATES = {  # of the hinges' parameters, at the start
+    "shaft_tilt": 8e-3,
+    "shaft_shift": 8e-2,
+    "hinge_angle": 1e-2,
+    "hinge_depth": 8e-2,
+    "offsets": 6e-3,
+    "share": 6e-3,
+    "scale": 2e-4,
+}
 
 
 @dataclass(frozen=True)
 class KinematicSettings:
     """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
-    `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it after iteration 1500;
-    `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration 1000; `part_sharpness`: weight
-    of how mixed Gaussians are of parts, from iteration 600 on; `wrist_again`: whether wrists are looked for again at 60
-    and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is looked for and drawn (see
-    `neeco.raster.shadow`); `rim`: whether tissue that no frame saw is continued smoothly (see `neeco.scene.rim`)."""
+    `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration
+    `opacity_penalty_stop` on; `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration
+    `label_sharpness_start`; `part_sharpness`: weight of how mixed Gaussians are of parts, after iteration
+    `hinge_start`, from which on hinges are learned, by rates that `rate_scale` multiplies; `refine_wrists`: whether
+    wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
+    looked for and drawn (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`: whether
+    tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
 
     shaft_roll: float = 0.5
     shaft_roll_start: int = 600
     opacity_penalty: float = 0.002
+    opacity_penalty_stop: int = 1500
     label_sharpness: float = 0.02
+    label_sharpness_start: int = 1000
     part_sharpness: float = 0.003
-    wrist_again: bool = True
+    hinge_start: int = 600  # before, unformed Gaussians would drag the hinges off
+    rate_scale: float = 1.0
+    refine_wrists: bool = True
     shadow: bool = True
-    rim: bool = True
+    shadow_at: tuple[int, ...] = (1000, 1500)  # instruments have shape, and no shadow is learned yet as a part of them
+    extrapolate_tissue: bool = True
 
 
 @dataclass(frozen=True)
@@ -68,13 +84,12 @@ class Spin(Perturbation):
     shaft_roll: float = 0.0
 
 
-class Kinematic(Deformation):
+class Kinematic(HingedInstruments, Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
     method = "kinematic"
     Settings = KinematicSettings
     separates_instruments = True
-    learns_from = 600  # hinges hold still until Gaussians have taken shape around them, or unformed ones drag them off
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
         "schedule.sh_interval": 500,
@@ -90,21 +105,11 @@ class Kinematic(Deformation):
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
         super().__init__(instruments, settings)
+        self.start_iteration = self.settings.hinge_start
         self.hinges = nn.ModuleList(Hinges(tuple(instrument.joints)) for instrument in instruments)
         self.label_names = tuple(
             (instrument.name, part) for instrument in instruments for part in part_names(tuple(instrument.joints))
         )
-
-    def hinges_of(self, index: int) -> Hinges:
-        """The shaft and hinges of instrument `index`."""
-        hinges = self.hinges[index]
-        assert isinstance(hinges, Hinges)
-        return hinges
-
-    @property
-    def logit_count(self) -> int:
-        """Columns of the per-Gaussian part logits: the largest part count of any instrument."""
-        return max((self.hinges_of(i).part_count for i in range(len(self.instruments))), default=1)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
@@ -117,21 +122,15 @@ class Kinematic(Deformation):
             *pose_bodies(canonical.means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies)
         )
 
-    def part_weights(self, canonical: CanonicalGaussians, index: int) -> Tensor:
-        """Part weights [M, part_count] of one instrument's Gaussians."""
-        rows = canonical.body(index + 1)
-        return self.hinges_of(index).part_weights(canonical.means[rows], canonical.extras[PART_LOGITS][rows])
-
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
         column = 0
         for index in range(len(self.instruments)):
             hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-            if not hinges.joint_names:
-                labels[rows, column] = 1.0
-                column += 1
-                continue
-            parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            if hinges.joint_names:
+                parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            else:
+                parts = labels.new_ones(canonical.counts[index + 1], 1)
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
         return labels
@@ -199,7 +198,7 @@ class Kinematic(Deformation):
     def begin(self, training: GaussianTraining) -> None:
         training.instruments.find(self)
 
-    def disturbed(
+    def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
     ) -> Perturbation:
         settings = self.settings
@@ -207,22 +206,22 @@ class Kinematic(Deformation):
             return Spin(perturbation.state_noise, float(rng.uniform(-math.pi, math.pi)))
         return perturbation
 
-    def spun(self, roll: float) -> Perturbation:
-        """Nothing disturbed but every shaft, by `roll` rad."""
+    def spin_perturbation(self, roll: float) -> Perturbation:
         return Spin(shaft_roll=roll)
 
-    def lost(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
-        """Tissue whose middle no frame sees: what it looks like there, nothing ever checks."""
-        if not self.settings.rim:
+    def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
+        """Tissue whose middle no frame sees: no image checks what it looks like."""
+        if not self.settings.extrapolate_tissue:
             return None
         tissue = canonical.body(0)
-        lost = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
-        lost[tissue] = never_in_view(canonical.means[tissue].detach(), cameras)
-        return lost
+        mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
+        mask[tissue] = outside_all_views(canonical.means[tissue].detach(), cameras)
+        return mask
 
     def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
         """The whole instruments' label [N, 1]: parts share it out, so all of them together have 1."""
-        if not (self.settings.label_sharpness > 0 and iteration > SHARPENS_FROM and self.label_names):
+        settings = self.settings
+        if not (settings.label_sharpness > 0 and iteration > settings.label_sharpness_start and self.label_names):
             return None
         return canonical.of_instruments.to(canonical.means.dtype)[:, None]
 
@@ -230,48 +229,39 @@ class Kinematic(Deformation):
         """Sparse instruments with sharp labels and decided parts."""
         settings, terms = self.settings, []
         if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
-            weight = settings.opacity_penalty * (1.0 if iteration < RELAXES_FROM else 0.1)
+            weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
             terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
-        if settings.part_sharpness > 0 and iteration > self.learns_from:
-            terms += [settings.part_sharpness * self._undecided(canonical, k) for k in range(len(self.instruments))]
+        if settings.part_sharpness > 0 and iteration > self.start_iteration:
+            terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
         if rendering.channels is not None and settings.label_sharpness > 0:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
-    def _undecided(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+    def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """How mixed one instrument's Gaussians are of its parts, a scalar in [0, 1)."""
         weights = self.part_weights(canonical, index)
         opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
         return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
 
     def between_steps(self, training: GaussianTraining, before: float) -> None:
-        passed = [mark for mark in LOOKS_AGAIN_AT if before < mark <= training.progress]
-        if self.settings.shadow and (passed or any(map(training.reached, SHADOW_AT))):
+        passed = [mark for mark in (WRISTS_AT, *WRISTS_AGAIN_AT) if before < mark <= training.progress]
+        if self.settings.shadow and (passed or any(map(training.reached, self.settings.shadow_at))):
             training.instruments.find_shadow()
-        if LOOKS_AGAIN_AT[0] in passed:
+        if WRISTS_AT in passed:
             training.instruments.place_wrists(self)
-        elif passed and self.settings.wrist_again:
+        elif passed and self.settings.refine_wrists:
             training.instruments.replace_wrists(self)
 
     def finish(self, training: GaussianTraining) -> None:
         training.instruments.conclude(self)
-        if self.settings.rim:
+        if self.settings.extrapolate_tissue:
             scene = training.scene
-            scene.canonical = continue_tissue(scene.canonical, scene.recorded.cameras)
+            scene.canonical = extrapolate_tissue(scene.canonical, scene.recorded.cameras)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        rates = {
-            "shaft_tilt": 8e-3,
-            "shaft_shift": 8e-2,
-            "hinge_angle": 1e-2,
-            "hinge_depth": 8e-2,
-            "offsets": 6e-3,
-            "share": 6e-3,
-            "scale": 2e-4,
-        }
-        fall = floored_decay(progress)
-        return {name: rates[name.rsplit(".", 1)[-1]] * fall for name, _ in self.named_parameters()}
+        scale = self.settings.rate_scale * floored_decay(progress)
+        return {name: RATES[name.rsplit(".", 1)[-1]] * scale for name, _ in self.named_parameters()}
 
 
 def part_names(joints: tuple[str, ...]) -> tuple[str, ...]:

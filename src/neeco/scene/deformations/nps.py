@@ -3,7 +3,7 @@
 G' = C + F(gamma(mu), gamma(p)): an MLP of depth 12 and width 256 maps each canonical mean and the instrument state to
 changes of mean, rotation and scale. Where the paper is silent: an input skip at the middle layer, a zero-initialised
 head (the untrained scene is the canonical one), rotation added to the unit quaternion and scale to its logarithm, means
-detached and the network at rest for the first 7.5 % of the training (Deformable-3DGS: 3,000 of 40,000 iterations).
+detached and the network off for the first 7.5 % of the training (Deformable-3DGS: 3,000 of 40,000 iterations).
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
 from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import LabelledByMotion
 from neeco.scene.deformations.base import (
     UNPERTURBED,
+    LabelledByMotion,
     Perturbation,
     Posed,
     check_warm_up,
+    encode,
     floored_decay,
-    point_box,
+    robust_bounds,
     state_of,
 )
-from neeco.scene.encoding import encode
-from neeco.scene.swept import SweptVolume
+from neeco.scene.instruments import SweptVolume
 from neeco.scene.training_session import GaussianTraining
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about
@@ -47,8 +47,9 @@ class NPSSettings:
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
     `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
-    evaluation when no gradient is wanted. `warm_up`: share of the training over which the network rests; without it
-    the first steps, whose gradients all ask to fill a half-empty image, may throw the Gaussians out of sight for good.
+    evaluation without gradients. `warm_up`: share of the training over which the network is off; without it the first
+    steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight for good. `rate`:
+    learning rate at the start.
     `gate_mm` (None: off, as published): Gaussians farther than this from all that the instruments were recorded to
     sweep stay canonical without being evaluated.
     """
@@ -63,6 +64,7 @@ class NPSSettings:
     chunk: int = 65536
     warm_up: float = 0.075
     gate_mm: float | None = None
+    rate: float = 8e-4
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
@@ -141,7 +143,7 @@ class NPS(LabelledByMotion):
             low, high = vectors.min(0).values, vectors.max(0).values
             self.state_center = (low + high) / 2
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
-        self.mean_center, self.mean_halfwidth = point_box(means)
+        self.mean_center, self.mean_halfwidth = robust_bounds(means)
 
     def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
@@ -164,7 +166,7 @@ class NPS(LabelledByMotion):
         return (self._raw_state(state) - self.state_center) / self.state_halfwidth
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        if not self.instruments or self.resting:
+        if not self.instruments or self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
         change = self._change(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
         means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
@@ -206,4 +208,6 @@ class NPS(LabelledByMotion):
         return nn.functional.linear(features.float(), self.head.weight, self.head.bias)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        return dict.fromkeys((name for name, _ in self.named_parameters()), 8e-4 * floored_decay(progress))
+        return dict.fromkeys(
+            (name for name, _ in self.named_parameters()), self.settings.rate * floored_decay(progress)
+        )

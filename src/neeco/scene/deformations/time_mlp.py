@@ -6,14 +6,13 @@ and scale to the scale itself, that is after activation; normal noise on the tim
 tenth of the frame interval to none at half of the run. `synthetic` is the source's variant for D-NeRF: 6 octaves of
 time through a small network 13 -> 256 -> 30, and no noise.
 
-Where it departs from its source:
-- What the source counts in iterations of its 40,000 are shares of the run here, which is shorter: rest over the first
-  3,000, density control until 15,000, noise until 20,000, and the learning rate's whole fall from 8e-4 to 1.6e-6.
-- The head starts at zero, so that waking the network changes nothing. The source starts it at small random numbers.
-- The source computes in the units of its scenes, whose half extent is about 1. Here the points' half extent is the
-  unit, for what goes in and for the changes of mean and scale.
-- A scale that its change would make negative is taken as positive; in the source, too, the covariance squares it.
-- The number of Gaussians has a ceiling (`tissue_budget`).
+Departures from the source:
+- Its iterations, of 40,000, are shares of the run, which is shorter here: warm-up until 3,000, density control until
+  15,000, noise until 20,000, and the fall of the learning rate from 8e-4 to 1.6e-6.
+- The head starts at zero, so that the end of the warm-up changes nothing. The source starts it at random.
+- The points' half extent is the unit of the input and of the changes of mean and scale; it is about 1 in the source.
+- The absolute value is taken of negative scales; in the source, too, the covariance squares them.
+- The number of Gaussians is limited (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
@@ -29,14 +28,20 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.raster.devices import tf32_products
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations._moving import LabelledByMotion
-from neeco.scene.deformations._times import RecordedTimes
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation, Posed, check_warm_up, log_linear, point_box
-from neeco.scene.encoding import encode
+from neeco.scene.deformations.base import (
+    UNPERTURBED,
+    LabelledByMotion,
+    Perturbation,
+    Posed,
+    RecordedTimes,
+    check_warm_up,
+    encode,
+    log_linear,
+    robust_bounds,
+)
 from neeco.scene.method import PLAIN_TRAINING
 
 DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
-FIRST_NOISE, NOISE_SHARE = 0.1, 0.5  # of the frame interval; share of the run at which none is left
 
 
 def octaves(values: Tensor, count: int) -> Tensor:
@@ -47,13 +52,19 @@ def octaves(values: Tensor, count: int) -> Tensor:
 @dataclass(frozen=True)
 class TimeMLPSettings:
     """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
-    `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network rests."""
+    `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;
+    `time_noise` at the start, in frame intervals, falling to none at the share `time_noise_stop` of the training;
+    `rate` and `final_rate`: learning rates at its ends."""
 
     width: int = 256
     L_mean: int = 10
     L_time: int | None = None
     synthetic: bool = False
     warm_up: float = 0.075
+    time_noise: float = 0.1
+    time_noise_stop: float = 0.5
+    rate: float = 8e-4
+    final_rate: float = 1.6e-6
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
@@ -100,26 +111,27 @@ class TimeMLP(LabelledByMotion):
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Time from 0 to 1 over the recording, mu from -1 to 1 over the points."""
         self.times.fit(states)
-        self.mean_center, self.mean_halfwidth = point_box(means)
+        self.mean_center, self.mean_halfwidth = robust_bounds(means)
 
-    def disturbed(
+    def perturb(
         self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
     ) -> Perturbation:
-        noise = 0.0 if self.settings.synthetic else FIRST_NOISE * max(0.0, 1 - progress / NOISE_SHARE)
+        left = max(0.0, 1 - progress / self.settings.time_noise_stop)
+        noise = 0.0 if self.settings.synthetic else self.settings.time_noise * left
         return NoisyTime(perturbation.state_noise, noise) if noise else perturbation
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         scales = canonical.log_scales.exp()
-        if self.resting:
+        if self.warming_up:
             return Posed(canonical.means, canonical.quats, scales)
-        places = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
-        change = self.network(places, self.encoded_time(state, perturbation))
+        positions = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
+        change = self.network(positions, self.encoded_time(state, perturbation))
         means = canonical.means + self.mean_halfwidth * change[:, :3]
         quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
         return Posed(means, quats, (scales + self.mean_halfwidth * change[:, 7:]).abs())
 
     def time_of(self, state: State, perturbation: Perturbation) -> Tensor:
-        """The time of `state`, a scalar, 0 and 1 at the ends of the recording; disturbed where training asks for it."""
+        """The time of `state`, a scalar, 0 and 1 at the ends of the recording; perturbed where training asks for it."""
         time = self.times.share(state)
         if not isinstance(perturbation, NoisyTime):
             return time
@@ -132,11 +144,11 @@ class TimeMLP(LabelledByMotion):
             encoded = encoded + perturbation.state_noise * torch.randn_like(encoded)
         return self.time_net(encoded) if self.settings.synthetic else encoded
 
-    def network(self, places: Tensor, encoded_time: Tensor) -> Tensor:
-        """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
-        encoded = octaves(places, self.settings.L_mean)
+    def network(self, positions: Tensor, encoded_time: Tensor) -> Tensor:
+        """F: positions [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
+        encoded = octaves(positions, self.settings.L_mean)
         features = encoded
-        with tf32_products(places.device):
+        with tf32_products(positions.device):
             for index, layer in enumerate(self.layers):
                 assert isinstance(layer, nn.Linear)
                 if index == SKIP + 1:
@@ -150,4 +162,5 @@ class TimeMLP(LabelledByMotion):
         return self.head(features)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        return dict.fromkeys((name for name, _ in self.named_parameters()), log_linear(8e-4, 1.6e-6, progress))
+        rate = log_linear(self.settings.rate, self.settings.final_rate, progress)
+        return dict.fromkeys((name for name, _ in self.named_parameters()), rate)

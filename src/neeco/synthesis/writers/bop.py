@@ -80,7 +80,8 @@ def _masks(
         visible = np.isin(parts, ids[k])
         whole = visible | (bits >> place & 1 > 0)
         for kind, mask in (("mask", whole), ("mask_visib", visible)):
-            write_labels(folder / kind / f"{name}_{place:06d}.png", _binary(mask))
+            pixels = torch.from_numpy(mask.astype(np.uint8) * 255)
+            write_labels(folder / kind / f"{name}_{place:06d}.png", pixels)
         infos.append(
             {
                 "bbox_obj": list(bounding_box(whole)) if whole.any() else NOWHERE,
@@ -92,7 +93,3 @@ def _masks(
             }
         )
     return infos
-
-
-def _binary(mask: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(mask.astype(np.uint8) * 255)

@@ -26,13 +26,13 @@ from neeco.labels.drawing import LayeredDrawing, to_numpy
 
 Record = dict[str, Any]
 
-DEPTH_MM_PER_COUNT = 0.05
+DEPTH_MM_PER_COUNT = 0.05  # of 16 bits, 0 = none; saturates at 3276 mm
 SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
 PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
-MAX_INSTRUMENTS = 8  # that a pixel of `silhouettes` has bits for
+MAX_INSTRUMENTS = 8  # in `silhouettes`, whose bit k is set where instrument k would be seen if nothing else were there
 FOLDERS = (*PIXELS, RECORDS)
 PUBLIC = {  # what every line of states.jsonl holds, among others
     "index": int,
@@ -45,17 +45,12 @@ PUBLIC = {  # what every line of states.jsonl holds, among others
     "intrinsics": {"fl_x": float, "fl_y": float, "cx": float, "cy": float},
     "labels": [{"name": str, "area": int, "keypoints": {str: [float]}, "camera_from_instrument": [[float]]}],
 }
-VALIDATION_EVERY = 5  # every fifth image is for validation
+VALIDATION_EVERY = 5  # every fifth image is for validation; by the index alone, so a data set can grow
 
 
 def stem(index: int) -> str:
     """File stem of image `index`."""
     return f"{index:06d}"
-
-
-def split_of(index: int) -> str:
-    """Which split an image belongs to; it depends on nothing but the index, so a data set can grow."""
-    return "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train"
 
 
 def write_sample(
@@ -69,18 +64,21 @@ def write_sample(
     """Write one image with all that its pixels say, then its record, to which `facts` are added; returns the record.
     Raises NeecoError."""
     name = f"{stem(index)}.png"
+    silhouettes = np.zeros(drawing.depth.shape, np.uint8)
+    for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
+        silhouettes |= layer.mask.astype(np.uint8) << k
     write_image(root / "images" / name, drawing.image)
     write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
     write_labels(root / "soft" / name, (drawing.share / SHARE_PER_COUNT).round().to(torch.uint8))
     write_labels(root / "ignore" / name, drawing.ignored.to(torch.uint8) * IGNORED)
     write_labels(root / "parts" / name, drawing.parts)
-    write_depth(root / "depth" / name, drawing.depth)
-    write_labels(root / "silhouettes" / name, silhouettes(drawing))
+    write_png(root / "depth" / name, np.clip(np.round(drawing.depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16))
+    write_labels(root / "silhouettes" / name, torch.from_numpy(silhouettes))
     camera = drawing.camera
     record = {
         "index": index,
         "image": f"images/{name}",
-        "split": split_of(index),
+        "split": "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train",
         "width": camera.width,
         "height": camera.height,
         **state_to_json(drawing.state),
@@ -94,14 +92,6 @@ def write_sample(
     }
     _write_record(root, record)
     return record
-
-
-def silhouettes(drawing: LayeredDrawing) -> torch.Tensor:
-    """uint8 [H, W]: bit k is set where instrument k of the labels would be seen if nothing else were there."""
-    bits = np.zeros(drawing.depth.shape, np.uint8)
-    for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
-        bits |= layer.mask.astype(np.uint8) << k
-    return torch.from_numpy(bits)
 
 
 def write_skipped(
@@ -145,10 +135,6 @@ def load_record(root: Path, index: int) -> Record | None:
 def link(source: Path, target: Path) -> None:
     """Make `target` the same file as `source`: a hard link, or a copy where the file system has none. Raises
     NeecoError."""
-
-    def copy(temporary: Path) -> None:
-        temporary.write_bytes(source.read_bytes())
-
     with contextlib.suppress(FileNotFoundError):
         if os.path.samefile(source, target):
             return
@@ -157,17 +143,12 @@ def link(source: Path, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.link(source, target)
     except OSError:
-        write_atomically(target, copy)
+        write_atomically(target, lambda temporary: temporary.write_bytes(source.read_bytes()))
 
 
 def files_of(index: int) -> list[str]:
     """The files of image `index` beside its record, relative to the data set."""
     return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
-
-
-def write_depth(path: Path, depth: np.ndarray) -> None:
-    """Write depth [H, W] mm as a 16-bit grey PNG of 0.05 mm per count, 0 = none; beyond 3276 mm it saturates."""
-    write_png(path, np.clip(np.round(depth / DEPTH_MM_PER_COUNT), 0, 65535).astype(np.uint16))
 
 
 def write_states(root: Path, records: list[Record]) -> None:

@@ -2,115 +2,160 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neeco.errors import NeecoError
 from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
-from neeco.scene.hinges import PART_LOGITS, Hinged, Hinges
-from neeco.scene.recorded import Recorded
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges, SweptVolume
 from neeco.scene.scene import Scene
-from neeco.scene.training_session import Report
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import RefineConfig, TrainConfig, method_defaults
-from neeco.training.instruments.carving import MOVES, CarvedShape, carve, posed_views, score_points
-from neeco.training.instruments.evidence import Evidence, gather_evidence
-from neeco.training.instruments.hinge_search import balanced_depth, dominant_angle, search_hinge
+from neeco.training.config import RefineConfig, SearchConfig, TrainConfig, method_defaults
+from neeco.training.instruments.evidence import (
+    CarvedShape,
+    Evidence,
+    camera_from_instrument,
+    carve,
+    center_line,
+    gather_evidence,
+    posed_views,
+    score_points,
+)
 from neeco.training.session import GaussianSession, new_session
 
-TISSUE_STEPS = 500  # of the short tissue-only fit that makes the evidence
-LONGER_STEPS = 1500  # of the one with density control, where the sparse points alone explain too little
-UNEXPLAINED = 0.25  # mean evidence that is too much for instruments alone
-SEEDS = 3000  # Gaussians per instrument at the start
-AROUND_FRAME = 0.05  # of the distance to the tissue: how far about an untrusted frame seeds are strewn
-BODY_LEAN = 2.0  # part logit given to the side of the hinge a seed lies on
+MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
+SEED_SPREAD = (
+    0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame, without a shape
+)
+BODY_LOGIT = 2.0  # initial part logit of seeds on the body's side of the hinge
+GAINS = ((0.5, -0.5), (1.0, 0.0))  # part angle per reading: two jaws share the opening, or one takes it all
+SMALL_GAIN = 0.3  # a smaller turn, which tolerates rough evidence
+MIN_READING_RANGE = 0.05  # rad: the hinge of a joint that moves less is not searched
+STICK_POINTS = 16
 
 
-def find_instruments(session: GaussianSession, hinged: Hinged) -> None:
+def find_instruments(session: GaussianSession, hinged: HingedInstruments) -> None:
     """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
     hinges.
 
-    `hinged` is the scene's deformation, known to have hinges. Raises NeecoError when an instrument leaves no evidence
-    in its own frame: its poses do not match the images.
+    `hinged` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame: its
+    poses do not match the images.
     """
-    scene, config, report = session.scene, session.config, session.report
+    scene, report, search = session.scene, session.report, session.config.search
     if not scene.instruments:
         return
     report("looking for the instruments: fitting the tissue alone")
-    evidence = tissue_evidence(scene, session.views, config)
-    generator = torch.Generator().manual_seed(config.seed)
+    evidence = tissue_evidence(scene, session.views, session.config)
+    generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
-        shape = carve(evidence, instrument.name, generator, SEEDS)
+        shape = carve(evidence, instrument.name, generator, search)
         if shape is None:
             raise NeecoError(
                 f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
                 "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
             )
-        if not judge_evidence(scene, evidence, instrument.name, shape, report):
-            shape = shape_around_frame(shape, evidence.distance, generator)
+        if not moves_with_pose(session, evidence, instrument.name, shape):
+            shape = shape_around_frame(shape, evidence.distance, search.seeds, generator)
         hinges = hinged.hinges_of(index)
-        start_hinges(hinges, evidence, instrument.name, shape, report)
+        start_hinges(session, hinges, evidence, instrument.name, shape)
         seeds = shape.seeds.to(scene.center.device)
         logits = seed_logits(hinges, seeds, hinged.logit_count, generator)
-        seeds = at_middle(hinges, seeds, logits)
-        body = seed_gaussians(seeds, seeds.new_full((SEEDS, 3), 0.4), seeds.new_full((SEEDS,), 0.4 * shape.radius))
+        seeds = unbend_seeds(hinges, seeds, logits)
+        count = len(seeds)
+        body = seed_gaussians(seeds, seeds.new_full((count, 3), 0.4), seeds.new_full((count,), 0.4 * shape.radius))
         bodies.append(body.with_extras(**{PART_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
 
-def judge_evidence(scene: Scene, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> bool:
-    """Does the evidence move with the instrument? Exchange the poses among frames: it must get worse.
+def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
+    """Bound `volume`, outside which the paper's network is not evaluated, by what the carved instruments sweep in the
+    training frames.
 
-    Where it does not (an instrument that hardly moves, say), carving cannot tell the instrument from what stands still.
+    Where carving cannot be trusted the volume stays unbounded: slow, but never wrong. Raises NeecoError when hardly any
+    Gaussian lies inside: the network moves tissue onto the instrument, so the volume has to reach the tissue.
     """
-    views = posed_views(evidence, name)
+    scene, views, config, report = session.scene, session.views, session.config, session.report
+    report("looking for the instruments, to bound where the network is evaluated")
+    evidence = tissue_evidence(scene, views, config)
+    generator = torch.Generator().manual_seed(config.seed)
+    swept = []
+    for instrument in scene.instruments:
+        shape = carve(evidence, instrument.name, generator, config.search)
+        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
+            report(f"warning: {instrument.name}: its shape cannot be carved; the network is evaluated everywhere")
+            return
+        recorded = [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
+        poses = torch.stack(recorded).to(shape.seeds)  # [F, 4, 4]
+        swept.append((shape.seeds @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3))
+    volume.cover(torch.cat(swept).to(scene.canonical.means))
+    inside = volume.contains(scene.canonical.means)
+    if int(inside.sum()) < MIN_SHARE_INSIDE * len(inside):
+        raise NeecoError(
+            f"deformation.gate_mm: only {int(inside.sum())} of {len(inside)} Gaussians lie within {volume.margin_mm} "
+            "mm of the instruments' path; give a greater distance"
+        )
+    report(f"the network is evaluated on {int(inside.sum())} of {len(inside)} Gaussians")
+
+
+def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
+    """Whether the evidence moves with the instrument: with poses exchanged among frames it must be weaker.
+
+    Where it is not (an instrument that hardly moves, say), carving cannot separate the instrument from static parts of
+    the scene.
+    """
+    search = session.config.search
+    views = posed_views(evidence, name, search)
     own, _ = score_points(evidence, views.own, shape.seeds)
     other = views.exchanged_scores(shape.seeds)
-    moves = float(own.mean()) > MOVES * float(other.mean())
-    scene.diagnostics.setdefault("instruments", {})[name] = {
+    moves = float(own.mean()) > search.motion_ratio * float(other.mean())
+    session.scene.diagnostics.setdefault("instruments", {})[name] = {
         "evidence": round(float(own.mean()), 4),
         "evidence_of_other_poses": round(float(other.mean()), 4),
         "moves_with_its_pose": moves,
     }
     if not moves:
-        report(
-            f"warning: {name}: what the images show hardly depends on its recorded pose; its shape is sought about the "
+        session.report(
+            f"warning: {name}: the images hardly depend on its recorded pose; its shape is searched around the "
             "tracked frame, and its labels may be wrong (record more motion, or check that poses are registered)"
         )
     return moves
 
 
-def shape_around_frame(shape: CarvedShape, distance: float, generator: torch.Generator) -> CarvedShape:
-    """What to start from when carving cannot be trusted: seeds about the tracked frame, which is on the body."""
-    spread = AROUND_FRAME * distance
-    seeds = (torch.randn(SEEDS, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
+def shape_around_frame(shape: CarvedShape, distance: float, count: int, generator: torch.Generator) -> CarvedShape:
+    """The initial shape where carving cannot be trusted: `count` seeds around the tracked frame, which is on the
+    body."""
+    spread = SEED_SPREAD * distance
+    seeds = (torch.randn(count, 3, generator=generator, device=generator.device) * spread).to(shape.seeds)
     frame = torch.eye(4, device=seeds.device)
     return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
 def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig) -> Evidence:
-    """Fit a copy of the tissue with nothing moving; what is left over is the evidence.
+    """Fit a copy of the tissue without motion; the residual is the evidence.
 
-    A few hundred steps of the sparse points do on tissue full of texture. Where much is left over, the points are too
-    few, and a longer fit may add Gaussians.
+    A few hundred steps suffice on textured tissue with enough sparse points. Where the residual is large, a longer fit
+    may add Gaussians.
     """
-    evidence = _evidence_after(TISSUE_STEPS, 10**9, scene, views, config)
-    if float(evidence.hits.mean()) <= UNEXPLAINED:
+    evidence = _evidence_after(config.search.tissue_steps, 10**9, scene, views, config)
+    if float(evidence.hits.mean()) <= config.search.max_evidence:
         return evidence
-    return _evidence_after(LONGER_STEPS, 200, scene, views, config)
+    return _evidence_after(config.search.long_tissue_steps, 200, scene, views, config)
 
 
 def _evidence_after(
     steps: int, density_start: int, scene: Scene, views: TrainingViews, config: TrainConfig
 ) -> Evidence:
     """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
-    tissue = scene.canonical.map(lambda tensor: tensor.clone())
-    alone = Scene(Static.method, tissue, Static(), (), Recorded(), scene.center)
-    alone.background = scene.background  # or what lies behind transparent images would be evidence
+    canonical = scene.canonical.map(lambda tensor: tensor.clone())
+    tissue = Scene(Static.method, canonical, Static(), (), Recorded(), scene.center)
+    tissue.background = scene.background  # or the background of transparent images would be evidence
     short = replace(
         config,
         iterations=steps,
@@ -120,27 +165,27 @@ def _evidence_after(
         density_start=density_start,
         density_stop=0.8,
     )
-    session = new_session(alone, views, short)
+    session = new_session(tissue, views, short)
     session.start()
     while session.iteration < steps:
         session.step()
-    alone.requires_grad_(False)
-    return gather_evidence(alone, views)
+    tissue.requires_grad_(False)
+    return gather_evidence(tissue, views, config.search)
 
 
-def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape, report: Report) -> None:
+def start_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape) -> None:
     """Put the shaft where it was carved and each joint at the best hypothesis of the search."""
     hinges.base.copy_(shape.instrument_from_shaft)
     hinges.extent.copy_(torch.tensor([shape.near, shape.tip]))
     for index, joint in enumerate(hinges.joint_names):
-        guesses = search_hinge(evidence, name, joint, shape)
-        if not guesses:
-            report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
+        found = search_hinge(evidence, name, joint, shape, session.config.search)
+        if found is None:
+            session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
             continue
         with torch.no_grad():
-            hinges.hinge_angle[index] = dominant_angle(guesses)
-            hinges.hinge_depth[index] = balanced_depth(guesses)
-            hinges.share[index] = 1.0 if guesses[0].gains[1] == 0 else 0.5
+            hinges.hinge_angle[index] = found.angle
+            hinges.hinge_depth[index] = found.depth
+            hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
             readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
             hinges.middle[index] = sum(readings) / len(readings)
             hinges.closed[index] = min(readings)
@@ -151,9 +196,9 @@ def start_hinges(hinges: Hinges, evidence: Evidence, name: str, shape: CarvedSha
 
 
 @torch.no_grad()
-def at_middle(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
-    """Seeds [M, 3] mm, carved with the joints at their offsets, as they are where every part's offset is zero, which
-    they are set to: there a change of hinge or gains moves nothing."""
+def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
+    """Seeds [M, 3] mm, carved with the joints at their offsets, turned to the pose of zero offsets, to which the
+    hinges are set: there a change of hinge or gains moves nothing."""
     weights = torch.softmax(logits[:, : hinges.part_count], -1)
     middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.joint_names)}
     turned = hinges.bend(seeds, weights, middle)
@@ -169,7 +214,109 @@ def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Ge
     with torch.no_grad():
         along = hinges.along_shaft(seeds)
         beyond = along > hinges.hinge_depth[0]
-        logits[:, 0] += torch.where(beyond, 0.0, BODY_LEAN)
+        logits[:, 0] += torch.where(beyond, 0.0, BODY_LOGIT)
         side = torch.randint(1, hinges.part_count, (len(seeds),), generator=generator).to(seeds.device)
-        lean = nn.functional.one_hot(side, columns) * (BODY_LEAN / 2)
+        lean = nn.functional.one_hot(side, columns) * (BODY_LOGIT / 2)
         return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))
+
+
+@dataclass(frozen=True)
+class HingeScores:
+    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all GAINS."""
+
+    angles: list[float]
+    depths: list[float]
+    score: np.ndarray  # [D, GAINS, A] mean evidence on the turned sticks, in [0, 1]
+    over_rigid: np.ndarray  # [D, GAINS, A] score less that of unturned sticks, times the share of the length they cover
+
+    @property
+    def depth(self) -> float:
+        """Half way between the best by score and the best over rigid sticks, mm.
+
+        The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
+        """
+        best = [np.unravel_index(score.argmax(), score.shape)[0] for score in (self.score, self.over_rigid)]
+        return (self.depths[best[0]] + self.depths[best[1]]) / 2
+
+    @property
+    def angle(self) -> float:
+        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its
+        peak alone."""
+        best = self.score.max((0, 1)).tolist()
+        wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
+        return (math.atan2(wave.imag, wave.real) / 2) % math.pi
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Those of the best score."""
+        return GAINS[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
+
+
+def search_hinge(
+    evidence: Evidence, name: str, joint: str, shape: CarvedShape, search: SearchConfig
+) -> HingeScores | None:
+    """Scores of all hinges on a grid, by a search over stick figures; None when the reading hardly varies.
+
+    A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
+    pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
+    all where the reading is large, and leaves tissue visible between them.
+    """
+    recorded = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
+    readings = torch.tensor(recorded, dtype=torch.float32, device=evidence.device)
+    opening = readings - readings.min()
+    if float(opening.max()) < MIN_READING_RANGE:
+        return None
+    closed = evidence.subset(torch.nonzero(readings <= readings.quantile(0.35))[:, 0])
+    line = center_line(closed, name, shape, search)
+    if len(line) < 2:
+        line = shape.center_line
+    camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
+    angles = torch.arange(search.hinge_angles, device=evidence.device) * (math.pi / search.hinge_angles)
+    length = shape.tip - shape.near
+    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, search.hinge_depths).tolist()
+    score, over_rigid = [], []
+    for depth in depths:
+        stick = _stick(line, depth, shape.tip)
+        scores = {
+            gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, gain * opening, opening)
+            for gain in {0.0, SMALL_GAIN, -SMALL_GAIN, *GAINS[0], *GAINS[1]}
+        }
+        turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in GAINS])
+        score.append(torch.maximum(turned, (scores[SMALL_GAIN] + scores[-SMALL_GAIN]) / 2))
+        over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
+    return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
+
+
+def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
+    """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the
+    tip."""
+    known = line.cpu().numpy()
+    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICK_POINTS)
+    across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
+    return torch.from_numpy(np.stack([*across, along], -1)).to(line)
+
+
+def _stick_scores(
+    evidence: Evidence,
+    camera_from_shaft: Tensor,
+    stick: Tensor,
+    depth: float,
+    angles: Tensor,
+    turns: Tensor,
+    weight: Tensor,
+) -> Tensor:
+    """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by
+    `weight` [F]."""
+    axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
+    arm = (stick - stick.new_tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
+    cosine, sine = turns.cos()[None, :, None, None], turns.sin()[None, :, None, None]
+    along = (arm * axis).sum(-1, keepdim=True) * axis
+    across = torch.linalg.cross(axis.expand(-1, 1, arm.shape[2], 3), arm.expand(len(angles), 1, -1, 3))
+    turned = arm * cosine + across * sine + along * (1 - cosine)  # [A, F, Q, 3]
+    turned[..., 2] += depth
+    flat = turned.permute(1, 0, 2, 3).reshape(len(turns), -1, 3)  # [F, A * Q, 3]
+    points = flat @ camera_from_shaft[:, :3, :3].transpose(1, 2) + camera_from_shaft[:, None, :3, 3]
+    hits, inside = evidence.look_up_camera(points)
+    weights = (inside * weight[:, None]).reshape(len(turns), len(angles), -1)
+    total = (hits.reshape(weights.shape) * weights).sum((0, 2))
+    return total / weights.sum((0, 2)).clamp_min(1e-6)

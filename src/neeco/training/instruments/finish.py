@@ -1,4 +1,4 @@
-"""After learning: how long each instrument is, and whether its joints were really found."""
+"""After learning: how long each instrument is, and whether its joints were found."""
 
 from __future__ import annotations
 
@@ -8,27 +8,35 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neeco.capture.model import InstrumentState, State
+from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.raster import rasterize
+from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.hinges import Hinged
-from neeco.training.instruments.border import color_boundary
-from neeco.training.instruments.extend import extend_shaft
-from neeco.training.instruments.hidden import drop_hidden
-from neeco.training.instruments.solid import ENOUGH, measure_tips, solid, solid_extent
+from neeco.scene.drawable import Recorded
+from neeco.scene.instruments import HingedInstruments, Hinges
+from neeco.scene.scene import Scene
+from neeco.scene.visibility import visible_pixels
+from neeco.training.instruments.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
 from neeco.training.session import GaussianSession
 
-FOUND = 0.35  # share of the moving parts' error that the readings must explain: .5-.9 where found, .27 half-way off
+MIN_VISIBLE_SHARE = 0.2  # of the pixels that a Gaussian takes up of its instrument rendered alone
+MIN_PIXELS_ALONE = 0.05  # px taken up there, in all frames together: below, its own instrument hides it
+OCCLUSION_FRAMES = 64  # looked at, evenly spaced
+WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
+END_IN_VIEW = 0.3  # share above which the instrument's rear end is its real end
+SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
+MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
+TIP_QUANTILE = 0.97  # of the distances of a part's solid Gaussians from the hinge: farther ones are its tip
 
 
 @torch.no_grad()
-def conclude(session: GaussianSession, hinged: Hinged) -> None:
-    """Drop what is hidden of instruments, set the extent of each, prolong its shaft and write the joints' verdicts into
-    `scene.diagnostics`.
+def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
+    """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
+    into `scene.diagnostics`.
 
-    Says so when hardly anything was learned of an instrument: nothing else would tell of labels that stay empty.
+    Reports an instrument of which hardly anything was learned: its labels would stay empty without a message.
     """
-    session.scene.canonical = drop_hidden(session.scene)
+    session.scene.canonical = drop_occluded(session.scene)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         hinges = hinged.hinges_of(index)
@@ -38,9 +46,9 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
         for joint, name in enumerate(hinges.joint_names):
             verdicts[f"{instrument.name}.{name}"] = _verdict(session, hinged, index, joint)
         scene = session.scene
-        count = int(solid(scene.canonical, index).sum())
+        count = int(solid_gaussians(scene.canonical, index).sum())
         scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count
-        if count < ENOUGH:
+        if count < MIN_SOLID:
             session.report(
                 f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
                 "labels will be empty; the images show it too little, or another that moves alike has its place"
@@ -56,12 +64,11 @@ def conclude(session: GaussianSession, hinged: Hinged) -> None:
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
 
 
-def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -> dict[str, Any]:
-    """Was the joint found? Judged on the training frames of greatest opening: does its reading explain the moving
-    parts' image?
+def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, joint: int) -> dict[str, Any]:
+    """Whether the joint was found: whether its reading explains the image of the moving parts, in the training frames
+    of its extreme readings.
 
-    `explained` = 1 - error(reading) / error(reading replaced by the mean), over pixels that a moving part covers in
-    either drawing.
+    `explained` = 1 - error(reading) / error(mean reading), over pixels that a moving part covers in either rendering.
     """
     scene = session.scene
     hinges, instrument = hinged.hinges_of(index), scene.instruments[index]
@@ -74,19 +81,19 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
     for frame_index in extremes:
         state, camera = session.corrected(frame_index)
         target = session.views.target(frame_index)
-        drawings = [
+        renderings = [
             rasterize(scene.at(variant), camera, channels=moving)
             for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
         ]
-        covered = torch.maximum(*(d.channels[..., 0] for d in drawings if d.channels is not None)) > 0.3
+        covered = torch.maximum(*(r.channels[..., 0] for r in renderings if r.channels is not None)) > 0.3
         mask = session.views.mask(frame_index)
         if mask is not None:
             covered &= mask
-        errors = [float((d.color - target).abs().mean(-1)[covered].sum()) for d in drawings]
+        errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
         given, middle = given + errors[0], middle + errors[1]
     pivot, axis = hinges.hinge(joint)
     explained = 1 - given / middle if middle > 0 else 0.0
-    found = bool(explained > FOUND and math.isfinite(explained))
+    found = bool(explained > session.config.search.min_joint_explained and math.isfinite(explained))
     return {
         "found": found,
         "explained": round(explained, 4),
@@ -103,7 +110,7 @@ def _verdict(session: GaussianSession, hinged: Hinged, index: int, joint: int) -
     }
 
 
-def _moving_weight(canonical: CanonicalGaussians, hinged: Hinged, index: int, joint: int) -> Tensor:
+def _moving_weight(canonical: CanonicalGaussians, hinged: HingedInstruments, index: int, joint: int) -> Tensor:
     """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
     weight = canonical.means.new_zeros(len(canonical), 1)
     weights = hinged.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
@@ -115,3 +122,104 @@ def _with_reading(state: State, instrument: str, joint: str, reading: float) -> 
     given = state.instruments[instrument]
     changed = InstrumentState(given.pose, {**given.joints, joint: reading})
     return State({**state.instruments, instrument: changed}, state.time)
+
+
+def drop_occluded(scene: Scene) -> CanonicalGaussians:
+    """The canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
+
+    No image constrained them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,
+    they would widen the instrument.
+    """
+    canonical, recorded = scene.canonical, scene.recorded
+    instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
+    visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
+    for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
+        camera = recorded.cameras[index]
+        with torch.no_grad():
+            posed = scene.at(recorded.states[index])
+        visible += visible_pixels(posed, camera)
+        for own in instruments:
+            alone[own] += visible_pixels(posed.select(own), camera)
+    stays = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
+    counts = tuple(int(stays[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
+    return canonical.map(lambda tensor: tensor[stays], counts)
+
+
+@torch.no_grad()
+def extend_shaft(
+    canonical: CanonicalGaussians, body: int, name: str, hinges: Hinges, recorded: Recorded, length: float
+) -> CanonicalGaussians:
+    """Canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
+    unchanged when its real end is in view.
+
+    The camera sees a shaft only up to the image's border; in a new state more of it comes into view. A shaft is the
+    same all along, so the rearmost well-seen slab is repeated towards the rear.
+    """
+    rows = canonical.body(body)
+    along = hinges.along_shaft(canonical.means[rows])  # [M]
+    solid = torch.sigmoid(canonical.opacity_logits[rows]) > SOLID_OPACITY
+    if not hinges.joint_names or int(solid.sum()) < 50:
+        return canonical
+    rear, front = float(along[solid].quantile(0.01)), float(hinges.wrist_start)
+    if not rear < front:
+        return canonical
+    device = canonical.means.device
+    positions = torch.linspace(rear, front, 40, device=device)
+    seen = shaft_coverage(positions, name, hinges, recorded)
+    if float(seen[0]) > END_IN_VIEW or not bool((seen >= WELL_SEEN).any()):
+        return canonical
+    start = float(positions[seen >= WELL_SEEN][0])
+    slab = SLAB_RADII * _median_radius(canonical, rows, hinges, solid)
+    copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
+    if start + slab > front or len(copied) < 10:
+        return canonical
+    seen_part = torch.nonzero(along >= start)[:, 0]
+    repeats = math.ceil(length / slab)
+    index = torch.cat([seen_part, copied.repeat(repeats)]) + rows.start
+    shift = torch.zeros(len(index), device=device)
+    shift[len(seen_part) :] = -slab * torch.arange(1, repeats + 1, device=device).repeat_interleave(len(copied)).float()
+    whole = torch.arange(len(canonical), device=device)
+    whole = torch.cat([whole[: rows.start], index, whole[rows.stop :]])
+    counts = list(canonical.counts)
+    counts[body] = len(index)
+    extended = canonical.map(lambda tensor: tensor[whole].contiguous(), tuple(counts))
+    _, direction = hinges.shaft()
+    extended.means[extended.body(body)] += shift[:, None] * direction
+    return extended
+
+
+def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recorded) -> Tensor:
+    """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
+    origin, direction = hinges.shaft()
+    points = origin + positions[:, None] * direction  # [Q, 3]
+    counts = torch.zeros_like(positions)
+    for state, camera in zip(recorded.states, recorded.cameras, strict=True):
+        pose = state.instruments[name].pose.to(points)
+        counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
+    return counts / max(1, len(recorded.states))
+
+
+def _median_radius(canonical: CanonicalGaussians, rows: slice, hinges: Hinges, solid: Tensor) -> float:
+    """Median distance mm of solid Gaussians behind the wrist from the axis."""
+    origin, direction = hinges.shaft()
+    arm = canonical.means[rows][solid] - origin
+    across = arm - (arm @ direction)[:, None] * direction
+    behind = (arm @ direction) < hinges.wrist_start
+    return float((across[behind] if bool(behind.any()) else across).norm(dim=1).median())
+
+
+def measure_tips(canonical: CanonicalGaussians, index: int, hinges: Hinges, weights: Tensor) -> None:
+    """Set the tips of every joint's parts to where their solid Gaussians lie farthest from the hinge; leave them
+    unknown where there are too few. weights [M, part_count]."""
+    points, solid = canonical.means[canonical.body(index + 1)], solid_gaussians(canonical, index)
+    shares = hinges.parts(points, weights)
+    for joint in range(len(hinges.joint_names)):
+        pivot, _ = hinges.hinge(joint)
+        found = torch.full_like(hinges.tips[joint], torch.nan)
+        for side, part in enumerate(hinges.left_right_order(joint).tolist()):
+            of_part = points[solid & (shares[:, 2 + 2 * joint + side] > MIN_PART_SHARE)]
+            if len(of_part) < MIN_SOLID:
+                continue
+            away = (of_part - pivot).norm(dim=1)
+            found[part] = of_part[away >= away.quantile(TIP_QUANTILE)].mean(0)
+        hinges.tips[joint] = found

@@ -1,0 +1,115 @@
+"""How far an ingested capture can be trusted, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from neeco.capture.model import Capture
+from neeco.ingest.pipeline import IngestResult
+
+# Limits above which the page begins to doubt: conventions, not measurements.
+POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5
+SEVERE = 3.0  # times the limit
+FEW_TRAIN, FEW_POINTS = 20, 100
+USABLE = ("not among the", "beside an unseen frame")  # how reasons begin that do not speak against a frame
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """headline: one sentence; doubts: why it is not better, one sentence each."""
+
+    level: Literal["good", "careful", "bad"]
+    headline: str
+    doubts: tuple[str, ...]
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
+def assess_ingest(result: IngestResult, capture: Capture) -> Assessment:
+    """Judge a finished ingest by its own numbers; nothing here knows the truth."""
+    severe: list[str] = []
+    doubts: list[str] = []
+    for value, limit, sentence in _measured(result, capture):
+        if value > limit:
+            (severe if value > SEVERE * limit else doubts).append(sentence)
+    train = len(capture.split("train"))
+    if train < FEW_TRAIN:
+        severe.append(f"Only {train} frames are left to train on.")
+    unusable = sum(not why.startswith(USABLE) for _, why in result.dropped)
+    if unusable > 0.5 * result.video_frames:
+        doubts.append(f"{unusable} of {result.video_frames} video frames were dropped as unusable.")
+    if result.points < FEW_POINTS:
+        doubts.append(f"Only {result.points} tissue points were found.")
+    doubts += [
+        f"Clock {name} was neither given nor found: {clock.source}."
+        for name, clock in result.clocks.items()
+        if not np.isfinite(clock.sd)
+    ]
+    if not capture.instruments:
+        severe.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
+        return Assessment("bad", "Cameras only: there is no instrument to pose.", (*severe, *doubts))
+    if not capture.registered:
+        severe.append("The instrument's poses are not in the cameras' frame, so it cannot be drawn where it was.")
+        headline = "Cameras and instrument do not meet: instrument poses are in a frame of their own."
+        return Assessment("bad", headline, (*severe, *doubts))
+    if severe:
+        return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *doubts))
+    if doubts:
+        return Assessment("careful", "Usable, with care: " + _lower(doubts[0]), tuple(doubts))
+    fit = "nothing measured speaks against it" if result.registration is None else "cameras and instrument fit together"
+    return Assessment("good", f"Ready to train: {fit}.", ())
+
+
+def _lower(sentence: str) -> str:
+    return sentence[0].lower() + sentence[1:]
+
+
+def _measured(result: IngestResult, capture: Capture) -> list[tuple[float, float, str]]:
+    """(value, limit, sentence for a value above the limit)."""
+    measured = []
+    if (pixels := result.reprojection_px) is not None:
+        sentence = f"Tissue points are off by {pixels:.2f} px on average in the images they were found in."
+        measured.append((pixels, REPROJECTION_PX, sentence))
+    registration = result.registration
+    if registration is not None:
+        position = rms(registration.position_residual)
+        rotation = float(np.degrees(rms(registration.rotation_residual)))
+        scale = registration.scale_sd
+        measured += [
+            (position, POSITION_MM, f"Cameras and laparoscope tracker disagree by {position:.2f} mm rms."),
+            (rotation, ROTATION_DEG, f"Cameras and laparoscope tracker disagree by {rotation:.2f}° rms."),
+            (scale, SCALE, f"Lengths are known to {scale:.1%} only: the scope travelled too little."),
+        ]
+    for name, clock in result.clocks.items():
+        moved = clock_cost_mm(name, clock.sd, capture)
+        if moved is not None:
+            sentence = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
+            measured.append((moved, CLOCK_MM, sentence))
+    return measured
+
+
+def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
+    """How far an instrument moves in the clock's standard deviation, at its 90th percentile of speed; None for a
+    joint's clock or where it is not known."""
+    joints = {joint for instrument in capture.instruments for joint in instrument.joints}
+    speeds = [instrument_speed(capture, instrument.name) for instrument in capture.instruments]
+    if name in joints or not speeds or not np.isfinite(sd):
+        return None
+    return sd * max(speeds)
+
+
+def instrument_speed(capture: Capture, name: str) -> float:
+    """mm/s, 90th percentile over frames next to each other in time; 0 for fewer than two frames."""
+    frames = sorted((f for f in capture.frames if name in f.state.instruments), key=lambda frame: frame.state.time)
+    if len(frames) < 2:
+        return 0.0
+    steps = np.diff([frame.state.time for frame in frames])
+    places = np.stack([frame.state.instruments[name].pose.numpy()[:3, 3] for frame in frames])
+    moved, usable = np.linalg.norm(np.diff(places, axis=0), axis=1), steps > 0
+    return float(np.quantile(moved[usable] / steps[usable], 0.9)) if usable.any() else 0.0

@@ -1,0 +1,121 @@
+"""Who may look: nothing from outside this machine without the token, nothing that another site's page asks for."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import ipaddress
+import re
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from urllib.parse import parse_qs
+
+from neeco.errors import NeecoError
+
+HOST_HEADER = re.compile(r"([\w.-]+|\[[0-9a-f:.]+\])(:\d+)?", re.ASCII | re.IGNORECASE)
+INLINE_SCRIPT = re.compile(rb"<script[^>]*>(.*?)</script>", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class AccessControl:
+    """Decides on every HTTP request, that for the page and that which opens the web socket."""
+
+    token: str | None  # None: loopback, where none is needed
+    cookie: str = "neeco"  # that holds it; browsers send one to all ports of a host, so it should name the port
+
+    def refusal(self, path: str, headers: Mapping[str, Sequence[str]]) -> str | None:
+        """Why a request for `path` is refused, or None. headers: name in small letters -> all its values."""
+        hosts, origins = headers.get("host", ()), headers.get("origin", ())
+        if len(hosts) != 1 or len(origins) > 1 or not HOST_HEADER.fullmatch(hosts[0]):
+            return "one Host and at most one Origin are expected"
+        # DNS rebinding: another site's name that resolves to this machine appears as the Host
+        if self.token is None and not is_loopback(re.sub(r":\d*$", "", hosts[0])):
+            return "open http://127.0.0.1, not another name of this machine"
+        if origins and origins[0].partition("://")[2].lower() != hosts[0].lower():
+            return "a page of another site asks"
+        if self.token is not None and not (self.in_address(path) or self._in_cookie(headers)):
+            return "the token is missing or wrong; open the whole address that neeco view printed"
+        return None
+
+    def in_address(self, path: str) -> bool:
+        """Does the address itself carry the token?"""
+        return any(self._is_token(value) for value in parse_qs(path.partition("?")[2]).get("token", ()))
+
+    def _in_cookie(self, headers: Mapping[str, Sequence[str]]) -> bool:
+        pairs = (pair.partition("=") for value in headers.get("cookie", ()) for pair in value.split(";"))
+        return any(name.strip() == self.cookie and self._is_token(value.strip()) for name, _, value in pairs)
+
+    def _is_token(self, value: str) -> bool:
+        # headers hold any bytes, as surrogates
+        return self.token is not None and hmac.compare_digest(value.encode(errors="replace"), self.token.encode())
+
+    def page_headers(self, path: str, page: bytes, host: str) -> dict[str, str]:
+        """Headers of the page: the browser loads and connects to nothing else, and remembers the token."""
+        headers = {
+            "Content-Security-Policy": content_security_policy(page, host),
+            "Referrer-Policy": "no-referrer",  # or the address would give the token away
+            "X-Content-Type-Options": "nosniff",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Cache-Control": "no-store",
+        }
+        if self.in_address(path):
+            headers["Set-Cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return headers
+
+
+def content_security_policy(page: bytes, host: str) -> str:
+    """The Content-Security-Policy of a page whose own scripts may run, and nothing that is injected into it."""
+    scripts = [base64.b64encode(hashlib.sha256(text).digest()).decode() for text in INLINE_SCRIPT.findall(page)]
+    allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
+    return "; ".join(
+        [
+            "default-src 'none'",
+            f"script-src {allowed} 'strict-dynamic' 'wasm-unsafe-eval' blob:",
+            "worker-src blob:",
+            "style-src 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "font-src data:",
+            f"connect-src 'self' ws://{host} data: blob:",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'none'",
+        ]
+    )
+
+
+def is_loopback(host: str) -> bool:
+    """Does `--host` name this machine to itself alone?"""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def free_port(host: str, port: int) -> int:
+    """`port`, or the next one that is free on `host`. Raises NeecoError for a host or port that cannot be."""
+    if not 0 < port < 65536:
+        raise NeecoError(f"--port: {port} is no port; give 1 to 65535")
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError as error:
+        raise NeecoError(f"--host: {host!r} is unknown ({error.strerror or error}); give a name or address") from None
+    last = OSError()
+    for candidate in range(port, min(port + 100, 65536)):
+        try:
+            with socket.socket(family, socket.SOCK_STREAM) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((address[0], candidate, *address[2:]))
+                return candidate
+        except OSError as error:
+            last = error
+    raise NeecoError(f"--host: {host}: --port {port} and the next ones: {last.strerror or last}; give others")
+
+
+def url_of(host: str, port: int, token: str | None) -> str:
+    """What to open in a browser."""
+    if host in ("0.0.0.0", "::", ""):
+        host = socket.gethostname()
+    shown = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")

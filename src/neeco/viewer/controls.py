@@ -1,0 +1,153 @@
+"""What the sliders say, as a state: a place in the recording, and how far each instrument departs from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.labels.drawing import to_numpy
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.samplers import instrument_axes
+from neeco.synthesis.states import JointRange, interpolate_pose, joint_ranges, rigid, turn_about
+
+if TYPE_CHECKING:
+    from neeco.scene import Drawable
+
+MARGIN = 0.2  # of the recorded range, by which a slider goes further where the capture states no limits
+STILL = math.radians(1.0)  # half of the range of a joint that never moved
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """The line that an instrument is slid along and turned about, in its own frame."""
+
+    end: np.ndarray  # [3] mm; yaw and pitch turn about it
+    along: np.ndarray  # [3] unit, towards the jaws
+    learned: bool  # False: the scene knows no shaft; the tracked frame's origin and z axis
+
+
+@dataclass(frozen=True)
+class InstrumentControls:
+    """How one instrument departs from the recording. The default does not."""
+
+    joints: Mapping[str, float] = field(default_factory=dict)  # rad; those not named are as recorded
+    slide: float = 0.0  # mm along the shaft, towards the jaws
+    roll: float = 0.0  # rad about the shaft
+    yaw: float = 0.0  # rad about the shaft's end, to the side
+    pitch: float = 0.0  # rad, about an axis at right angles to that of yaw
+    pose: np.ndarray | None = None  # [4, 4] world_from_instrument, mm: slides and turns start here
+
+    @property
+    def departs(self) -> bool:
+        """Does it do anything that was not recorded?"""
+        return self.pose is not None or bool(self.joints) or any((self.slide, self.roll, self.yaw, self.pitch))
+
+
+@dataclass(frozen=True)
+class Controls:
+    """A place in the recording, and what is to be otherwise. frame: 1.5 is half way from the second to the third."""
+
+    frame: float = 0.0
+    instruments: Mapping[str, InstrumentControls] = field(default_factory=dict)
+
+    @property
+    def recorded_frame(self) -> int | None:
+        """The frame whose state this is, just as it was recorded; None between frames and for other states."""
+        departs = any(item.departs for item in self.instruments.values())
+        return int(self.frame) if self.frame == int(self.frame) and not departs else None
+
+
+def controlled_state(states: Sequence[State], shafts: Mapping[str, Shaft], controls: Controls) -> State:
+    """The state that the controls ask for. states: the recording's, at least one; controls of instruments that it lacks
+    are passed over. A frame outside the recording is its first or last."""
+    state = interpolated_state(states, controls.frame)
+    moved = {
+        name: _moved(recorded, shafts[name], controls.instruments[name]) if name in controls.instruments else recorded
+        for name, recorded in state.instruments.items()
+    }
+    return State(moved, state.time)
+
+
+def interpolated_state(states: Sequence[State], frame: float) -> State:
+    """The recording at a place between two frames: positions, joints and time linearly, rotations by slerp."""
+    frame = min(max(frame, 0.0), len(states) - 1.0)
+    first, share = int(frame), frame - int(frame)
+    if share == 0.0:
+        return states[first]
+    start, end = states[first], states[first + 1]
+    moved = {}
+    for name, one in start.instruments.items():
+        two = end.instruments[name]
+        pose = interpolate_pose(to_numpy(one.pose), to_numpy(two.pose), share)
+        joints = {joint: (1 - share) * value + share * two.joints[joint] for joint, value in one.joints.items()}
+        moved[name] = InstrumentState(torch.from_numpy(pose), joints)
+    return State(moved, (1 - share) * start.time + share * end.time)
+
+
+def corresponding_frame(frame: float, frames: int, others: int) -> float:
+    """The place in a recording of `others` frames that belongs to `frame` of one of `frames`: the same where they are
+    equally long, else at the same share of it; to a frame itself the nearest."""
+    if frames == others:
+        return frame
+    there = frame / (frames - 1) * (others - 1) if frames > 1 else 0.0
+    return float(round(there)) if frame == int(frame) else there
+
+
+def shafts_of(scene: Drawable) -> dict[str, Shaft]:
+    """Every instrument's shaft: as learned, where the method learns one."""
+    if not scene.has_gaussians or not scene.recorded.states:
+        return {item.name: Shaft(np.zeros(3), np.array([0.0, 0.0, 1.0]), False) for item in scene.instruments}
+    posed = gaussian_scene(scene, "view")
+    with torch.no_grad():
+        known = posed.keypoints(scene.recorded.states[0])
+    return {
+        name: Shaft(end, along, {"shaft_far", "shaft_near"} <= set(known.get(name, ())))
+        for name, (end, along) in instrument_axes(posed).items()
+    }
+
+
+def slider_ranges(instruments: Sequence[Instrument], states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
+    """How far the slider of each (instrument, joint) goes, in rad: to the capture's limits, or a little beyond what was
+    recorded where it states none."""
+    found = {}
+    for (name, joint), recorded in joint_ranges(states).items():
+        limits = next((item.joints.get(joint) for item in instruments if item.name == name), None)
+        if limits is not None and all(map(math.isfinite, limits)) and limits[0] < limits[1]:
+            found[name, joint] = JointRange(*limits)
+            continue
+        if recorded.upper - recorded.lower < 2 * STILL:
+            middle = (recorded.upper + recorded.lower) / 2
+            recorded = JointRange(middle - STILL, middle + STILL)
+        found[name, joint] = recorded.widened(MARGIN, None)
+    return found
+
+
+def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls) -> InstrumentState:
+    """Roll about the shaft, then pitch and yaw about its end, then slide along where it pointed before."""
+    if not controls.departs:
+        return recorded
+    side, up = perpendicular_axes(shaft.along)
+    turns = (
+        Rotation.from_rotvec(controls.yaw * up)
+        * Rotation.from_rotvec(controls.pitch * side)
+        * Rotation.from_rotvec(controls.roll * shaft.along)
+    )
+    offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
+    pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
+    joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
+    return InstrumentState(torch.from_numpy(pose @ offset), joints)
+
+
+def perpendicular_axes(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit directions [3] at right angles to `along` and each other; which two depends on `along` alone."""
+    least = np.eye(3)[np.argmin(np.abs(along))]
+    side = np.cross(along, least)
+    side /= np.linalg.norm(side)
+    return side, np.cross(along, side)

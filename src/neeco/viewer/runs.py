@@ -1,0 +1,337 @@
+"""The run folders that are looked at: their scenes, also while they are trained, and how well each frame is drawn."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture import read_capture
+from neeco.capture.model import Capture, Frame
+from neeco.errors import NeecoError
+from neeco.evaluation.image_metrics import psnr, resize_camera
+from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.mask_metrics import iou
+from neeco.labels.drawing import draw
+from neeco.raster.types import Camera
+from neeco.scene.drawable import Recorded
+from neeco.scene.io import load_scene
+from neeco.training.run import checkpoint_path, read_checkpoint, read_config
+from neeco.viewer.controls import Shaft, shafts_of
+
+if TYPE_CHECKING:
+    from neeco.scene import Drawable, Scene
+
+SCENE_FILE = "scene.safetensors"
+ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
+DISTANCE_UNITS = 10.0  # viser's units of length, from a recorded camera to what it looks at
+WATCH_S = 2.0  # between two looks at the run folders
+MAX_SCORES = 4096  # remembered
+TIMELINE_WIDTH = 320  # px at most of the images that a timeline compares
+FIELD_WIDTH = 48  # px, of a radiance field's, which take a hundred times as long
+WORST = 8  # frames that a timeline lists
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """What a run folder held when it was read. Frames are in the order they were recorded in, all splits together."""
+
+    name: str
+    world: str  # the capture's folder: runs of one capture share their world frame
+    scene: Drawable
+    recorded: Recorded
+    frames: tuple[Frame, ...]  # those of `recorded`, with their images; empty: the capture is not at hand
+    capture: Capture | None
+    shafts: dict[str, Shaft]
+    iteration: int | None  # that training had reached; None: it has finished
+    trouble: str = ""  # why the capture is not at hand
+    serial: int = field(default_factory=itertools.count().__next__)  # tells one reading from another
+
+    @cached_property
+    def labels(self) -> Tensor | None:
+        """The scene's label channels [N, L], computed once; None where it has none."""
+        if not self.scene.label_names:
+            return None
+        scene: Scene = self.scene  # type: ignore[assignment]
+        with torch.no_grad():
+            return scene.label_channels()
+
+    @cached_property
+    def distance(self) -> float:
+        """Median distance of the recorded cameras from the centre of the scene, along what they look at, in mm."""
+        centre = getattr(self.scene, "center", torch.zeros(3)).detach().cpu().double()
+        poses = [camera.world_from_camera.detach().cpu().double() for camera in self.recorded.cameras]
+        depths = [float((centre - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]
+        ahead = [depth for depth in depths if depth > 0]
+        return float(np.median(ahead)) if ahead else ASSUMED_MM
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        """What sliders are made from: where it changes, they must be made anew."""
+        joints = tuple((item.name, tuple(item.joints.items())) for item in self.scene.instruments)
+        return joints, self.recorded.names, tuple(self.scene.label_names), bool(self.frames)
+
+
+class WatchedRun:
+    """Reads a run folder, and again when it has changed. Any thread may ask for what was read last."""
+
+    def __init__(self, path: Path, device: torch.device | None = None) -> None:
+        """Raises NeecoError where `path` holds no scene, finished or not."""
+        self.path, self.device = Path(path), device
+        self._refreshing = threading.Lock()
+        self._stamp = self._current_stamp()
+        self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
+        self.trouble = ""
+
+    def refresh(self) -> bool:
+        """Read the run again if its files have changed; whether anything new was read. A run that cannot be read
+        stays as it was, and `trouble` says why."""
+        with self._refreshing:
+            try:
+                stamp = self._current_stamp()
+                if stamp == self._stamp:
+                    return False
+                # before reading: what is written meanwhile is read the next time
+                self._stamp = stamp
+                self.loaded = self._load()
+            except NeecoError as error:
+                self.trouble = str(error)
+                return False
+            self.trouble = ""
+            return True
+
+    def _current_stamp(self) -> tuple[str, int, int, int]:
+        """File, its inode, time and size."""
+        read_config(self.path)
+        for file in (self.path / SCENE_FILE, checkpoint_path(self.path)):
+            try:
+                found = file.stat()
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                raise NeecoError(f"{file}: cannot read: {error.strerror or error}") from error
+            return str(file), found.st_ino, found.st_mtime_ns, found.st_size
+        raise NeecoError(
+            f"{self.path}: nothing to look at yet: neither a finished scene nor a checkpoint; "
+            "wait until `neeco train` has written one"
+        )
+
+    def _load(self) -> LoadedRun:
+        config = read_config(self.path)
+        iteration = None
+        if (self.path / SCENE_FILE).is_file():
+            scene = load_scene(self.path / SCENE_FILE)
+        else:
+            scene, header, _ = read_checkpoint(self.path)
+            iteration = int(header["iteration"])
+        if self.device is not None:
+            scene = scene.to(self.device)
+        capture, trouble = _read_capture_of(config)
+        if not scene.recorded.states and capture is None:
+            raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
+        frames = () if capture is None else capture.frames
+        known = scene.recorded if capture is None else Recorded.of(frames, scene.instruments)
+        order = np.argsort([state.time for state in known.states], kind="stable")
+        columns = (known.names, known.splits, known.states, known.cameras)
+        return LoadedRun(
+            name=self.path.resolve().name,
+            world=str(config["capture"]),
+            scene=scene,
+            recorded=Recorded(*(tuple(column[k] for k in order) for column in columns)),
+            frames=tuple(frames[k] for k in order) if frames else (),
+            capture=capture,
+            shafts=shafts_of(scene),
+            iteration=iteration,
+            trouble=trouble,
+        )
+
+
+def _read_capture_of(config: dict[str, Any]) -> tuple[Capture | None, str]:
+    """The capture that a run was trained on, or why it cannot be read."""
+    root = Path(config["capture"])
+    if not root.is_dir():
+        return None, f"capture: {root} no longer exists: no recorded images to compare with"
+    try:
+        return read_capture(root, config["transforms"]), ""
+    except NeecoError as error:
+        return None, str(error)
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """How well one recorded frame is drawn."""
+
+    psnr: float  # dB
+    iou: float | None  # of all instruments together; None: nobody drew a true mask, or the scene has no labels
+
+
+@torch.no_grad()
+def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
+    """What `neeco evaluate` would say of one frame of `loaded.frames`. Raises NeecoError for unreadable files."""
+    frame = loaded.frames[index]
+    counted = frame.load_mask()
+    drawing = draw(loaded.scene, frame.state, frame.camera)
+    overlap = None
+    if drawing.parts is not None and loaded.capture is not None:
+        reference = load_reference(loaded.capture, frame)
+        if reference is not None:
+            overlap = iou(drawing.parts > 0, reference.mask, counted)
+    return FrameScore(psnr(drawing.image, frame.load_image(), counted), overlap)
+
+
+class Timeline:
+    """The PSNR of every frame of a recording, at no more than TIMELINE_WIDTH px, computed a frame at a time: first a
+    few from everywhere, then those between them. One thread computes; any may read."""
+
+    def __init__(self, loaded: LoadedRun) -> None:
+        self.loaded = loaded
+        self._pending = spread_order(len(loaded.frames))[::-1]
+        self._psnr: dict[int, float] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def done(self) -> bool:
+        """Is every frame known?"""
+        return not self._pending
+
+    def advance(self) -> None:
+        """Score one more frame; one that cannot be read raises NeecoError and stays unknown."""
+        index = self._pending.pop()
+        value = coarse_psnr(self.loaded, index)
+        if math.isfinite(value):
+            with self._lock:
+                self._psnr[index] = value
+
+    @property
+    def count(self) -> int:
+        """How many frames are known."""
+        return len(self._psnr)
+
+    def known(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frames [K], rising, and their PSNR [K] in dB, as far as they are known."""
+        with self._lock:
+            frames = sorted(self._psnr)
+            return np.array(frames, np.int64), np.array([self._psnr[k] for k in frames], np.float64)
+
+    def worst(self) -> list[tuple[int, float]]:
+        """(frame, PSNR) of the worst known frames, worst first; of neighbours, which look alike, only the worst."""
+        frames, values = self.known()
+        apart = max(1, len(self.loaded.frames) // (4 * WORST))
+        chosen: list[tuple[int, float]] = []
+        for k in np.argsort(values, kind="stable"):
+            if all(abs(int(frames[k]) - other) >= apart for other, _ in chosen):
+                chosen.append((int(frames[k]), float(values[k])))
+            if len(chosen) == WORST:
+                break
+        return chosen
+
+
+@torch.no_grad()
+def coarse_psnr(loaded: LoadedRun, index: int) -> float:
+    """PSNR in dB of one frame, drawn and recorded at no more than TIMELINE_WIDTH px. Raises NeecoError."""
+    frame = loaded.frames[index]
+    camera = narrowed(frame.camera, TIMELINE_WIDTH if loaded.scene.has_gaussians else FIELD_WIDTH)
+    size = camera.width, camera.height
+    image = cv2.resize(frame.load_image().numpy(), size, interpolation=cv2.INTER_AREA)
+    mask = frame.load_mask()
+    if mask is not None:
+        mask = torch.from_numpy(cv2.resize(mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+    rendered = loaded.scene.render(frame.state, camera).color.clamp(0, 1).cpu()
+    return psnr(rendered, torch.from_numpy(image), mask)
+
+
+def narrowed(camera: Camera, width: int) -> Camera:
+    """The same view in an image of at most `width` px."""
+    return camera if camera.width <= width else resize_camera(camera, width / camera.width)
+
+
+def spread_order(count: int) -> list[int]:
+    """0 to count - 1 in bit-reversed order, so that any first few of them are from everywhere."""
+    bits = max(1, (count - 1).bit_length())
+    mirrored = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
+    return [k for k in mirrored if k < count]
+
+
+class ViewedRuns:
+    """The runs that all browsers of a server share, and what is known of their frames. Any thread may use it."""
+
+    def __init__(self, paths: Sequence[Path], device: torch.device | None = None) -> None:
+        """Raises NeecoError where a run folder holds nothing to look at."""
+        self.watched = [WatchedRun(path, device) for path in paths]
+        self.distance = self.loaded[0].distance  # mm
+        self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
+        self.timelines = [Timeline(loaded) for loaded in self.loaded]
+        self._scores: dict[tuple[int, int, int], FrameScore] = {}
+        self._images: dict[int, tuple[tuple[int, int], np.ndarray]] = {}
+        self._ended = threading.Event()
+
+    @property
+    def loaded(self) -> list[LoadedRun]:
+        """What the runs held when they were read last."""
+        return [run.loaded for run in self.watched]
+
+    def score(self, number: int, loaded: LoadedRun, frame: int) -> FrameScore | None:
+        """How well run `number` draws a recorded frame; None where its capture is not at hand. Raises NeecoError."""
+        if not loaded.frames:
+            return None
+        key = number, loaded.serial, frame
+        if key not in self._scores:
+            if len(self._scores) >= MAX_SCORES:
+                self._scores.clear()
+            self._scores[key] = score_frame(loaded, frame)
+        return self._scores[key]
+
+    def recorded_image(self, number: int, loaded: LoadedRun, frame: int) -> np.ndarray:
+        """A frame's recorded image [H, W, 3] in [0, 1]; the last one is remembered. Raises NeecoError."""
+        key = loaded.serial, frame
+        known = self._images.get(number)
+        if known is None or known[0] != key:
+            known = key, loaded.frames[frame].load_image().numpy()
+            self._images[number] = known
+        return known[1]
+
+    def refresh(self) -> bool:
+        """Read what has changed; whether anything was. Its frames are scored anew."""
+        changed = [run.refresh() for run in self.watched]
+        for number, loaded in enumerate(self.loaded):
+            if changed[number]:
+                self.timelines[number] = Timeline(loaded)
+                self._scores.clear()
+        return any(changed)
+
+    def watch(self, changed: Callable[[], None]) -> None:
+        """Look at the run folders from time to time, in a thread of its own, and call `changed` where one changed or
+        can no longer be read; until `end_watch`."""
+
+        def look() -> None:
+            while not self._ended.wait(WATCH_S):
+                troubles = [run.trouble for run in self.watched]
+                if self.refresh() or troubles != [run.trouble for run in self.watched]:
+                    changed()
+
+        threading.Thread(target=look, name="neeco-watcher", daemon=True).start()
+
+    def end_watch(self) -> None:
+        """Look at the run folders no more."""
+        self._ended.set()
+
+    def advance_timelines(self) -> bool:
+        """Score one more frame; False: all are."""
+        for timeline in self.timelines:
+            if not timeline.done:
+                # of a frame whose image cannot be read the status says so to whoever goes there
+                with timeline.loaded.scene.torch_threads(), contextlib.suppress(NeecoError):
+                    timeline.advance()
+                return True
+        return False

@@ -1,0 +1,93 @@
+"""What a user saves while looking: states for `synthesize --states`, and single labelled images."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from neeco.capture.model import State
+from neeco.capture.statefile import StateLine, camera_to_json, read_states, state_to_json
+from neeco.files import own_folder, write_text
+from neeco.labels.annotation import annotate
+from neeco.labels.drawing import draw_layers, to_numpy
+from neeco.labels.labellers import CompositedLabels
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.samplers import moved_camera
+from neeco.synthesis.settings import Settings
+from neeco.synthesis.writers.folder import load_record, record_path, write_sample
+
+if TYPE_CHECKING:
+    from neeco.viewer.runs import LoadedRun
+
+FOLDER = "kept"  # of the run
+STATES, SAMPLES = "states.jsonl", "samples"
+
+
+class SavedStates:
+    """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it."""
+
+    def __init__(self, run: Path) -> None:
+        self.folder = Path(run) / FOLDER
+        self._lock = threading.Lock()
+
+    @property
+    def states_path(self) -> Path:
+        """What `synthesize --states` takes."""
+        return self.folder / STATES
+
+    def add(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> int:
+        """Add a state and the camera [4, 4] that sees it (OpenCV axes, mm); returns how many are saved. Raises
+        NeecoError where the file cannot be written, or holds states of another scene."""
+        line = json.dumps(state_to_json(state) | {"camera": camera_to_json(world_from_camera)}, allow_nan=False)
+        with self._lock:
+            return self._write([*self._lines(loaded), line])
+
+    def remove_last(self, loaded: LoadedRun) -> int:
+        """Take the last one out again; returns how many are left. Raises NeecoError."""
+        with self._lock:
+            return self._write(self._lines(loaded)[:-1])
+
+    def read(self, loaded: LoadedRun) -> list[StateLine]:
+        """What is saved, checked against the scene. Raises NeecoError."""
+        if not self.states_path.exists():
+            return []
+        return read_states(self.states_path, loaded.scene.instruments)
+
+    def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
+        """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics and size; returns the
+        image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
+        scene = gaussian_scene(loaded.scene, "save labelled image")
+        labeller = CompositedLabels(scene)
+        camera = moved_camera(loaded.recorded.cameras[0], world_from_camera)
+        with scene.torch_threads(), torch.no_grad():
+            drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
+            labels = annotate(scene, drawing, labeller.names)
+        root = self.folder / SAMPLES
+        with self._lock, own_folder(root):
+            index = 0
+            while record_path(root, index).exists() and load_record(root, index) is not None:
+                index += 1
+            record = write_sample(root, index, drawing, labels, {})
+        return root / record["image"]
+
+    def _lines(self, loaded: LoadedRun) -> list[str]:
+        """The lines that are there, of this scene's states."""
+        lines = []
+        for line in self.read(loaded):
+            entry = state_to_json(line.state)
+            if line.world_from_camera is not None:
+                entry["camera"] = camera_to_json(to_numpy(torch.from_numpy(line.world_from_camera)))
+            lines.append(json.dumps(entry, allow_nan=False))
+        return lines
+
+    def _write(self, lines: list[str]) -> int:
+        if lines:
+            write_text(self.states_path, "".join(f"{line}\n" for line in lines))
+        else:
+            self.states_path.unlink(missing_ok=True)
+        return len(lines)

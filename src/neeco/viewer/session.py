@@ -1,0 +1,394 @@
+"""The thread that renders, and one browser's session: how its sliders and camera become its picture."""
+
+from __future__ import annotations
+
+import logging
+import math
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neeco.capture.model import State
+from neeco.errors import NeecoError
+from neeco.labels.drawing import to_numpy
+from neeco.viewer.controls import Controls, controlled_state, interpolated_state
+from neeco.viewer.panel import Actions, Panel, message_html, status_html
+from neeco.viewer.runs import LoadedRun, ViewedRuns
+from neeco.viewer.saving import SavedStates
+from neeco.viewer.views import Picture, RunPicture, beside, render_run, scored, split
+from neeco.viewer.viser_scene import Overlays, aspect_of, browser_camera, fitting_view, jump, pose_of, stands_at
+
+if TYPE_CHECKING:
+    import viser
+
+SETTLED_S = 0.15  # without a request: what is shown stands still and is rendered sharp
+IDLE_S = 0.5
+MOVING_PX, SHARP_PX = 256, 720  # high, at most
+MIN_PX = 32
+MOVING_S, SHARP_S = 0.15, 0.4  # that rendering may take
+REMEMBERED = 3  # renderings; a single one that had to compute something first does not count
+JPEG_MOVING, JPEG_SHARP = 80, 92
+PLAYED_PER_S = 10.0  # frames, where the recording does not say how many were taken
+SLOWEST, FASTEST = 2.0, 30.0  # frames per second of `play`
+STATUS_EVERY_S = 0.25  # while things move
+
+log = logging.getLogger(__name__)
+
+
+class AdaptiveResolution:
+    """Chooses heights of renderings so that they come in time, from what the last ones took."""
+
+    def __init__(self) -> None:
+        self._per_pixel: deque[float] = deque(maxlen=REMEMBERED)  # s
+
+    def height(self, sharp: bool, window: int, aspect: float) -> int:
+        """How many px high to render: as the constants say and the window shows, fewer where that would take too long.
+        aspect: width of all that is rendered by its height."""
+        most, seconds = (SHARP_PX, SHARP_S) if sharp else (MOVING_PX, MOVING_S)
+        most = max(MIN_PX, min(most, window))
+        if not self._per_pixel:
+            return min(most, MOVING_PX)
+        in_time = math.sqrt(seconds / statistics.median_low(self._per_pixel) / aspect)
+        return max(MIN_PX, min(most, int(in_time)))
+
+    def record(self, seconds: float, pixels: int) -> None:
+        """A rendering of that many pixels took so long."""
+        self._per_pixel.append(seconds / pixels)
+
+
+class RenderThread:
+    """Renders for all sessions in turn: first what moves, then sharp what stands still, then what nobody waits for.
+
+    While it renders, further requests of one session replace each other. Any thread may request; `when_idle` is called
+    when there is nothing to render, and says whether it did something.
+    """
+
+    def __init__(self, when_idle: Callable[[], bool] = lambda: False) -> None:
+        self._when_idle = when_idle
+        self._lock, self._wake = threading.Lock(), threading.Event()
+        self._sessions: dict[int, ClientSession] = {}
+        self._requested: dict[int, float] = {}  # when, of requests that nothing was rendered for; the oldest first
+        self._unsharp: dict[int, float] = {}  # when the last request was, of pictures that are to be rendered sharp
+        self._jobs: list[Callable[[], None]] = []
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="neeco-render", daemon=True)
+
+    @property
+    def sessions(self) -> tuple[ClientSession, ...]:
+        """Those that are connected."""
+        with self._lock:
+            return tuple(self._sessions.values())
+
+    def start(self) -> None:
+        """Begin to render."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after what is being rendered."""
+        self._stopped = True
+        self._wake.set()
+        self._thread.join(timeout=10)
+
+    def add(self, session: ClientSession) -> None:
+        """A browser has connected."""
+        with self._lock:
+            self._sessions[session.key] = session
+        self.request(session.key)
+
+    def remove(self, key: int) -> None:
+        """A browser has gone."""
+        with self._lock:
+            for table in (self._sessions, self._requested, self._unsharp):
+                table.pop(key, None)
+
+    def request(self, key: int | None = None) -> None:
+        """A session, or every one, needs another picture."""
+        now = time.perf_counter()
+        with self._lock:
+            for which in list(self._sessions) if key is None else [key]:
+                if which in self._sessions:
+                    self._requested.setdefault(which, now)
+                    self._unsharp[which] = now
+        self._wake.set()
+
+    def run_job(self, job: Callable[[], None]) -> None:
+        """Have something else done between two pictures, by the thread that renders."""
+        with self._lock:
+            self._jobs.append(job)
+        self._wake.set()
+
+    def _run(self) -> None:
+        while not self._stopped:
+            self._wake.clear()
+            moments = self._tick()
+            if self._do_most_urgent():
+                continue
+            try:
+                if self._when_idle():
+                    continue
+            except Exception:
+                log.exception("work while idle failed")
+            now = time.perf_counter()
+            with self._lock:
+                moments += [since + SETTLED_S for since in self._unsharp.values()]
+            self._wake.wait(max(0.0, min([IDLE_S, *(moment - now for moment in moments)])))
+
+    def _tick(self) -> list[float]:
+        """Let time go on for every session; when they want to be called again."""
+        now = time.perf_counter()
+        moments = []
+        for session in self.sessions:
+            try:
+                moments.append(session.tick(now))
+            except Exception:
+                # one browser's trouble must not end the others' pictures
+                log.exception("a session failed")
+                self.remove(session.key)
+        return [moment for moment in moments if moment is not None]
+
+    def _do_most_urgent(self) -> bool:
+        """Do a job, or render a picture; whether there was one."""
+        with self._lock:
+            job = self._jobs.pop(0) if self._jobs else None
+            key, sharp = next(iter(self._requested), None), False
+            if key is None:
+                now = time.perf_counter()
+                key = next((key for key, since in self._unsharp.items() if now - since >= SETTLED_S), None)
+                sharp = True
+            session = None if job is not None or key is None else self._sessions[key]
+            if session is not None:
+                del (self._unsharp if sharp else self._requested)[session.key]
+        try:
+            if job is not None:
+                job()
+            elif session is not None:
+                session.render(sharp)
+        except Exception:
+            # one browser's trouble must not end the others' pictures
+            log.exception("rendering failed")
+        return job is not None or session is not None
+
+
+class ClientSession:
+    """One browser: its panel, what is drawn over its picture, its picture.
+
+    Made when the browser connects. `render` and `tick` belong to the render thread, the rest to any. connected: is it
+    still there?
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        runs: ViewedRuns,
+        saved: SavedStates,
+        thread: RenderThread,
+        connected: Callable[[], bool],
+    ) -> None:
+        self.key = client.client_id
+        self.status_at = 0.0  # time.perf_counter() of the last status; 0: no picture was sent yet
+        self._client, self._runs, self._saved, self._thread, self._connected = client, runs, saved, thread, connected
+        self._resolution = AdaptiveResolution()
+        self._saving = False
+        self._played_at: float | None = None
+        self._shape = 0.0  # of a run's part of the window, width by height
+        self._camera_frame = 0  # whose camera the window was sent to last
+        self._followed: int | None = 0  # the frame that the camera went along to
+        self._set_dark(True)
+        self._loaded, self.overlays, self._panel = self._build(runs.loaded)
+        self._go_to(0)
+        client.camera.on_update(lambda _: self._request())
+
+    def render(self, sharp: bool) -> None:
+        """Render what is asked for now: coarsely, or sharp with its numbers."""
+        if not self._connected():
+            return
+        current = self._runs.loaded
+        if [run.signature for run in current] != [run.signature for run in self._loaded]:
+            self._client.gui.reset()
+            self._client.scene.reset()
+            self._loaded, self.overlays, self._panel = self._build(current)
+        self._loaded = current
+        began = time.perf_counter()
+        self._fit_window()
+        controls, window, share = self._follow_recording(), self._client.camera, self._share
+        height = self._resolution.height(sharp, window.image_height, aspect_of(window) * share * len(current))
+        camera = browser_camera(window, self._runs.unit, height, share)
+        view = self._panel.view.value
+        try:
+            parts = [render_run(self._runs, k, controls, camera, self._camera_frame, view) for k in range(len(current))]
+        except NeecoError as error:
+            self._panel.status.content = message_html(str(error))
+            return
+        pictures = [part.picture for part in parts]
+        if len(pictures) == 1 or self._panel.side_by_side:
+            whole = beside(pictures)
+        else:
+            whole = split(pictures[0], pictures[1], self._panel.divide.value / 100)
+        seconds = time.perf_counter() - began
+        self._resolution.record(seconds, sum(picture.depth.size for picture in pictures))
+        if self._connected():
+            self._send(whole, sharp)
+            self._show_status(parts, whole, seconds, sharp)
+
+    def tick(self, now: float) -> float | None:
+        """Let the recording play on, and show what is newly known of its frames. now: of time.perf_counter(); returns
+        when to be called again, or None: nothing moves by itself."""
+        if not self._connected():
+            return None
+        self._panel.show_timelines(self._runs.timelines)
+        if not self._panel.play.value:
+            self._played_at = None
+            return None
+        per_s, frames = frames_per_s(self._loaded[0]), len(self._loaded[0].recorded.states)
+        if self._played_at is None:
+            self._played_at = now
+        ahead = int((now - self._played_at) * per_s)
+        if ahead:
+            self._played_at += ahead / per_s
+            self._panel.frame.value = float((int(self._panel.place) + ahead) % frames)
+            self._request()
+        return self._played_at + 1 / per_s
+
+    def _build(self, runs: list[LoadedRun]) -> tuple[list[LoadedRun], Overlays, Panel]:
+        """What the runs hold, and the overlays and panel for it."""
+        actions = Actions(
+            changed=self._request,
+            go_to=self._go_to,
+            toggle_gizmo=self._toggle_gizmo,
+            save_state=self._save_state,
+            remove_state=self._remove_state,
+            save_image=self._save_image,
+            dark=self._set_dark,
+        )
+        overlays = Overlays(self._client, runs[0], self._runs.unit, self._go_to, self._request)
+        return runs, overlays, Panel(self._client, runs, actions)
+
+    def _request(self) -> None:
+        self._thread.request(self.key)
+
+    def _go_to(self, frame: int) -> None:
+        self._jump_to(frame)
+        self._request()
+
+    def _jump_to(self, frame: int) -> None:
+        self._camera_frame = frame
+        camera = self._loaded[0].recorded.cameras[frame]
+        jump(self._client, camera, self._runs.unit, self._runs.distance, self._share)
+
+    @property
+    def _share(self) -> float:
+        """Of the window's width, that one run's picture takes up."""
+        return 1 / len(self._loaded) if self._panel.side_by_side else 1.0
+
+    def _fit_window(self) -> None:
+        """Where the window has changed its shape, have it show all that the recorded camera saw, if it stands there."""
+        window, recorded = self._client.camera, self._loaded[0].recorded.cameras[self._camera_frame]
+        shape = aspect_of(window) * self._share
+        if shape == self._shape:
+            return
+        self._shape = shape
+        if stands_at(browser_camera(window, self._runs.unit, MIN_PX), recorded, self._runs.distance):
+            window.fov = fitting_view(recorded, shape)
+
+    def _follow_recording(self) -> Controls:
+        """What the sliders say; they and the camera are brought along to where the recording is."""
+        panel = self._panel
+        controls = panel.controls(self.overlays)
+        recorded = interpolated_state(self._loaded[0].recorded.states, controls.frame)
+        for instrument in panel.instruments:
+            instrument.follow(recorded.instruments[instrument.name])
+        frame = round(controls.frame)
+        if panel.follows.value and frame != self._followed:
+            self._jump_to(frame)
+        self._followed = frame if panel.follows.value else None
+        alone = not panel.side_by_side
+        self.overlays.show(alone and panel.cameras.value, alone and panel.points.value)
+        return controls
+
+    def _state(self) -> State:
+        """What the first run shows now."""
+        first = self._loaded[0]
+        return controlled_state(first.recorded.states, first.shafts, self._panel.controls(self.overlays))
+
+    def _pose(self) -> np.ndarray:
+        """world_from_camera [4, 4] mm of the window."""
+        return pose_of(self._client.camera.wxyz, self._client.camera.position, self._runs.unit)
+
+    def _toggle_gizmo(self, name: str, number: int, on: bool) -> None:
+        if not on:
+            self.overlays.remove_gizmo(name)
+            return
+        # the gizmo is not there yet, so this is where the sliders have brought the instrument
+        pose = to_numpy(self._state().instruments[name].pose)
+        self.overlays.add_gizmo(name, number, pose)
+        self._panel.instruments[number].straighten()
+
+    def _save_state(self) -> None:
+        saved, loaded = self._saved, self._loaded[0]
+        self._report(lambda: f"kept: {saved.add(loaded, self._state(), self._pose())} in {saved.states_path}")
+
+    def _remove_state(self) -> None:
+        saved, loaded = self._saved, self._loaded[0]
+        self._report(lambda: f"kept: {saved.remove_last(loaded)} in {saved.states_path}")
+
+    def _save_image(self) -> None:
+        if self._saving:  # or a page that asks a thousand times would be drawn for long after it has gone
+            return
+        self._saving = True
+        state, pose = self._state(), self._pose()
+        self._panel.saved.content = message_html("drawing …")
+
+        def save() -> None:
+            try:
+                self._report(lambda: f"written: {self._saved.save_image(self._loaded[0], state, pose)}")
+            finally:
+                self._saving = False
+
+        # by the thread that renders: the rasteriser has the cores to itself
+        self._thread.run_job(save)
+
+    def _report(self, task: Callable[[], str]) -> None:
+        """Do something, and say what became of it."""
+        try:
+            self._panel.saved.content = message_html(task())
+        except NeecoError as error:
+            self._panel.saved.content = message_html(f"error: {error}")
+
+    def _set_dark(self, on: bool) -> None:
+        self._client.gui.configure_theme(dark_mode=on, show_logo=False, show_share_button=False)
+
+    def _send(self, whole: Picture, sharp: bool) -> None:
+        depth = None
+        if self.overlays.shown and not self._panel.side_by_side:
+            # 0 is nothing there: far away, not at the eye
+            depth = np.where(whole.depth > 0, whole.depth * self._runs.unit, np.inf)
+        quality = JPEG_SHARP if sharp else JPEG_MOVING
+        self._client.scene.set_background_image(whole.pixels, format="jpeg", jpeg_quality=quality, depth=depth)
+        self._client.flush()
+
+    def _show_status(self, parts: list[RunPicture], whole: Picture, seconds: float, sharp: bool) -> None:
+        now = time.perf_counter()
+        if not sharp and now - self.status_at < STATUS_EVERY_S:
+            return
+        self.status_at = now
+        notes = list(dict.fromkeys(part.note for part in parts if part.note))
+        if sharp:  # else things move on before the numbers are read
+            try:
+                parts = [scored(self._runs, part) for part in parts]
+            except NeecoError as error:
+                notes.append(str(error))
+        size = whole.pixels.shape[1], whole.pixels.shape[0]
+        self._panel.status.content = status_html(parts, seconds, size, "; ".join(notes))
+
+
+def frames_per_s(loaded: LoadedRun) -> float:
+    """How fast to play: as it was recorded, within reason."""
+    times = [state.time for state in loaded.recorded.states]
+    if loaded.capture is None or not loaded.capture.timed or times[-1] <= times[0]:
+        return PLAYED_PER_S
+    return min(max((len(times) - 1) / (times[-1] - times[0]), SLOWEST), FASTEST)

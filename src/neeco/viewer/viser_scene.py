@@ -1,0 +1,198 @@
+"""viser's camera and scene for one browser: conversion from and to ours, recorded cameras, sparse points, gizmos.
+
+viser keeps depth up to 168 of its units and sees 1000 far, so mm do not fit; a `unit` is how many of them a mm is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.model import evenly_spaced
+from neeco.labels.drawing import to_numpy
+from neeco.raster.types import Camera
+from neeco.synthesis.samplers import moved_camera
+from neeco.synthesis.states import rigid
+from neeco.viewer.runs import DISTANCE_UNITS, LoadedRun
+
+if TYPE_CHECKING:
+    import viser
+
+MAX_ASPECT = 8.0
+NARROWEST, WIDEST = 0.01, 3.0  # rad
+SAME_PLACE = 2e-4  # of the distance to what is looked at
+SAME_TURN = 1e-3  # rad
+MAX_FRUSTA, MAX_POINTS = 24, 20_000
+FRUSTUM_UNITS, GIZMO_UNITS, POINT_UNITS = 0.06 * DISTANCE_UNITS, 0.2 * DISTANCE_UNITS, 0.005 * DISTANCE_UNITS
+FRUSTUM_COLOR = (255, 200, 0)
+
+
+def aspect_of(window: viser.CameraHandle) -> float:
+    """Width of the window by its height, within reason: a browser may say anything."""
+    return min(max(float(window.aspect), 1 / MAX_ASPECT), MAX_ASPECT) if window.aspect > 0 else 1.0
+
+
+def upward(cameras: Sequence[Camera]) -> np.ndarray:
+    """The direction [3] that is up in most recorded images; orbiting keeps it up."""
+    up = -np.mean([to_numpy(camera.world_from_camera)[:3, 1] for camera in cameras], axis=0)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+
+
+def wxyz_of(pose: np.ndarray) -> np.ndarray:
+    """The unit quaternion [4] of a pose [4, 4]."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+
+
+def pose_of(wxyz: np.ndarray, position: np.ndarray, unit: float) -> np.ndarray:
+    """The pose [4, 4] in mm of a quaternion and a position in viser's units."""
+    return rigid(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), np.asarray(position) / unit)
+
+
+def field_of_view(camera: Camera) -> float:
+    """Vertical, in rad, about the middle of the image."""
+    return 2 * math.atan(camera.height / 2 / camera.fy)
+
+
+def browser_camera(window: viser.CameraHandle, unit: float, height: int, share: float = 1.0) -> Camera:
+    """The camera of the browser's window, rendered `height` px high and `share` of the window wide."""
+    width = max(1, round(height * aspect_of(window) * share))
+    focal = height / 2 / math.tan(min(max(window.fov, NARROWEST), WIDEST) / 2)
+    pose = torch.from_numpy(pose_of(window.wxyz, window.position, unit))
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def stands_at(window: Camera, recorded: Camera, distance: float) -> bool:
+    """Does the window look from where the recorded camera did, whatever part of that it shows? distance:
+    `LoadedRun.distance`, mm."""
+    one, two = to_numpy(window.world_from_camera), to_numpy(recorded.world_from_camera)
+    apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3]))
+    turned = Rotation.from_matrix(one[:3, :3].T @ two[:3, :3]).magnitude()
+    return apart <= SAME_PLACE * distance and turned <= SAME_TURN
+
+
+def carried_over(camera: Camera, here: Camera, there: Camera, scale: float) -> Camera:
+    """What stands to `there` as `camera` stands to `here`, in a world that is `scale` times as large."""
+    pose, start, end = (to_numpy(item.world_from_camera) for item in (camera, here, there))
+    moved = np.linalg.inv(start) @ pose
+    moved[:3, 3] *= scale
+    return moved_camera(camera, end @ moved)
+
+
+def fitting_view(camera: Camera, aspect: float) -> float:
+    """The vertical field of view in rad with which a window of that width by height shows all that `camera` saw."""
+    across = camera.width / 2 / camera.fx / aspect
+    return 2 * math.atan(max(camera.height / 2 / camera.fy, across))
+
+
+def jump(client: viser.ClientHandle, camera: Camera, unit: float, distance: float, share: float = 1.0) -> None:
+    """Send the browser's camera exactly to a recorded one; it orbits about what lies `distance` mm ahead. share: of the
+    window's width, that is to show it all."""
+    pose = to_numpy(camera.world_from_camera)
+    with client.atomic():
+        # the up direction first, or the orbit controls keep the old roll
+        client.camera.up_direction = -pose[:3, 1]
+        client.camera.position = pose[:3, 3] * unit
+        client.camera.look_at = (pose[:3, 3] + distance * pose[:3, 2]) * unit
+        client.camera.fov = fitting_view(camera, aspect_of(client.camera) * share)
+
+
+class Overlays:
+    """What viser draws over the picture. Nodes are named by number: names of a run go into no path."""
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        loaded: LoadedRun,
+        unit: float,
+        clicked: Callable[[int], None],
+        dragged: Callable[[], None],
+    ) -> None:
+        """clicked: gets the frame whose camera was clicked on; dragged: called when a gizmo moved."""
+        self._scene, self._unit, self._dragged = client.scene, unit, dragged
+        self.cameras = self._scene.add_frame("/cameras", show_axes=False, visible=False)
+        for frame in _frustum_frames(loaded):
+            camera = loaded.recorded.cameras[frame]
+            pose = to_numpy(camera.world_from_camera)
+            frustum = self._scene.add_camera_frustum(
+                f"/cameras/{frame}",
+                fov=field_of_view(camera),
+                aspect=camera.width / camera.height,
+                scale=FRUSTUM_UNITS,
+                thickness=1.5,
+                thickness_units="screen",
+                color=FRUSTUM_COLOR,
+                wxyz=wxyz_of(pose),
+                position=pose[:3, 3] * unit,
+            )
+            frustum.on_click(partial(_click, clicked, frame))
+        self.points = self._add_points(loaded)
+        self._gizmos: dict[str, Any] = {}
+
+    @property
+    def shown(self) -> bool:
+        """Is there anything that the picture's depth must hide or show?"""
+        return bool(self.cameras.visible or (self.points is not None and self.points.visible) or self._gizmos)
+
+    def show(self, cameras: bool, points: bool) -> None:
+        """Which of them are to be seen."""
+        for node, seen in ((self.cameras, cameras), (self.points, points)):
+            if node is not None and node.visible != seen:
+                node.visible = seen
+
+    def add_gizmo(self, name: str, number: int, pose: np.ndarray) -> None:
+        """Show the gizmo of an instrument that stands at `pose` [4, 4] mm."""
+        gizmo = self._scene.add_transform_controls(
+            f"/gizmos/{number}",
+            scale=GIZMO_UNITS,
+            wxyz=wxyz_of(pose),
+            position=pose[:3, 3] * self._unit,
+            depth_test=False,
+        )
+        gizmo.on_update(lambda _: self._dragged())
+        self._gizmos[name] = gizmo
+
+    def remove_gizmo(self, name: str) -> None:
+        """Take an instrument's gizmo away."""
+        gizmo = self._gizmos.pop(name, None)
+        if gizmo is not None:
+            gizmo.remove()
+
+    def gizmo_pose(self, name: str) -> np.ndarray | None:
+        """Where an instrument's gizmo stands [4, 4] mm; None: it has none."""
+        gizmo = self._gizmos.get(name)
+        return None if gizmo is None else pose_of(gizmo.wxyz, gizmo.position, self._unit)
+
+    def _add_points(self, loaded: LoadedRun) -> Any:
+        if loaded.capture is None or not len(loaded.capture.points.positions):
+            return None
+        points = loaded.capture.points
+        chosen = evenly_spaced(len(points.positions), MAX_POINTS)
+        return self._scene.add_point_cloud(
+            "/points",
+            (points.positions[chosen] * self._unit).astype(np.float32),
+            points.colors[chosen].astype(np.float32),
+            point_size=POINT_UNITS,
+            point_shape="circle",
+            precision="float32",
+            visible=False,
+        )
+
+
+def _click(clicked: Callable[[int], None], frame: int, _: object) -> None:
+    clicked(frame)
+
+
+def _frustum_frames(loaded: LoadedRun) -> list[int]:
+    """Frames whose cameras are shown: some from everywhere, none twice in one place."""
+    chosen: dict[bytes, int] = {}
+    for frame in evenly_spaced(len(loaded.recorded.cameras), MAX_FRUSTA):
+        pose = to_numpy(loaded.recorded.cameras[frame].world_from_camera)
+        chosen.setdefault(pose.round(3).tobytes(), frame)
+    return list(chosen.values())
