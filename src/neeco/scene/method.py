@@ -61,7 +61,7 @@ class Method:
 
     @classmethod
     def torch_threads(cls) -> AbstractContextManager[None]:
-        """As many of torch's threads as pay where scenes are posed and drawn: one, unless the operations are large."""
+        """Use one of torch's threads where scenes are posed and drawn, or all where the operations are large."""
         return nullcontext() if cls.large_operations else torch_threads(1)
 
     @classmethod

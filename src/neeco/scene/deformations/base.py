@@ -163,15 +163,15 @@ class Deformation(nn.Module, Method):
         return None
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
+        """Adam learning rate of each of this module's parameters, by name; 0 freezes one. `progress` in [0, 1]."""
         return {}
 
     def between_steps(self, training: GaussianTraining, before: float) -> None:
-        """After every step; `before` is the progress before it: for what is due once a mark has been passed. A step may
-        be several iterations (`batch_size`)."""
+        """After every step; `before` is the progress before it: for what is due at a share of the run. A step may be
+        several iterations (`batch_size`)."""
 
     def finish(self, training: GaussianTraining) -> None:
-        """Find out what is found once learning has ended; may replace the canonical Gaussians."""
+        """After the last step; may replace the canonical Gaussians."""
 
 
 class LabelledByMotion(Deformation):
