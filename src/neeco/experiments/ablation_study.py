@@ -125,7 +125,7 @@ class AblationResult:
 
 
 def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | None = None) -> AblationResult:
-    """Train and score every variant of the chosen tables, write DIR/ablation.json and return what it holds.
+    """Train and score every variant of the chosen tables, write DIR/ablation.json and DIR/tables/, return the first.
 
     Runs lie in DIR/runs/, derived captures in DIR/captures/. What is finished is not done again; the same command goes
     on after an interruption. A run that fails leaves its cells empty and its reason under "failures". Raises NeecoError
@@ -168,6 +168,7 @@ def run_ablations(plan: AblationPlan, progress: Callable[[JobEvent], None] | Non
         ],
     )
     write_json(plan.output / "ablation.json", plain(result))
+    write_tables(plan.output, result.tables)
     return result
 
 
