@@ -15,7 +15,20 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notes/*
 SPOKEN = [page for page in PAGES if page.parent.name != "notes" and page.name not in ("CHANGELOG.md", "glossary.md")]
 # classes, functions, arguments and variables of 0.1 that are no terms of the field; docs/glossary.md has today's words
 OLD_NAMES = {
-    *("Artist", "Sitter", "Visitor", "Studio", "Pace", "Guard", "Keeper", "Crew", "Parcel", "Maker", "Wishes", "Answer"),
+    *(
+        "Artist",
+        "Sitter",
+        "Visitor",
+        "Studio",
+        "Pace",
+        "Guard",
+        "Keeper",
+        "Crew",
+        "Parcel",
+        "Maker",
+        "Wishes",
+        "Answer",
+    ),
     *("Teaching", "casts", "goes_native", "photograph", "made_up", "rim", "lost", "told", "said", "kept", "standings"),
     *("shots", "warm_up", "drawn"),
 }

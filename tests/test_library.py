@@ -94,9 +94,7 @@ def test_a_scene_draws_states_given_as_arrays_tensors_and_lists_alike(folder: Pa
     state, camera = scene.recorded[3]
     (name, given), *_ = state.instruments.items()
     convert: tuple[Callable, ...] = (np.asarray, torch.as_tensor, lambda pose: pose.tolist())
-    drawn = [
-        scene.draw(neeco.State({name: (to(given.pose), given.joints)}, state.time), camera) for to in convert
-    ]
+    drawn = [scene.draw(neeco.State({name: (to(given.pose), given.joints)}, state.time), camera) for to in convert]
     assert isinstance(neeco.State({name: (given.pose, {})}).instruments[name], InstrumentState)
     height, width = camera.height, camera.width
     assert drawn[0].image.shape == (height, width, 3)
