@@ -30,7 +30,7 @@ OLD_NAMES = {
         "Answer",
     ),
     *("Teaching", "casts", "goes_native", "photograph", "made_up", "rim", "lost", "told", "said", "kept", "standings"),
-    *("shots", "warm_up", "drawn"),
+    *("shots", "drawn"),
 }
 # fields of files that 0.1 wrote and that are read as they are
 FILE_FIELDS: set[str] = set()

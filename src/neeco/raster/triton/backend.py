@@ -102,5 +102,5 @@ class _Rasterize(torch.autograd.Function):
             to_background = ((1 - alpha)[..., None] * to_color).sum(dim=(0, 1))
         grads = [to.means, to.quats, to.scales, to.opacities, to.sh, to.falloff, to.channels, to.left]
         grads += [to.vignette, to.pose]
-        gradients = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
-        return to.centers, None, None, *gradients, to_background, None
+        needed = [gradient if need else None for gradient, need in zip(grads, wanted, strict=False)]
+        return to.centers, None, None, *needed, to_background, None
