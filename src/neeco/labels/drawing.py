@@ -87,7 +87,7 @@ def draw_layers(
     Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
     """
     gaussians = scene.at(state)
-    learned_camera = scene.camera(camera)
+    learned_camera = camera
     owners = labeller.owners(state, gaussians)
     unobserved = scene.unobserved(gaussians, learned_camera)
     rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, unobserved)
