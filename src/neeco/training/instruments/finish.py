@@ -134,7 +134,7 @@ def drop_occluded(scene: Scene) -> CanonicalGaussians:
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
     for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
-        camera = scene.camera(recorded.cameras[index])
+        camera = recorded.cameras[index]
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         visible += visible_pixels(posed, camera)
