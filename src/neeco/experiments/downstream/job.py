@@ -229,7 +229,8 @@ class DownstreamJob:
         """What a folder must agree with to be this job's. Its keys are those of job.json, for good."""
         settings, kind = self.settings, model_class(self.model)
         finish = f"{settings.finetune_share} of the steps, {settings.finetune_epochs} rounds at most"
-        held_out = {"validation_every": settings.validation_every, "min_validated": settings.min_validated}
+        held_out = ("validation_every", "min_validated")  # part of it only where they are not the usual
+        changed = {key: getattr(settings, key) for key in held_out}
         return {
             "model": self.model,
             "condition": self.condition.name,
@@ -247,7 +248,7 @@ class DownstreamJob:
             "side": settings.size or kind.image_size,
             "batch": settings.batch_of(kind),
             "weights": absolute(settings.weights.get(self.model)),
-        } | {key: value for key, value in held_out.items() if value != getattr(DownstreamSettings, key)}
+        } | {key: value for key, value in changed.items() if value != getattr(DownstreamSettings, key)}
 
     def check(self) -> None:
         """Raises NeecoError when the folder holds another job's result."""
