@@ -181,7 +181,7 @@ def test_numbers_are_also_written_where_asked(world, tmp_path, monkeypatch):
     monkeypatch.setattr("neeco.training.run.load_run", lambda path, device: run)
     assert main(["evaluate", str(run.path), "--json", str(tmp_path / "new" / "scores.json")]) == 0
     assert (tmp_path / "new" / "scores.json").read_text() == (run.path / "evaluation.json").read_text()
-    assert "photographs it never saw. " in (run.path / "report.html").read_text()
+    assert "images it never saw. " in (run.path / "report.html").read_text()
 
 
 def test_the_device_is_waited_for_before_a_clock_is_read(world, tmp_path, monkeypatch):

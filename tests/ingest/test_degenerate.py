@@ -47,15 +47,15 @@ def told(result: IngestResult, text: str) -> bool:
 def test_frames_without_a_camera_are_left_out_and_listed(recorded):
     recorded.mapped = lambda number: number < 26
     result = run(recorded, laparoscope=None)
-    assert result.kept.max() < 26
+    assert result.selected.max() < 26
     assert any("no camera" in why for frame, why in result.dropped if frame >= 26)
 
 
 def test_frames_in_a_gap_of_the_tracker_are_left_out(recorded):
     keep_rows(recorded.folder / "instrument.csv", lambda t: not 0.5 < t < 0.9)
     result = run(recorded, laparoscope=None)
-    assert len(result.kept) > 0
-    assert not ((result.kept_times > 0.5) & (result.kept_times < 0.8)).any()
+    assert len(result.selected) > 0
+    assert not ((result.selected_times > 0.5) & (result.selected_times < 0.8)).any()
     assert told(result, "gap")
 
 
@@ -80,7 +80,7 @@ def test_two_instruments_and_a_split_by_the_second_ones_joint(recorded):
 def test_a_joint_log_that_ends_early_ends_the_capture_there(recorded):
     keep_rows(recorded.folder / "jaw.csv", lambda t: t < 1.0)
     result = run(recorded, laparoscope=None)
-    assert result.kept_times.max() < 1.02
+    assert result.selected_times.max() < 1.02
     assert any("no instrument state" in why for _, why in result.dropped)
 
 

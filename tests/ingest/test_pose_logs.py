@@ -36,9 +36,9 @@ def test_aurora_export_with_its_states_and_bad_float(world):
         lines.append(["1", "Port 1", 1000 + number, state, *map(float, cells), 0.12, "OK", 1.0, 2.0, 3.0])
     header = "Tools,Port,Frame,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,State,Tx,Ty,Tz"
     log = read_pose_log(PoseColumns(world.write(header, lines), rate_hz=40.0))
-    kept = np.delete(np.arange(200), [7, 8, 30])
-    assert_same(log, world, world.times[kept])
-    np.testing.assert_allclose(log.times - log.times[0], world.times[kept], atol=1e-9)
+    selected = np.delete(np.arange(200), [7, 8, 30])
+    assert_same(log, world, world.times[selected])
+    np.testing.assert_allclose(log.times - log.times[0], world.times[selected], atol=1e-9)
     assert any("2 rows dropped: State is 'MISSING' (lines 9, 10)" in note for note in log.notes)
     assert any("1 row dropped: State is 'Out of Volume' (line 32)" in note for note in log.notes)
 
@@ -164,9 +164,9 @@ def test_rows_out_of_order_twice_or_damaged_are_noted(world):
     rows[80][5] = "x7"
     rows[90] = rows[90][:5]
     log = read_pose_log(PoseColumns(world.write(HEADER, rows)))
-    kept = np.delete(np.arange(200), [69, 79, 89])
-    np.testing.assert_allclose(log.times, world.times[kept])
-    assert_same(log, world, world.times[kept])
+    selected = np.delete(np.arange(200), [69, 79, 89])
+    np.testing.assert_allclose(log.times, world.times[selected])
+    assert_same(log, world, world.times[selected])
     notes = "\n".join(log.notes)
     assert "1 row dropped: values are missing (line 72)" in notes
     assert "2 rows dropped: not readable, first: qx is 'x7', not a number (lines 82, 92)" in notes

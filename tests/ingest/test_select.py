@@ -35,8 +35,8 @@ def test_a_frame_like_the_one_before_is_dropped_unless_the_instrument_moved() ->
     features = frame_features(picture(4 * min(i, 20)) for i in range(30))
     still = STATES.copy()
     still[25:] = still[24]
-    kept, _ = choose_frames(features, np.ones(30, dtype=bool), still, None)
-    assert kept.tolist() == list(range(25))
+    selected, _ = choose_frames(features, np.ones(30, dtype=bool), still, None)
+    assert selected.tolist() == list(range(25))
 
 
 def test_a_limit_keeps_extremes_and_both_ends() -> None:
@@ -44,9 +44,9 @@ def test_a_limit_keeps_extremes_and_both_ends() -> None:
     states = STATES.copy()
     states[:, 5] = 0.0
     states[17, 5] = 3.0  # a state like no other
-    kept, _ = choose_frames(features, np.ones(30, dtype=bool), states, 6)
-    assert len(kept) == 6
-    assert {0, 17, 29} <= set(kept.tolist())
+    selected, _ = choose_frames(features, np.ones(30, dtype=bool), states, 6)
+    assert len(selected) == 6
+    assert {0, 17, 29} <= set(selected.tolist())
 
 
 def test_frames_without_a_state_are_dropped() -> None:

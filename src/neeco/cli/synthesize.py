@@ -45,9 +45,9 @@ def run(arguments: Arguments) -> int:
 
     settings = arguments.settings
     settings.check()
-    drawn, instrument_runs = _runs(arguments)
+    run_path, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
-    with open_run(drawn, device) as trained, counting("synthesize", settings.count) as advance:
+    with open_run(run_path, device) as trained, counting("synthesize", settings.count) as advance:
         others = [load_run(cast, device) for cast in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(

@@ -163,7 +163,7 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
     image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((recorded.tissue & counted).sum())
-    drawn = None if drawing.parts is None or reference is None else drawing.parts > 0
+    predicted = None if drawing.parts is None or reference is None else drawing.parts > 0
     shown = image if mask is None else torch.where(mask[..., None], image, target)
     lpips = {
         name: network.between(network.features(shown), recorded.features[name], mask)
@@ -174,8 +174,8 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
         "ssim": ssim(image, target, mask),
         **{key: lpips.get(name) for name, key in LPIPS_KEYS.items()},
         "psnr_instrument": None if reference is None else psnr(image, target, counted & reference.mask),
-        "mask_iou": None if reference is None or drawn is None else iou(drawn, reference.mask, counted),
-        "mask_dice": None if reference is None or drawn is None else dice(drawn, reference.mask, counted),
+        "mask_iou": None if reference is None or predicted is None else iou(predicted, reference.mask, counted),
+        "mask_dice": None if reference is None or predicted is None else dice(predicted, reference.mask, counted),
         "psnr_covered": psnr(image, target, counted & ~recorded.unobserved),
         "psnr_uncovered": psnr(image, target, counted & recorded.unobserved),
         "covered_fraction": 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None,

@@ -62,12 +62,13 @@ def choose_frames(
             dropped[i] = f"the same as frame {last}: neither picture nor state changed"
         else:
             last = i
-    kept = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
-    if count is not None and len(kept) > count:
-        chosen = kept[_farthest_points(_embedding(features, states)[kept], count)]
-        dropped |= {int(i): f"not among the {count} that cover states and views best" for i in set(kept) - set(chosen)}
-        kept = np.sort(chosen)
-    return kept, dropped
+    selected = np.array([i for i in range(len(usable)) if i not in dropped], dtype=int)
+    if count is not None and len(selected) > count:
+        chosen = selected[_farthest_points(_embedding(features, states)[selected], count)]
+        reason = f"not among the {count} that cover states and views best"
+        dropped |= dict.fromkeys((int(i) for i in set(selected) - set(chosen)), reason)
+        selected = np.sort(chosen)
+    return selected, dropped
 
 
 def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:

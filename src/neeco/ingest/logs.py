@@ -309,9 +309,9 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
-    table, kept = rows.table, np.flatnonzero(rows.keep)
-    order = kept[np.argsort(times[kept], kind="stable")]
-    late = kept[1:][times[kept][1:] < np.maximum.accumulate(times[kept])[:-1]]
+    table, usable = rows.table, np.flatnonzero(rows.keep)
+    order = usable[np.argsort(times[usable], kind="stable")]
+    late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]

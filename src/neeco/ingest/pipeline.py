@@ -35,12 +35,12 @@ class IngestResult:
     video_frames: int
     video_fps: float
     size: tuple[int, int]  # width, height px
-    kept: np.ndarray  # [K] indices of the video frames in the capture
-    kept_times: np.ndarray  # [K] s, video clock
+    selected: np.ndarray  # [K] indices of the video frames in the capture
+    selected_times: np.ndarray  # [K] s, video clock
     dropped: tuple[tuple[int, str], ...]  # video frame, why
     clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
     registration: Registration | None  # None: instrument poses stay in their tracker's frame
-    registered_frames: np.ndarray  # [R] row of `kept` of each entry of `registration.used`; -1: not in the capture
+    registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
     reprojection_px: float | None  # None: cameras were not found by SfM
     points: int
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
@@ -67,7 +67,7 @@ class IngestResult:
         return {
             "capture": str(self.capture),
             "video_frames": self.video_frames,
-            "kept": len(self.kept),
+            "kept": len(self.selected),
             "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
             "clocks": clocks,
             "registration": registration,
@@ -105,8 +105,8 @@ class _Ingest:
         self.size = self.data.video.size
         self.lens = self._read_lens()
         self.dropped: dict[int, str] = {}  # video frame -> why
-        self.kept = self._choose()  # [K] video frames
-        self.names = [f"{frame:06d}.png" for frame in self.kept]
+        self.selected = self._choose()  # [K] video frames
+        self.names = [f"{frame:06d}.png" for frame in self.selected]
         self._write_images()
         (folder / "sfm").mkdir()
         self.visible = self._write_visible()
@@ -163,23 +163,23 @@ class _Ingest:
         features = frame_features(images())
         states, usable = data.coverage_states()
         limit = self.recording.frames or self.settings.max_frames
-        kept, self.dropped = choose_frames(features, usable, states, limit, self.settings.min_sharpness)
+        selected, self.dropped = choose_frames(features, usable, states, limit, self.settings.min_sharpness)
         if self.recording.frames is None and count > limit:
             data.note(f"{limit} of {count} frames are kept; ask for more with --frames")
-        if len(kept) < MIN_FRAMES:
+        if len(selected) < MIN_FRAMES:
             reasons = Counter(why.split(":")[0] for why in self.dropped.values())
             why = reasons.most_common(1)[0][0] if reasons else "the video is short"
             raise NeecoError(
-                f"{data.video.path}: only {len(kept)} of {count} frames are usable (at least {MIN_FRAMES} are "
+                f"{data.video.path}: only {len(selected)} of {count} frames are usable (at least {MIN_FRAMES} are "
                 f"needed); most are dropped because: {why}"
             )
-        return kept
+        return selected
 
     def _write_images(self) -> None:
         """Frames as PNG: as recorded while the lens is unknown, else undistorted."""
         folder = self.folder / "raw"
         folder.mkdir(exist_ok=True)
-        frames = self.data.video.read(self.kept.tolist())
+        frames = self.data.video.read(self.selected.tolist())
         for done, (name, (_, image)) in enumerate(zip(self.names, frames, strict=True)):
             self.progress("writing frames", done, len(self.names))
             straight = self.lens.undistort(image) if self.lens else image
@@ -188,7 +188,7 @@ class _Ingest:
     def _write_visible(self) -> Path | None:
         """Masks of the endoscope's dark border, one file per frame as SfM wants them; None without a border."""
         count = len(self.names)
-        sample = self.kept[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
+        sample = self.selected[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
         seen = visible_mask(image for _, image in self.data.video.read(np.unique(sample).tolist()))
         if seen is None:
             return None
@@ -205,7 +205,7 @@ class _Ingest:
 
     def _times(self, sfm: SfmResult) -> np.ndarray:
         """[M] s of the frames that got a camera."""
-        return self.data.times[self.kept[sfm.indices]]
+        return self.data.times[self.selected[sfm.indices]]
 
     def _register(self, sfm: SfmResult) -> Registration | None:
         """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
@@ -287,9 +287,9 @@ class _Ingest:
     ) -> IngestResult:
         """States at every frame's time, splits, and the capture on disk."""
         data = self.data
-        for index in set(range(len(self.kept))) - set(sfm.indices.tolist()):
-            self.dropped[int(self.kept[index])] = "no camera: too few of its features match other frames"
-        frames, times = self.kept[sfm.indices], self._times(sfm)
+        for index in set(range(len(self.selected))) - set(sfm.indices.tolist()):
+            self.dropped[int(self.selected[index])] = "no camera: too few of its features match other frames"
+        frames, times = self.selected[sfm.indices], self._times(sfm)
         cameras, points = self._placed(sfm, registration)
         states, usable = data.states_at(times)
         for frame in frames[~usable]:

@@ -148,15 +148,15 @@ def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:
     return keep[components]
 
 
-def without_components(share: np.ndarray, kept: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+def without_components(share: np.ndarray, remaining: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     """The share of instrument [H, W] with 0 in a mask's dropped components and in what fades around them.
 
-    kept, dropped: bool [H, W], together the mask. A pixel of neither that is not clearly instrument goes with the
+    remaining, dropped: bool [H, W], together the mask. A pixel of neither that is not clearly instrument goes with the
     component nearest to it.
     """
     if not dropped.any():
         return share
-    fading = ~kept & (share < CLEAR_SHARES[1]) & (_distance_to(dropped) < _distance_to(kept))
+    fading = ~remaining & (share < CLEAR_SHARES[1]) & (_distance_to(dropped) < _distance_to(remaining))
     return np.where(dropped | fading, np.float32(0), share)
 
 
@@ -168,8 +168,9 @@ def _drop_small_components(
         ids = [k + 1 for k, (owner, _) in enumerate(names) if owner == instrument]
         keep = torch.from_numpy(without_small_components(np.isin(parts.numpy(), ids), min_component))
         cleaned[keep] = parts[keep]
-    kept = (cleaned > 0).numpy()
-    return cleaned, torch.from_numpy(without_components(share.numpy(), kept, dropped=(parts > 0).numpy() & ~kept))
+    remaining = (cleaned > 0).numpy()
+    dropped = (parts > 0).numpy() & ~remaining
+    return cleaned, torch.from_numpy(without_components(share.numpy(), remaining, dropped))
 
 
 def _distance_to(pixels: np.ndarray) -> np.ndarray:

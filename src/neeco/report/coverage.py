@@ -69,9 +69,9 @@ def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) ->
             columns.append((joint, "mm" if sliding else "deg", values if sliding else np.degrees(values)))
         for name, unit, values in columns:
             known = np.isfinite(values)
-            kept = tuple(split for split, keep in zip(splits, known, strict=True) if keep)
+            shown = tuple(split for split, keep in zip(splits, known, strict=True) if keep)
             if known.any():
-                degrees.append(Degree(instrument.name, name, unit, values[known], kept))
+                degrees.append(Degree(instrument.name, name, unit, values[known], shown))
     return degrees
 
 
@@ -134,15 +134,15 @@ def histogram(degree: Degree) -> str:
     shaded."""
     low, high = float(degree.values.min()), float(degree.values.max())
     trained = degree.trained
-    said = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
+    caption = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
     axes = new_axes((340, 150), 12, 12, 28, 22)
     axes.set_title(f"{degree.name}, {degree.unit}")
     axes.set_yticks([])
     if high - low < CONSTANT:
         axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
         axes.set_xticks([])
-        return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
-    axes.set_title(said, loc="right", fontsize=11, color=PALETTE["soft"])
+        return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {caption}")
+    axes.set_title(caption, loc="right", fontsize=11, color=PALETTE["soft"])
     axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
     left, right = axes.get_xlim()
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
@@ -151,7 +151,7 @@ def histogram(degree: Degree) -> str:
     _draw_bars(axes, degree, np.linspace(low, high, BINS + 1))
     axes.axhline(0, color=PALETTE["edge"], linewidth=1)
     round_ticks(axes.xaxis, 4, _number)
-    return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
+    return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {caption}")
 
 
 def _draw_bars(axes: Axes, degree: Degree, edges: np.ndarray) -> None:
@@ -159,9 +159,9 @@ def _draw_bars(axes: Axes, degree: Degree, edges: np.ndarray) -> None:
     floor = np.zeros(BINS)
     for name in names:
         count = np.histogram(degree.of(name), edges)[0]
-        kept, color = count > 0, PALETTE[SPLIT_COLORS.get(name, "soft")]
+        shown, color = count > 0, PALETTE[SPLIT_COLORS.get(name, "soft")]
         middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
-        axes.bar(middles[kept], count[kept], 0.92 * width, floor[kept], color=color)
+        axes.bar(middles[shown], count[shown], 0.92 * width, floor[shown], color=color)
         floor += count
     axes.set_ylim(0, max(1.0, floor.max()))
 

@@ -58,7 +58,7 @@ def _residuals(result: IngestResult) -> dict[str, Any]:
         return {"residuals": []}
     rows = result.registered_frames.astype(int)
     shown = rows >= 0  # frames that helped to register but were left out of the capture afterwards have no row
-    times = result.kept_times[rows[shown]] - result.kept_times.min()
+    times = result.selected_times[rows[shown]] - result.selected_times.min()
     positions, turns = registration.position_residual, np.degrees(registration.rotation_residual)
     position, rotation = rms(positions), rms(turns)
     charts = [
@@ -83,7 +83,7 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
 def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
     """Sample frames as (picture, which frame, its second, its split), and the key to what is drawn over them."""
     length = figures.axis_length(capture)
-    numbers = dict(zip(np.round(result.kept_times, 6).tolist(), result.kept.tolist(), strict=True))
+    numbers = dict(zip(np.round(result.selected_times, 6).tolist(), result.selected.tolist(), strict=True))
     start = min(frame.state.time for frame in capture.frames)
     samples = []
     for picture, frame in figures.sample_figures(capture, result.shapes, axes, length):

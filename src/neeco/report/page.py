@@ -51,10 +51,10 @@ def now() -> datetime:
     return datetime.now().astimezone()
 
 
-def difference(image: np.ndarray, photograph: np.ndarray, counted: Tensor | None) -> str:
+def difference(image: np.ndarray, recorded: np.ndarray, counted: Tensor | None) -> str:
     """The difference map of two images [H, W, 3] as a data URI; black also where `counted` [H, W] is False."""
-    compared = image if counted is None else np.where(counted.numpy()[..., None], image, photograph)
-    return png(difference_map(compared, photograph))
+    compared = image if counted is None else np.where(counted.numpy()[..., None], image, recorded)
+    return png(difference_map(compared, recorded))
 
 
 def jpeg(pixels: np.ndarray) -> str:

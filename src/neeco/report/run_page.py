@@ -34,7 +34,7 @@ class Score(NamedTuple):
 
 
 SCORES = (
-    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the photograph's; 30 is close, 20 is rough."),
+    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the recorded ones; 30 is close, 20 is rough."),
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
@@ -48,7 +48,7 @@ SCORES = (
 )  # fmt: skip
 KINDS = {
     "given": "As given: drawn at the poses the capture states, tracker errors included",
-    "aligned": "Aligned: instrument and camera pose fitted to each photograph first, the scene unchanged",
+    "aligned": "Aligned: instrument and camera pose fitted to each image first, the scene unchanged",
 }
 KIND_NAMES = {"given": "as given", "aligned": "aligned"}
 PARTS = ("shaft", "wrist", "jaws", "jaw_left", "jaw_right")
@@ -90,7 +90,7 @@ def write_report(
         part_head=["split", *(part.replace("_", " ") for part in PARTS), "jaws matched"],
         parts=_parts(evaluation),
         figures=figures,
-        drawn=KIND_NAMES[kind],
+        pose_kind=KIND_NAMES[kind],
         full_scale=FULL_SCALE,
         tints=_tints(scene),
         curves=_curves(rows),
@@ -138,18 +138,18 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
 def _figure(capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]) -> FrameFigure:
     state, camera = _poses(frame, row)
     drawing = draw(scene, state, camera)
-    photograph, image = frame.load_image().numpy(), drawing.image.numpy()
+    recorded, image = frame.load_image().numpy(), drawing.image.numpy()
     reference = load_reference(capture, frame)
     pictures = [
-        ("photograph", jpeg(to_bytes(photograph))),
+        ("recorded", jpeg(to_bytes(recorded))),
         ("drawn", jpeg(to_bytes(image))),
-        ("difference", difference(image, photograph, frame.load_mask())),
+        ("difference", difference(image, recorded, frame.load_mask())),
     ]
     if drawing.parts is not None:
-        overlay = overlay_parts(photograph, drawing.parts.numpy())
+        overlay = overlay_parts(recorded, drawing.parts.numpy())
         if reference is not None:
             overlay = overlay_outline(overlay, reference.mask.numpy())
-        pictures.append(("label mask over photograph", jpeg(overlay)))
+        pictures.append(("label mask over recorded image", jpeg(overlay)))
     return FrameFigure(split, frame.name, why, tuple(_scores(row)), tuple(pictures))
 
 
@@ -246,11 +246,13 @@ def _curves(rows: list[dict[str, Any]]) -> list[str]:
 
 def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
     """What the scene says about its own joints, from training data alone."""
-    told = _flat(diagnostics)
-    judged = [key.split(" · ")[-1] == "verdict" for key, _ in told]
+    entries = _flat(diagnostics)
+    judged = [key.split(" · ")[-1] == "verdict" for key, _ in entries]
     return {
-        "diagnostics": [(key, _plain(value)) for (key, value), judges in zip(told, judged, strict=True) if not judges],
-        "verdicts": [value for (_, value), judges in zip(told, judged, strict=True) if judges],
+        "diagnostics": [
+            (key, _plain(value)) for (key, value), judges in zip(entries, judged, strict=True) if not judges
+        ],
+        "verdicts": [value for (_, value), judges in zip(entries, judged, strict=True) if judges],
     }
 
 

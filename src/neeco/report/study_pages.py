@@ -196,11 +196,11 @@ def _result_sections(comparison: ComparisonResult) -> list[Section]:
     sections = []
     for table in tables_of(comparison):
         for of_masks, title in ((False, table.title), (True, f"{table.title}: masks")):
-            kept = [k for k, column in enumerate(table.columns) if (column.key in MASK_METRICS) == of_masks]
-            rows = [replace(row, cells=tuple(row.cells[k] for k in kept)) for row in table.rows]
+            indices = [k for k, column in enumerate(table.columns) if (column.key in MASK_METRICS) == of_masks]
+            rows = [replace(row, cells=tuple(row.cells[k] for k in indices)) for row in table.rows]
             shown = [row for row in rows if row.failed is not None or any(cell.text != UNKNOWN for cell in row.cells)]
-            part = replace(table, columns=tuple(table.columns[k] for k in kept), rows=tuple(shown))
-            if kept:
+            part = replace(table, columns=tuple(table.columns[k] for k in indices), rows=tuple(shown))
+            if indices:
                 split = table.title.removeprefix("split ")
                 sections.append(Section(title=title, split=split, level=3, results=part))
     return sections
@@ -240,15 +240,15 @@ def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) 
                 place = {"split": frame.split, "frame": frame.name, "name": name, "seed": seed}
                 scores[index].append(place | {"psnr": score})
     sections = []
-    for frame, drawn in zip(chosen, images, strict=True):
+    for frame, pictures in zip(chosen, images, strict=True):
         recorded_image, reference = to_bytes(frame.load_image().numpy()), load_reference(capture, frame)
         shown = [jpeg(recorded_image)]
         if reference is not None:
             shown.append(jpeg(overlay_outline(recorded_image, reference.mask.numpy())))
         recording = Images("recorded image", tuple(shown), f"recorded image, frame {frame.name}")
-        if drawn:
+        if pictures:
             title = f"{frame.split}, frame {frame.name}"
-            sections.append(Section(title=title, level=3, images=[recording, *drawn]))
+            sections.append(Section(title=title, level=3, images=[recording, *pictures]))
     return sections, csv_text(["split", "frame", "name", "seed", "psnr"], [row for rows in scores for row in rows])
 
 

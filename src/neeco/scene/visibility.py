@@ -95,9 +95,9 @@ def visible_pixels(posed: Gaussians, camera: Camera) -> Tensor:
     channel = torch.ones_like(posed.opacities)[:, None].requires_grad_()
     with torch.enable_grad():
         unlit = replace(posed, sh=posed.sh[:, :1], headlight=None)
-        drawn = rasterize(unlit, camera, channels=channel).channels
-        assert drawn is not None
-        (pixels,) = torch.autograd.grad(drawn.sum(), channel)
+        composited = rasterize(unlit, camera, channels=channel).channels
+        assert composited is not None
+        (pixels,) = torch.autograd.grad(composited.sum(), channel)
     return pixels[:, 0]
 
 

@@ -205,15 +205,15 @@ class _Errors:
 
     label: np.ndarray
     beside: np.ndarray
-    drawn: np.ndarray
+    whole: np.ndarray
     tissue: np.ndarray
 
 
 def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | None]]) -> TypicalErrors:
     """From drawings of frames trained on, each with its image [H, W, 3] and loss mask."""
     errors = [_errors(*drawing) for drawing in drawings]
-    inside = np.concatenate([frame.drawn[frame.label] for frame in errors])
-    beside = np.concatenate([frame.drawn[frame.beside] for frame in errors])
+    inside = np.concatenate([frame.whole[frame.label] for frame in errors])
+    beside = np.concatenate([frame.whole[frame.beside] for frame in errors])
     return TypicalErrors(
         *(round(float(np.quantile(values, USUAL)), 5) if len(values) else 1.0 for values in (inside, beside))
     )
@@ -228,9 +228,9 @@ def estimate_trust(
     diagonal away do.
     """
     errors = _errors(drawing, image, mask, beside)
-    unexplained = (errors.drawn > typical.inside) & (errors.drawn > HALF * errors.tissue)
-    against = errors.label & ((errors.drawn > errors.tissue) | unexplained)
-    missed = errors.beside & (errors.drawn > typical.beside)
+    unexplained = (errors.whole > typical.inside) & (errors.whole > HALF * errors.tissue)
+    against = errors.label & ((errors.whole > errors.tissue) | unexplained)
+    missed = errors.beside & (errors.whole > typical.beside)
     size = max(1, int(errors.label.sum()))
     left_out, added = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
     return Trust((int(errors.label.sum()) - left_out) / (size + added), left_out / size, added / size)
@@ -242,8 +242,8 @@ def _errors(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, beside:
     away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
     near = ~label & (away <= beside * float(np.hypot(*label.shape)))
     assert drawing.tissue_image is not None
-    drawn, tissue = (
+    whole, tissue = (
         uniform_filter((rendered - image).abs().mean(2).numpy(), SMOOTH)
         for rendered in (drawing.image, drawing.tissue_image)
     )
-    return _Errors(label & votes, near & votes, drawn, tissue)
+    return _Errors(label & votes, near & votes, whole, tissue)

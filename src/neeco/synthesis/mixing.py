@@ -190,10 +190,10 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
     Beyond the image's border, that of the nearest pixel.
     """
     coarse = resize_camera(camera, DEPTH_SCALE)
-    drawn = rasterize(tissue, coarse)
+    rendering = rasterize(tissue, coarse)
     x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
     row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))
-    return float(surface_depth(drawn)[row, column])
+    return float(surface_depth(rendering)[row, column])
 
 
 def _merged(tissue: Scene, instrument_scenes: Sequence[Scene], gains: Sequence[tuple[float, float, float]]) -> Scene:

@@ -256,14 +256,14 @@ def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[R
     try:
         with readable_failures(), tempfile.TemporaryDirectory() as folder:
             generator = _opened(packed)
-            drawn = []
+            samples = []
             for index in indices:
                 draw_to_folder(generator, Path(folder), index)
                 record = load_record(Path(folder), index)
                 assert record is not None
                 names = [record_path(Path(), index).as_posix(), *(() if record.get("skipped") else files_of(index))]
-                drawn.append((record, {name: (Path(folder) / name).read_bytes() for name in names}))
-            return drawn
+                samples.append((record, {name: (Path(folder) / name).read_bytes() for name in names}))
+            return samples
     except NeecoError as error:
         return str(error)
 

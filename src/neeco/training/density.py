@@ -66,12 +66,12 @@ def control_density(
             strongest = gradients[wanted].argsort(descending=True, stable=True)
             grow[wanted[strongest[room:]]] = False
     clone, split = grow & small, grow & ~small
-    kept, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
-    index = torch.cat([kept, cloned, halves, halves])
+    remaining, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
+    index = torch.cat([remaining, cloned, halves, halves])
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
-    fresh[len(kept) :] = True
+    fresh[len(remaining) :] = True
     is_half = torch.zeros_like(fresh)
-    is_half[len(kept) + len(cloned) :] = True
+    is_half[len(remaining) + len(cloned) :] = True
     order = bodies[index].argsort(stable=True)  # bodies stay contiguous
     index, fresh, is_half = index[order], fresh[order], is_half[order]
     counts = tuple(int((bodies[index] == body).sum()) for body in range(len(max_gaussians)))

@@ -157,8 +157,8 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
     scene = session.scene
     posed: Gaussians = scene.at(state)
     instrument = scene.canonical.bodies > 0
-    kept = ~instrument | (posed.opacities > FAINT_OPACITY)
-    posed, instrument = posed.select(kept), instrument[kept]
+    casting = ~instrument | (posed.opacities > FAINT_OPACITY)
+    posed, instrument = posed.select(casting), instrument[casting]
     among = Casting.of(posed, instrument, camera)
     missed = blocked(among, scene.shadow_width, offsets, rasterize)  # [C, N]
     channels = torch.stack([instrument.float(), *missed], 1)  # [N, 1 + C]
