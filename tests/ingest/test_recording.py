@@ -182,7 +182,7 @@ def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder)
             r"settings\.shape_frames: 0 is out of range; give a whole number, 1 or",
         ),
         (
-            "shape_frames: 20",
+            "tracker_noise_mm: 1",
             "tracker_noise_mm: 0",
             r"settings\.tracker_noise_mm: 0 is out of range; give a number above",
         ),
