@@ -34,7 +34,7 @@ class Score(NamedTuple):
 
 
 SCORES = (
-    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the recorded ones; 30 is close, 20 is rough."),
+    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the recorded; 30 is close, 20 is rough."),
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
