@@ -20,6 +20,12 @@ SURE = 30.0  # a part logit that leaves no doubt
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=61.0, cx=32.0, cy=24.0, width=64, height=48)
 
 
+def rounding(scale: float, products: int) -> float:
+    """By how much two float32 sums of `products` terms may differ where a library adds them in another order, as it
+    does for tensors of another shape: errors of eps * `scale` (the largest sum) each, most of which cancel."""
+    return 4 * torch.finfo(torch.float32).eps * products**0.5 * scale
+
+
 def pose_of(*vector: float) -> Tensor:
     """[4, 4] float64 from a rotation vector (rad) and a translation (mm)."""
     return rigid_from_vector(torch.tensor(vector, dtype=torch.float64))

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from neeco.evaluation.align import AlignConfig, align_frame, pose_change
+from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_change
 
 
 @pytest.fixture(scope="module")
@@ -26,26 +26,30 @@ LOOSE = AlignConfig(
 )
 
 
+def align(scene, frame, config=None) -> Fit:
+    return fit_frame(scene, frame, frame.load_image(), config=config)
+
+
 def test_a_displaced_instrument_and_camera_are_found_again(world, scene_and_frame):
     scene, frame = scene_and_frame
     wrong = world.moved(frame, world.translation(1.2, -1.0, yaw=0.03), world.translation(0.6, 0.4))
-    state, camera = align_frame(scene, wrong, LOOSE)
+    fit = align(scene, wrong, LOOSE)
     truth = frame.state.instruments["bar"]
     before = pose_change(truth.pose, wrong.state.instruments["bar"].pose)
-    after = pose_change(truth.pose, state.instruments["bar"].pose)
+    after = pose_change(truth.pose, fit.state.instruments["bar"].pose)
     assert after["mm"] < 0.25 * before["mm"]
     assert after["deg"] < 0.5 * before["deg"]
     true_camera = frame.camera.world_from_camera
-    left = pose_change(true_camera, camera.world_from_camera)["mm"]
+    left = pose_change(true_camera, fit.camera.world_from_camera)["mm"]
     assert left < 0.5 * pose_change(true_camera, wrong.camera.world_from_camera)["mm"]
 
 
 def test_right_poses_stay_where_they_are(scene_and_frame):
     scene, frame = scene_and_frame
-    state, camera = align_frame(scene, frame)
-    assert pose_change(frame.state.instruments["bar"].pose, state.instruments["bar"].pose)["mm"] < 0.05
-    assert pose_change(frame.camera.world_from_camera, camera.world_from_camera)["mm"] < 0.05
-    assert camera.world_from_camera.dtype == frame.camera.world_from_camera.dtype
+    fit = align(scene, frame)
+    assert pose_change(frame.state.instruments["bar"].pose, fit.state.instruments["bar"].pose)["mm"] < 0.05
+    assert pose_change(frame.camera.world_from_camera, fit.camera.world_from_camera)["mm"] < 0.05
+    assert fit.camera.world_from_camera.dtype == frame.camera.world_from_camera.dtype
 
 
 def test_the_prior_holds_poses_that_the_image_cannot_tell(world, scene_and_frame):
@@ -54,8 +58,8 @@ def test_the_prior_holds_poses_that_the_image_cannot_tell(world, scene_and_frame
     tight = AlignConfig(
         sigma_instrument_mm=1e-3, sigma_instrument_deg=1e-3, sigma_camera_mm=1e-3, sigma_camera_deg=1e-3
     )
-    state, _ = align_frame(scene, wrong, tight)
-    assert pose_change(wrong.state.instruments["bar"].pose, state.instruments["bar"].pose)["mm"] < 0.05
+    fit = align(scene, wrong, tight)
+    assert pose_change(wrong.state.instruments["bar"].pose, fit.state.instruments["bar"].pose)["mm"] < 0.05
 
 
 def test_the_distance_between_two_poses_is_in_millimetres_and_degrees(world):
@@ -66,7 +70,7 @@ def test_the_distance_between_two_poses_is_in_millimetres_and_degrees(world):
 
 def test_the_fit_needs_no_gradient_and_leaves_none(scene_and_frame):
     scene, frame = scene_and_frame
-    state, camera = align_frame(scene, frame, AlignConfig(levels=(0.5,), steps=(1,)))
-    assert not state.instruments["bar"].pose.requires_grad
-    assert not camera.world_from_camera.requires_grad
-    assert torch.isfinite(camera.world_from_camera).all()
+    fit = align(scene, frame, AlignConfig(levels=(0.5,), steps=(1,)))
+    assert not fit.state.instruments["bar"].pose.requires_grad
+    assert not fit.camera.world_from_camera.requires_grad
+    assert torch.isfinite(fit.camera.world_from_camera).all()

@@ -56,9 +56,6 @@ class TinyScene:
             means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), scales, torch.full((count,), 0.95), self.colors
         )
 
-    def camera(self, camera: Camera) -> Camera:
-        return camera
-
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         return rasterize(self.at(state), camera, channels=self.label_channels() if labels and self.labelled else None)
 

@@ -15,9 +15,8 @@ from neeco.experiments.comparison import (
     SPLIT_METRICS,
     ComparisonResult,
     comparison_csv,
-    latex_text,
-    markdown_text,
     summarise,
+    table_texts,
     tables_of,
 )
 from neeco.experiments.study import spread
@@ -74,8 +73,8 @@ def test_equal_means_are_both_best_and_lower_lpips_is_better(comparison) -> None
     assert own.rows[0].cells[1].text == "1.00"  # 60 s in minutes
 
 
-def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
-    page = markdown_text(comparison)
+def test_markdown_escapes_names_and_reports_failures(comparison) -> None:
+    page = table_texts(comparison)["md"]
     assert "| a\\_b | **21.00** ± 1.41 | **0.100** ± 0.000 |" in page
     assert "| c\\|d | **21.00** ± 0.71 | 0.200 ± 0.000 |" in page
     assert "| lost | failed: loss is 100% nan\\_ |" in page
@@ -84,7 +83,7 @@ def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
 
 
 def test_latex_escapes_everything_and_stays_balanced(comparison) -> None:
-    text = latex_text(comparison)
+    text = table_texts(comparison)["tex"]
     assert r"a\_b & \textbf{21.00} $\pm$ 1.41 & \textbf{0.100} $\pm$ 0.000 \\" in text
     assert r"c\textbar{}d & " in text
     assert r"lost & failed &  \\" in text

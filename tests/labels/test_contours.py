@@ -94,13 +94,13 @@ def test_pieces_joined_for_yolo_cover_the_same_pixels():
     assert abs(signed_area(joined_polygon(polygons))) == pytest.approx(sum(map(signed_area, polygons)))
 
 
-def test_speckle_goes_and_large_pieces_stay():
+def test_small_components_go_and_large_ones_stay():
     mask = ellipse()
     mask[:, 35:42] = False
-    with_speck = mask.copy()
-    with_speck[1, 1] = True
-    assert (without_small_components(with_speck, 0.01) == mask).all()
-    assert without_small_components(with_speck, 0.0)[1, 1]
+    with_component = mask.copy()
+    with_component[1, 1] = True
+    assert (without_small_components(with_component, 0.01) == mask).all()
+    assert without_small_components(with_component, 0.0)[1, 1]
 
 
 def test_polygons_run_along_pixel_edges_and_pixels_that_touch_at_a_corner_are_two_pieces():

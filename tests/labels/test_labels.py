@@ -60,13 +60,13 @@ def test_what_the_tissue_hides_is_not_in_the_mask(scene, state, camera):
     assert label.keypoints["shaft_near"].visibility == 2
 
 
-def test_the_share_that_is_made_up_is_told(scene, state, camera):
+def test_the_unobserved_share_of_pixels_is_known(scene, state, camera):
     recorded, plain = scene.recorded.states[0], scene.canonical
     drawing, _ = labelled(scene, recorded, camera)
     tissue = slice(0, plain.counts[0])
-    unseen = torch.zeros(len(plain), dtype=torch.bool)
-    unseen[tissue] = plain.means[tissue, 0] > 0
-    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
+    unobserved = torch.zeros(len(plain), dtype=torch.bool)
+    unobserved[tissue] = plain.means[tissue, 0] > 0
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unobserved[:, None], 0.0))
     try:
         halved, _ = labelled(scene, recorded, camera)
     finally:
@@ -84,9 +84,9 @@ def test_the_share_that_is_made_up_is_told(scene, state, camera):
 
 def test_an_instrument_that_shows_sides_no_frame_saw_is_refused_when_too_much_of_it_does(scene, camera):
     recorded, plain = scene.recorded.states[0], scene.canonical
-    unseen = torch.zeros(len(plain), dtype=torch.bool)
-    unseen[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
-    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unseen[:, None], 0.0))
+    unobserved = torch.zeros(len(plain), dtype=torch.bool)
+    unobserved[plain.counts[0] : -scene.deformation.jaw_rows] = True  # its shaft
+    scene.canonical = plain.with_extras(seen=scene.visibility().masked_fill(unobserved[:, None], 0.0))
     try:
         for labeller in (CompositedLabels(scene), ThresholdLabels(scene)):
             drawing, _ = labelled(scene, recorded, camera, labeller)
@@ -211,18 +211,18 @@ def test_what_the_tissue_hides_has_no_share(scene, state, camera):
     assert not drawing.ignored.any()
 
 
-def test_a_dropped_speck_is_in_neither_parts_nor_share_nor_band(scene, state, camera, monkeypatch):
+def test_a_dropped_component_is_in_neither_parts_nor_share_nor_band(scene, state, camera, monkeypatch):
     whole = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
     strayed = scene.canonical.map(torch.clone)
     strayed.means[scene.canonical.counts[0] + 30] = torch.tensor([25.0, -5.0, 0.0])  # one of the shaft's
     monkeypatch.setattr(scene, "canonical", strayed)
-    with_speck = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.0)
+    with_component = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.0)
     cleaned = draw_layers(scene, CompositedLabels(scene), state(), camera, 0.1)
-    speck = slice(14, 26), slice(46, 62)  # rows and columns round it
-    assert with_speck.parts[speck].any()
-    assert with_speck.ignored[speck].any()
+    component = slice(14, 26), slice(46, 62)  # rows and columns round it
+    assert with_component.parts[component].any()
+    assert with_component.ignored[component].any()
     for pixels in (cleaned.parts, cleaned.share, cleaned.ignored):
-        assert not pixels[speck].any()
+        assert not pixels[component].any()
     near = slice(0, 48), slice(20, 44)
     assert (cleaned.share[near] - whole.share[near]).abs().max() < 0.1
 

@@ -86,8 +86,8 @@ def test_a_field_and_its_losses_stay_on_the_device() -> None:
     rays = Rays(torch.zeros(7, 3, device=META), directions, torch.zeros(7, dtype=torch.float64, device=META))
     drawn = scene.render_rays(rays)
     assert drawn.fine is not None
-    moved = scene.warp(drawn.places[:, 0], drawn.codes, scene.opened)
-    elastic = elastic_loss(scene.warp.jacobian(drawn.places[:, 0], drawn.codes, scene.opened)).mean()
+    moved = scene.warp(drawn.positions[:, 0], drawn.codes, scene.opened)
+    elastic = elastic_loss(scene.warp.jacobian(drawn.positions[:, 0], drawn.codes, scene.opened)).mean()
     loss = drawn.fine.color.mean() + drawn.coarse.color.mean() + elastic + geman_mcclure(moved.square().sum(-1)).mean()
     loss.backward()
     assert all_meta(loss, *(parameter.grad for parameter in scene.parameters()))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
-from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_canonical
+from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_canonical, rounding
 
 from neeco.errors import NeecoError
 from neeco.scene import Scene
@@ -64,8 +64,11 @@ def test_the_gate_changes_nothing_inside_and_moves_nothing_outside(neeco: Scene)
     state = neeco.recorded.states[3]
     with torch.no_grad():
         free, bound = neeco.deltas(state), other.deltas(state)
-    assert torch.allclose(bound.means[inside], free.means[inside], atol=1e-5)
-    assert torch.allclose(bound.scales[inside], free.scales[inside], atol=1e-5)
+    # the network multiplies fewer rows; sums add up over all its layers
+    products = neeco.deformation.settings.depth * neeco.deformation.settings.width
+    for name in ("means", "scales"):
+        gated_change, change = getattr(bound, name)[inside], getattr(free, name)[inside]
+        assert torch.allclose(gated_change, change, rtol=0, atol=rounding(float(change.abs().max()), products))
     assert free.means[~inside].norm(dim=1).min() > 0.01
     assert not bound.means[~inside].any()
     assert not bound.scales[~inside].any()

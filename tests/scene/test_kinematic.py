@@ -15,7 +15,7 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
-from neeco.scene.deformations.kinematic import Spin
+from neeco.scene.deformations.kinematic import Kinematic, Spin
 from neeco.scene.instruments import PART_LOGITS
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
@@ -188,6 +188,14 @@ def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
     distances = [torch.linalg.cross(p - origin, direction.expand_as(p)).norm(dim=1) for p in (points, spun)]
     assert torch.allclose(*distances, atol=1e-4)
     assert torch.allclose(hinges.along_shaft(spun), hinges.along_shaft(points), atol=1e-4)
+
+
+def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: Scene) -> None:
+    class Sways(Kinematic):
+        method = "sways"
+
+    assert kinematic.hinge_motion() is not None
+    assert Sways(kinematic.instruments).hinge_motion(kinematic.canonical) is None
 
 
 def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene) -> None:

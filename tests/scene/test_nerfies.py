@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scene_worlds import make_nerf
+from scene_worlds import make_nerf, rounding
 from torch import Tensor
 
 from neeco.capture.model import State
@@ -156,14 +156,19 @@ def test_codes_lie_between_their_neighbours_in_time() -> None:
 
 
 def test_drawing_in_chunks_changes_nothing_and_says_where_things_are() -> None:
-    scene = make_nerf()
+    octaves = 3  # few: the last one multiplies what the warp rounds by 2^2 pi
+    scene = make_nerf(frequencies=octaves, warp_frequencies=octaves)
     state, camera = scene.recorded.states[1], scene.recorded.cameras[1]
     drawn = scene.render(state, camera, labels=True)
     assert drawn.color.shape == (6, 8, 3)
     assert drawn.channels is None
     assert bool(((drawn.depth >= 20) & (drawn.depth <= 80))[drawn.alpha > 1e-6].all())
     scene.settings = replace(scene.settings, chunk=1000)
-    torch.testing.assert_close(scene.render(state, camera).color, drawn.color, atol=1e-4, rtol=0)
+    moved = rounding(1.0, 8 * 3 + 3 * (1 + 2 * octaves) + 8)  # places in [-1, 1], through the warp
+    tolerance = math.pi * 2 ** (octaves - 1) * moved + rounding(1.0, 8 * 2 + 3 * (1 + 2 * octaves))
+    whole = scene.render(state, camera).color
+    torch.testing.assert_close(whole, drawn.color, atol=tolerance, rtol=0)
+    assert float((whole - whole.mean((0, 1))).abs().max()) > 10 * tolerance  # pixels differ by more
 
 
 def test_what_needs_gaussians_is_refused_in_one_line() -> None:

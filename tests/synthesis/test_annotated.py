@@ -1,4 +1,4 @@
-"""Recorded frames labelled by the scene: fitted, judged by their photographs, written or listed."""
+"""Recorded frames labelled by the scene: fitted, judged by their images, written or listed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
 from neeco.report.annotated_page import write_annotated_page
 from neeco.scene import Scene
-from neeco.synthesis import annotated
 from neeco.synthesis.annotated import TypicalErrors, annotate_capture, estimate_trust, typical_errors_of
 
 USUAL = TypicalErrors(0.05, 0.05)
@@ -48,7 +47,7 @@ def tracked(state: State, index: int) -> State:
 
 @pytest.fixture(scope="module")
 def recorded(run, scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
-    """Eight photographs of the scene, one of them with a board held before the instrument."""
+    """Eight images of the scene, one of them with a board held before the instrument."""
     root = tmp_path_factory.mktemp("recorded")
     frames = []
     for index in range(8):
@@ -81,7 +80,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_a_photograph_speaks_for_a_right_label_and_against_a_wrong_one(scene: Scene) -> None:
+def test_an_image_supports_a_right_label_and_not_a_wrong_one(scene: Scene) -> None:
     right, wrong = layers(scene, rod_state()), layers(scene, rod_state(x=12.0))
     assert estimate_trust(right, right.image, None, USUAL).value == 1.0
     judged = estimate_trust(wrong, right.image, None, USUAL)
@@ -91,33 +90,32 @@ def test_a_photograph_speaks_for_a_right_label_and_against_a_wrong_one(scene: Sc
 
 def test_what_something_hides_is_no_label(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
-    photograph, label = drawing.image.clone(), drawing.parts > 0
-    photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
+    image, label = drawing.image.clone(), drawing.parts > 0
+    image[:20] = torch.tensor([0.1, 0.3, 0.9])
     hidden = float((label[:20]).sum() / label.sum())
-    judged = estimate_trust(drawing, photograph, None, USUAL)
+    judged = estimate_trust(drawing, image, None, USUAL)
     assert judged.against == pytest.approx(hidden, abs=0.1)
     assert judged.value < 1 - hidden + 0.1
 
 
-def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(annotated, "BESIDE", 0.2)  # of a very small image
+def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
     label = drawing.parts.clone()
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
     label[:, half:] = 0
     cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
-    judged = estimate_trust(cut, drawing.image, None, USUAL)
+    judged = estimate_trust(cut, drawing.image, None, USUAL, beside=0.2)  # a very small image
     assert judged.missed > 0.2
     assert judged.value < 0.9
 
 
 def test_pixels_that_the_loss_leaves_out_do_not_vote(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
-    photograph = drawing.image.clone()
-    photograph[:20] = torch.tensor([0.1, 0.3, 0.9])
+    image = drawing.image.clone()
+    image[:20] = torch.tensor([0.1, 0.3, 0.9])
     mask = torch.ones(48, 64, dtype=torch.bool)
     mask[:23] = False  # and what the blur of the errors reaches
-    assert estimate_trust(drawing, photograph, mask, USUAL).value == 1.0
+    assert estimate_trust(drawing, image, mask, USUAL).value == 1.0
 
 
 def test_without_a_label_there_is_nothing_to_trust(scene: Scene) -> None:
@@ -135,7 +133,7 @@ def test_usual_errors_are_those_of_all_but_a_hundredth_of_the_pixels(scene: Scen
     assert estimate_trust(drawing, brighter, None, usual).value > 0.95
 
 
-def test_photographs_get_the_labels_that_the_scene_draws_at_fitted_poses(made: Path, recorded: RecordedRun) -> None:
+def test_recorded_images_get_the_labels_that_the_scene_draws_at_fitted_poses(made: Path, recorded: RecordedRun) -> None:
     lines = [json.loads(line) for line in (made / "states.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == ["000", "001", "002", "003", "004", "006", "007"]
     for index, line in zip((0, 1, 2, 3, 4, 6, 7), lines, strict=True):

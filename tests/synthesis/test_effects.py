@@ -54,7 +54,7 @@ def grey(value: float = 0.5) -> np.ndarray:
     return np.full((48, 64, 3), value, np.float32)
 
 
-def photographed(image: np.ndarray, depth: float = 100.0, seed: int = 0, **values: float) -> np.ndarray:
+def through_effects(image: np.ndarray, depth: float = 100.0, seed: int = 0, **values: float) -> np.ndarray:
     return apply_effects(image, np.full(image.shape[:2], depth), values, np.random.default_rng(seed))
 
 
@@ -135,25 +135,27 @@ def test_without_effects_an_image_keeps_its_bits() -> None:
 
 
 def test_exposure_and_white_balance_scale_light() -> None:
-    brighter = photographed(grey(0.3), exposure_stops=1.0, red_gain=1.5)
+    brighter = through_effects(grey(0.3), exposure_stops=1.0, red_gain=1.5)
     assert srgb_to_linear(brighter)[0, 0] == pytest.approx(srgb_to_linear(grey(0.3))[0, 0] * [3.0, 2.0, 2.0], rel=1e-4)
 
 
 def test_gamma_is_an_exponent_on_the_stored_image() -> None:
-    assert photographed(grey(0.25), gamma=2.0) == pytest.approx(0.0625, abs=1e-5)
+    assert through_effects(grey(0.25), gamma=2.0) == pytest.approx(0.0625, abs=1e-5)
 
 
 def test_noise_has_the_deviation_asked_for() -> None:
-    noisy = srgb_to_linear(photographed(grey(0.5), read_noise=0.02)) - srgb_to_linear(grey(0.5))
+    noisy = srgb_to_linear(through_effects(grey(0.5), read_noise=0.02)) - srgb_to_linear(grey(0.5))
     assert noisy.std() == pytest.approx(0.02, rel=0.05)
-    bright = srgb_to_linear(photographed(grey(0.9), shot_noise=0.02)) - srgb_to_linear(grey(0.9))
+    bright = srgb_to_linear(through_effects(grey(0.9), shot_noise=0.02)) - srgb_to_linear(grey(0.9))
     assert bright.std() == pytest.approx(0.02 * np.sqrt(srgb_to_linear(grey(0.9))[0, 0, 0]), rel=0.05)
-    assert np.array_equal(photographed(grey(), read_noise=0.02), photographed(grey(), read_noise=0.02))
-    assert not np.array_equal(photographed(grey(), read_noise=0.02), photographed(grey(), seed=1, read_noise=0.02))
+    assert np.array_equal(through_effects(grey(), read_noise=0.02), through_effects(grey(), read_noise=0.02))
+    assert not np.array_equal(
+        through_effects(grey(), read_noise=0.02), through_effects(grey(), seed=1, read_noise=0.02)
+    )
 
 
 def test_smoke_hides_what_is_far_more_than_what_is_near() -> None:
-    near, far = (photographed(grey(0.1), depth, smoke=0.4, smoke_grey=0.8) for depth in (30.0, 150.0))
+    near, far = (through_effects(grey(0.1), depth, smoke=0.4, smoke_grey=0.8) for depth in (30.0, 150.0))
     assert 0.1 < near.mean() < far.mean() < 0.8
     passes = 0.6**1.5
     expected = srgb_to_linear(grey(0.1)) * passes + srgb_to_linear(grey(0.8)) * (1 - passes)
@@ -163,17 +165,17 @@ def test_smoke_hides_what_is_far_more_than_what_is_near() -> None:
 def test_lens_blur_keeps_the_light_and_spreads_it() -> None:
     image = grey(0.0)
     image[24, 32] = 1.0
-    light = srgb_to_linear(photographed(image, lens_blur_px=1.5))[..., 0]
+    light = srgb_to_linear(through_effects(image, lens_blur_px=1.5))[..., 0]
     assert light.sum() == pytest.approx(1.0, rel=0.02)
     rows = np.arange(48) - 24
     assert (light.sum(1) * rows**2).sum() / light.sum() == pytest.approx(1.5**2, rel=0.05)
 
 
 def test_vignette_and_image_circle_darken_the_corners() -> None:
-    assert srgb_to_linear(photographed(grey(), vignette=0.5))[0, 0, 0] == pytest.approx(
+    assert srgb_to_linear(through_effects(grey(), vignette=0.5))[0, 0, 0] == pytest.approx(
         0.5 * srgb_to_linear(grey())[0, 0, 0], rel=0.05
     )
-    shown = photographed(grey(), field_of_view=0.6)
+    shown = through_effects(grey(), field_of_view=0.6)
     assert shown[0, 0].max() == 0
     assert shown[24, 32, 0] == pytest.approx(0.5, abs=1e-4)
     assert image_circle(48, 64, 0.6).sum() == pytest.approx(np.pi * (0.6 * 40) ** 2, rel=0.02)
@@ -181,7 +183,7 @@ def test_vignette_and_image_circle_darken_the_corners() -> None:
 
 def test_jpeg_leaves_its_marks() -> None:
     image = grey() * np.linspace(0, 2, 64, dtype=np.float32)[None, :, None]
-    good, bad = (np.abs(photographed(image, jpeg_quality=quality) - image).mean() for quality in (100, 10))
+    good, bad = (np.abs(through_effects(image, jpeg_quality=quality) - image).mean() for quality in (100, 10))
     assert good < 0.005 < bad
 
 

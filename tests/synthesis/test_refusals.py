@@ -158,7 +158,7 @@ def test_a_data_set_begun_under_the_old_names_is_continued(run, tmp_path):
     settings = info["settings"] | {"states": "beyond"}
     for old, new in (("speckle", "min_component"), ("max_unseen", "max_unobserved")):
         settings[old] = settings.pop(new)
-    (output / "dataset.json").write_text(json.dumps(info | {"settings": settings}))
+    (output / "dataset.json").write_text(json.dumps(info | {"settings": settings, "version": "0.1.0"}))
     with pytest.warns(FutureWarning, match="--states beyond is called extrapolate now"):
         again = replace(SETTINGS, states="beyond")
     assert synthesize(run, output, again, resume=True).made_now == 2

@@ -10,7 +10,7 @@ import torch
 from neeco.raster.optimizer import Adam
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.training.config import DensityConfig
-from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
+from neeco.training.density import GradientStatistics, control_density, reset_opacity
 
 
 def two_bodies(size: float) -> CanonicalGaussians:
@@ -32,10 +32,9 @@ def steep(canonical: CanonicalGaussians, *rows: int) -> GradientStatistics:
 
 
 def change(canonical, statistics, most=(100, 100), threshold=1.0, adam=None, unsupported=None):
-    limits = [BodyLimit(count, 1.0) for count in most]
     generator = torch.Generator().manual_seed(0)
     return control_density(
-        canonical, adam or Adam(), statistics, limits, threshold, generator, DensityConfig(), unsupported
+        canonical, adam or Adam(), statistics, most, 1.0, threshold, generator, DensityConfig(), unsupported
     )
 
 

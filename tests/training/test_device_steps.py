@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -23,8 +22,7 @@ from neeco.scene.methods import METHODS
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as module
 from neeco.training.config import training_config
-from neeco.training.refinement import Refinement
-from neeco.training.session import GaussianSession, pose_order
+from neeco.training.session import GaussianSession
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -89,7 +87,6 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
     image, mask = torch.zeros(*size, 3, dtype=torch.uint8, device=META), torch.ones(size, dtype=torch.bool, device=META)
     refine = [f"refine.{part}=true" for part in ("registration", "latency", "frame_poses", "cameras")]
     config = training_config(method, {"iterations": 20_000, "batch_size": batch_size}, refine)
-    names = tuple(instrument.name for instrument in scene.instruments)
     session = GaussianSession(
         scene,
         config.length,
@@ -98,10 +95,7 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
         print,
         batch_size,
         config,
-        pose_order(frames, names),
         50.0,
-        Refinement(config.refine, frames, names, META),
-        np.random.default_rng(0),
     )
     session.start()
     session.iteration = 5_000

@@ -104,7 +104,7 @@ def test_ctrl_c_before_the_first_step_leaves_nothing(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "gaussian_session", interrupted)
+    monkeypatch.setattr(module, "begin_session", interrupted)
     assert main(["train", str(capture), "--output", str(tmp_path / "runs" / "mine"), "--method", "3dgs"]) == 130
     assert capsys.readouterr().err.strip() == ("neeco: interrupted: before the first step; run the same command again")
     assert not (tmp_path / "runs").exists()
@@ -152,7 +152,7 @@ def test_an_ignored_signal_stays_ignored() -> None:
     try:
         with deferred_interrupts() as stop:
             os.kill(os.getpid(), signal.SIGINT)
-        assert not stop.received
+        assert not stop.is_set()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)

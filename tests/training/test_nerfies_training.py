@@ -15,7 +15,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.nerfies.field import NerfScene
-from neeco.training.config import training_config, variant_config
+from neeco.training.config import training_config
 from neeco.training.train import ProgressRow, train
 
 SIZES = [
@@ -133,7 +133,7 @@ def test_frames_of_one_time_and_the_adjustment_of_gaussians_are_refused(tmp_path
     with pytest.raises(NeecoError, match=r"time: .* method nerfies needs it"):
         train(capture, tmp_path / "run", config_of(iterations=5))
     with pytest.raises(NeecoError, match="nerfies has no Gaussians for the dynamic adjustment"):
-        variant_config("nerfies+dta", {})
+        training_config("nerfies+dta", {})
 
 
 def test_evaluate_and_render_take_the_run_as_any_other(run: Path, tmp_path: Path, capsys) -> None:

@@ -18,7 +18,6 @@ from neeco.training.config import (
     method_defaults,
     schedule_parts,
     training_config,
-    variant_config,
 )
 from neeco.training.run import read_config, stored_config, write_config
 
@@ -130,8 +129,8 @@ def test_a_number_that_is_too_small_is_refused_by_its_option(name: str, value: i
 
 @pytest.mark.parametrize("method", ["3dgs", "deformable-3dgs", "4dgs", "kinematic"])
 def test_a_variant_turns_every_part_of_the_adjustment_on_and_nothing_else(method: str) -> None:
-    plain = config_to_dict(variant_config(method, {"seed": 3}))
-    adjusted = config_to_dict(variant_config(f"{method}+dta", {"seed": 3}))
+    plain = config_to_dict(training_config(method, {"seed": 3}))
+    adjusted = config_to_dict(training_config(f"{method}+dta", {"seed": 3}))
     assert plain == config_to_dict(training_config(method, {"seed": 3}))
     assert {plain["schedule"].pop(part) for part in schedule_parts()} == {"off"}
     assert {adjusted["schedule"].pop(part) for part in schedule_parts()} == {"on"}
@@ -145,7 +144,7 @@ def test_parts_of_the_adjustment_are_those_that_take_on_off_and_inverse() -> Non
 
 
 def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
-    config = variant_config("4dgs+dta", {}, ["schedule.compensation=off"])
+    config = training_config("4dgs+dta", {}, ["schedule.compensation=off"])
     assert (config.schedule.compensation, config.schedule.frame_order) == ("off", "on")
 
 
@@ -161,7 +160,7 @@ def test_a_part_of_a_variant_can_be_turned_off_again() -> None:
 )
 def test_a_variant_that_does_not_exist_is_refused(name: str, named: str) -> None:
     with pytest.raises(NeecoError, match=f"^method: .*{named}"):
-        variant_config(name, {})
+        training_config(name, {})
 
 
 def test_a_batch_is_of_gaussians_and_at_least_one_frame() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import neeco.training.session
 from neeco.errors import NeecoError
-from neeco.training.config import training_config, variant_config
+from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
@@ -24,7 +24,7 @@ SMALL = {
 
 
 def config_of(method: str):
-    return variant_config(method, {"iterations": 60}, [*SMALL.get(method, []), *SHORT])
+    return training_config(method, {"iterations": 60}, [*SMALL.get(method, []), *SHORT])
 
 
 @pytest.mark.parametrize("method", ["3dgs", "neeco", "deformable-3dgs+dta", "4dgs"])

@@ -13,7 +13,7 @@ from neeco.scene import training_views as module
 from neeco.scene.nerfies.session import RayTable
 from neeco.scene.training_views import PixelPrefetcher, TrainingViews
 from neeco.training.config import training_config
-from neeco.training.initial import gaussian_session
+from neeco.training.initial import begin_session
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
@@ -88,7 +88,7 @@ def test_a_run_learns_the_same_from_frames_that_are_copied(capture: Path, views:
     learned = []
     for given in (views, views.prefetched_to(CPU)):
         torch.manual_seed(0)
-        session = gaussian_session(read_capture(capture), given, config, print)
+        session = begin_session(read_capture(capture), given, config, print)
         while session.progress < 1:
             session.step()
         learned.append(session.scene.canonical.means.detach())

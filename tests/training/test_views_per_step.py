@@ -13,7 +13,7 @@ from neeco.capture import read_capture
 from neeco.raster.optimizer import Adam
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig, training_config
-from neeco.training.initial import gaussian_session
+from neeco.training.initial import begin_session
 from neeco.training.schedule import due
 from neeco.training.session import GaussianSession
 from neeco.training.train import ProgressRow, train
@@ -36,7 +36,7 @@ def config_of(views: int, method: str = "neeco", assignments: tuple[str, ...] = 
 def begun(folder: Path, config: TrainConfig) -> GaussianSession:
     capture = read_capture(folder)
     torch.manual_seed(0)
-    return gaussian_session(capture, TrainingViews.read(capture.split("train")), config, print)
+    return begin_session(capture, TrainingViews.read(capture.split("train")), config, print)
 
 
 def gradients(session: GaussianSession, monkeypatch: pytest.MonkeyPatch, steps: int) -> list[dict[str, Tensor]]:

@@ -76,9 +76,7 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> Ch
         report.error(transforms, "frames", "holds no usable frame", "list images and their cameras there")
     capture = None if errors_only(report.problems) else capture_of(parsed)
     if parsed.frames:
-        _check_splits(parsed)
-        _check_times(parsed)
-        _check_repeated_files(parsed)
+        _check_frames(parsed)
         _check_images(parsed)
         _check_states(parsed)
         check_geometry(parsed)
@@ -109,7 +107,8 @@ def _summary(parsed: Parsed) -> CaptureSummary:
     )
 
 
-def _check_splits(parsed: Parsed) -> None:
+def _check_frames(parsed: Parsed) -> None:
+    """Report splits without frames, times missing or going backwards, and files listed twice."""
     frames = parsed.header("frames")
     counts = Counter(frame.split for frame in parsed.frames)
     if not counts["train"]:
@@ -123,26 +122,18 @@ def _check_splits(parsed: Parsed) -> None:
         frames.warning(message, "record more if you can")
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
-
-
-def _check_times(parsed: Parsed) -> None:
-    if not parsed.timed:
-        message = "not every frame has a time; the order stands in"
-        parsed.header("frames").warning(message, "add `time` in seconds")
-        return
     latest: dict[str, float] = {}
     back = []
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         if frame.state.time < latest.get(place.file, frame.state.time):
             back.append(place)
         latest[place.file] = frame.state.time
-    if back:
+    if not parsed.timed:
+        frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+    elif back:
         more = f" (and {len(back) - 1} more times)" if len(back) > 1 else ""
         remedy = "right if the capture joins recordings or cameras; else sort the frames"
         back[0].child("time").warning(f"time goes backwards here{more}", remedy)
-
-
-def _check_repeated_files(parsed: Parsed) -> None:
     first: dict[Path, Node] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
         earlier = first.setdefault(frame.image_path, place)
@@ -230,23 +221,19 @@ def _same_state(one: Frame, two: Frame) -> bool:
 def _check_states(parsed: Parsed) -> None:
     """Report missing instruments and joints, limits passed, degrees, and states that never change."""
     for instrument in parsed.instruments:
-        _check_present(parsed, instrument)
+        frames = zip(parsed.frames, parsed.places, strict=True)
+        without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
+        name = printable(instrument.name)
+        if len(without) == len(parsed.frames):
+            message = f"instrument {name} is declared but no frame has it"
+            parsed.header("instruments").error(message, "remove it or give its poses")
+        else:
+            message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
+            for place in without:
+                place.child("instruments").error(message, "give its pose or drop the frame")
         for joint in instrument.joints:
             _check_joint(parsed, instrument, joint)
     _check_changes(parsed)
-
-
-def _check_present(parsed: Parsed, instrument: Instrument) -> None:
-    frames = zip(parsed.frames, parsed.places, strict=True)
-    without = [place for frame, place in frames if instrument.name not in frame.state.instruments]
-    name = printable(instrument.name)
-    if without and len(without) == len(parsed.frames):
-        message = f"instrument {name} is declared but no frame has it"
-        parsed.header("instruments").error(message, "remove it or give its poses")
-        return
-    for place in without:
-        message = f"instrument {name} is missing here ({len(without)} of {len(parsed.frames)} frames lack it)"
-        place.child("instruments").error(message, "give its pose or drop the frame")
 
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:

@@ -236,8 +236,14 @@ def _check_placement(
     elif seen.mean() < SEEN_RARELY:
         message = f"the origin of {name} is outside {outside}"
         all_poses.warning(message, "right if its sensor sits far behind")
-    else:
-        _report_jumps(name, poses, seen, places)
+    else:  # single poses far away from all others, and out of view: tracker drop-outs
+        origins = poses[:, :3, 3]
+        distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
+        usual = max(float(np.median(distances)), METRES)
+        for index in np.flatnonzero((distances > FAR * usual) & ~seen):
+            message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
+            remedy = "a tracker drop-out or unit slip? repair the pose or drop the frame"
+            places[index].child("pose").warning(message, remedy)
 
 
 def _visible_body_point(cameras: _Cameras, poses: np.ndarray) -> tuple[np.ndarray, float]:
@@ -278,15 +284,3 @@ def _instrument_mistake(cameras: _Cameras, poses: np.ndarray, given: float) -> M
     if np.median(np.linalg.norm(origins, axis=1)) > 30 * np.linalg.norm(cameras.centers, axis=1).max():
         guesses["cameras and points are in metres, its positions in mm", ALL_IN_MM] = origins / 1000.0
     return _likeliest({mistake: cameras.sees(moved[:, None]) for mistake, moved in guesses.items()}, given)
-
-
-def _report_jumps(name: str, poses: np.ndarray, seen: np.ndarray, places: list[Node]) -> None:
-    """Single poses far away from all others, and out of view: tracker drop-outs."""
-    origins = poses[:, :3, 3]
-    distances = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
-    usual = max(float(np.median(distances)), METRES)
-    for index in np.flatnonzero((distances > FAR * usual) & ~seen):
-        message = f"instrument {name} is {distances[index]:.4g} mm from where it usually is, and out of view"
-        places[index].child("pose").warning(
-            message, "a tracker drop-out or unit slip? repair the pose or drop the frame"
-        )

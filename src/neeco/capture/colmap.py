@@ -68,7 +68,7 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     except NeecoError as error:
         report.error(relative_name(model, root), "", str(error).removeprefix(f"{model}/"))
         return parsed
-    _add_points(model / f"points3D{suffix}", parse_points, parsed, report)
+    _parse_points(model / f"points3D{suffix}", parse_points, parsed, report)
     file = relative_name(model / f"images{suffix}", root)
     if not images:
         report.error(file, "", "holds no images", "reconstruct again: nothing was registered")
@@ -82,7 +82,7 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     return parsed
 
 
-def _add_points(
+def _parse_points(
     path: Path, parse: Callable[[bytes], list[tuple[float, ...]]], parsed: Parsed, report: ProblemReport
 ) -> None:
     parsed.points_place = Node(None, relative_name(path, parsed.root), "", report)

@@ -7,7 +7,7 @@ A line is `{"time": 0, "instruments": [{"name", "pose": 4x4, "joints": {name: ra
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -145,10 +145,15 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     if not isinstance(node.child("instruments").value, list):
         node.child("instruments").error("missing", 'expected {"instruments": [{"name", "pose", "joints"}]}')
     known = {instrument.name: instrument for instrument in instruments}
-    _check_names(node, known)
+    names = [item.child("name") for item in node.child("instruments").items()]
+    for name in names:
+        if not isinstance(name.value, str) or name.value not in known:
+            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(known) or 'no instruments'}")
+    if missing := [name for name in known if name not in [item.value for item in names]]:
+        node.child("instruments").error(f"{', '.join(missing)} missing", "give every instrument of the scene")
     given = parse_instruments(node) or {}
-    for item, name in zip(node.child("instruments").items(), given, strict=True):
-        _check_joints(item, known[name])
+    for item, instrument in zip(node.child("instruments").items(), given, strict=True):
+        _check_joints(item, known[instrument])
     time = node.child("time").number() if node.has("time") else None
     camera = node.child("camera")
     if isinstance(camera.value, dict):
@@ -156,20 +161,10 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     pose = None if camera.value is None else camera.rigid()
     # in the scene's order, so that files list them in one order, without joints that the scene does not have
     states = {
-        name: InstrumentState(given[name].pose, {joint: given[name].joints[joint] for joint in instrument.joints})
-        for name, instrument in known.items()
+        name: InstrumentState(given[name].pose, {joint: given[name].joints[joint] for joint in known[name].joints})
+        for name in known
     }
     return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
-
-
-def _check_names(node: Node, known: Mapping[str, Instrument]) -> None:
-    """Refuse instruments that the scene does not have, and lines without one that it has."""
-    given = [item.child("name") for item in node.child("instruments").items()]
-    for name in given:
-        if not isinstance(name.value, str) or name.value not in known:
-            name.error(f"{name.value!r} is not in the scene", f"it has {', '.join(known) or 'no instruments'}")
-    if missing := [name for name in known if name not in [item.value for item in given]]:
-        node.child("instruments").error(f"{', '.join(missing)} missing", "give every instrument of the scene")
 
 
 def _check_joints(item: Node, instrument: Instrument) -> None:

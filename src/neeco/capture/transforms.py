@@ -126,10 +126,14 @@ def _parse_frames(
     for index, node in enumerate(nodes.items()):
         if not node.is_object():
             continue
-        image_path = _image_path(node, folder, parsed.root, extensions)
+        image_path = None
+        if (file := node.child("file_path")).value is None:
+            file.error("is missing", "name the frame's image")
+        else:
+            image_path = _file(file, folder, parsed.root, extensions)
         name = splits.of(node, index)
         pose = node.child("transform_matrix").rigid()
-        mask_path = _optional_file(node, "mask_path", folder, parsed.root)
+        mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
         time = node.child("time").number() if node.has("time") else float(index)
         timed += node.has("time")
         instruments = parse_instruments(node)
@@ -160,7 +164,7 @@ def _parse_frames(
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
     parsed.points_place = document.child("ply_file_path")
-    path = _optional_file(document, "ply_file_path", folder, parsed.root)
+    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
     if path is None:
         return
     name = relative_name(path, parsed.root)
@@ -204,18 +208,6 @@ class _Splits:
             frame.child("split").error("is missing while other frames have one", "name the frame's split")
             return None
         return "test" if index % TEST_EVERY == 0 else "train"
-
-
-def _image_path(frame: Node, folder: Path, root: Path, extensions: tuple[str, ...]) -> Path | None:
-    node = frame.child("file_path")
-    if node.value is None:
-        node.error("is missing", "name the frame's image")
-        return None
-    return _file(node, folder, root, extensions)
-
-
-def _optional_file(parent: Node, key: str, folder: Path, root: Path) -> Path | None:
-    return _file(parent.child(key), folder, root) if parent.has(key) else None
 
 
 def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()) -> Path | None:

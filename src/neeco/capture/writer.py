@@ -163,18 +163,13 @@ def _write_image(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray
         target = f"images/{name}{frame.image_path.suffix}"
         _copy(frame.image_path, path / target)
         return target
-    target = f"images/{name}.png"
-    write_image(path / target, frame.load_image() if image is None else _checked(image, frame))
-    return target
-
-
-def _checked(image: Tensor | np.ndarray, frame: Frame) -> Tensor:
-    """Given pixels as floats in [0, 1]. Raises NeecoError when they are not of the camera's size."""
-    pixels = torch.as_tensor(image)
+    pixels = frame.load_image() if image is None else torch.as_tensor(image)
     wanted = (frame.camera.height, frame.camera.width, 3)
     if tuple(pixels.shape) != wanted:
         raise NeecoError(f"{frame.image_path}: image has shape {tuple(pixels.shape)}, its camera says {wanted}")
-    return pixels / 255 if pixels.dtype == torch.uint8 else pixels
+    target = f"images/{name}.png"
+    write_image(path / target, pixels / 255 if pixels.dtype == torch.uint8 else pixels)
+    return target
 
 
 def _copy(source: Path, target: Path) -> None:

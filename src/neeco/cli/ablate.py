@@ -16,12 +16,11 @@ if TYPE_CHECKING:
 def run(plan: AblationPlan) -> int:
     """Run the ablations with a progress bar, write all files, print the verdicts."""
     from neeco.cli._progress import Bars
-    from neeco.experiments.ablation_study import run_ablations, write_tables
+    from neeco.experiments.ablation_study import run_ablations
     from neeco.report.study_pages import write_ablation_report
 
     with Bars() as bars:
         ablation = run_ablations(plan, bars.job)
-    write_tables(plan.output, ablation.tables)
     page = write_ablation_report(plan.output, ablation)
     _print_tables(Console(), ablation)
     for line in (f"tables: {plan.output}/tables/: NAME.csv, .md, .tex", f"report: {page}"):

@@ -49,9 +49,9 @@ def run(args: Arguments) -> int:
     """Train with a progress bar; print where the run lies."""
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
-    from neeco.training.config import variant_config
+    from neeco.training.config import training_config
 
-    config = variant_config(
+    config = training_config(
         args.method,
         {
             "iterations": args.iterations,

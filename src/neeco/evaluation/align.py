@@ -104,7 +104,7 @@ class _Problem:
 
     def render(self, gaussians: Gaussians, level: _Level, parameters: Tensor) -> Tensor:
         """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
-        return rasterize(gaussians, self.scene.camera(self.moved_camera(level.camera, parameters))).color.cpu()
+        return rasterize(gaussians, self.moved_camera(level.camera, parameters)).color.cpu()
 
     def cost(self, level: _Level, image: Tensor, parameters: Tensor) -> float:
         """Huber cost of the residual plus the prior, in units of -log probability."""
@@ -115,22 +115,11 @@ class _Problem:
         return data + 0.5 * float(((parameters / self.sigmas) ** 2).sum())
 
 
-def align_frame(scene: Scene, frame: Frame, config: AlignConfig | None = None) -> tuple[State, Camera]:
-    """Fit the poses of `frame` to its recorded image and return the fitted state and camera, drawable like the given
-    ones.
-
-    See `fit_frame`. Costs about 7 * (6 * instruments + 8) small drawings. Raises NeecoError when the image cannot be
-    read.
-    """
-    fit = fit_frame(scene, frame, frame.load_image(), config=config)
-    return fit.state, fit.camera
-
-
 @torch.no_grad()
 def fit_frame(
     scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
 ) -> Fit:
-    """Fit the poses of `frame` to its recorded `image` [H, W, 3].
+    """Fit the poses of `frame` to its recorded `image` [H, W, 3], by about 7 * (6 * instruments + 8) small renderings.
 
     One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), with
     weak Gaussian priors at zero; joints and intrinsics stay. Pixels outside the frame's loss mask do not count.
@@ -191,7 +180,7 @@ def _normal_equations(
     residual = _smooth(image - level.target, level.weight)
     weight = problem.scale / (residual.abs() / problem.config.huber).clamp_min(1.0)
     # drawn a dozen times: the shadows, which move as little as what casts them, once
-    camera = problem.scene.camera(problem.moved_camera(level.camera, parameters))
+    camera = problem.moved_camera(level.camera, parameters)
     still = shadowed(gaussians, camera, rasterize)
     columns = []
     for index in range(len(parameters)):

@@ -77,7 +77,7 @@ def observed_depths(scene: Drawable, frames: Sequence[Frame]) -> Coverage:
     depths, views = torch.zeros(len(maps), height, width), torch.zeros(len(maps), 4, 4)
     for index, (depth, camera) in enumerate(zip(maps, cameras, strict=True)):
         depths[index, : depth.shape[0], : depth.shape[1]] = depth
-        views[index] = torch.linalg.inv(scene.camera(camera).world_from_camera.cpu().double()).float()
+        views[index] = torch.linalg.inv(camera.world_from_camera.cpu().double()).float()
     return Coverage(
         views,
         torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras]).reshape(-1, 4),
@@ -99,7 +99,7 @@ def unobserved_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tupl
     if rendering.channels is not None:
         tissue = composited_parts(rendering, threshold_of(scene)).cpu() == 0
     centers = pixel_centers(camera.height, camera.width)
-    points = unproject_world(centers, _filled(rendering), scene.camera(camera))  # [h, w, 3]
+    points = unproject_world(centers, _filled(rendering), camera)  # [h, w, 3]
     unobserved = torch.zeros_like(tissue)
     unobserved[tissue] = ~coverage.seen(points[tissue])
     size = (frame.camera.width, frame.camera.height)

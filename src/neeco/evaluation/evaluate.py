@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.align import align_frame, pose_changes
+from neeco.evaluation.align import fit_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import Reference, load_reference
@@ -146,7 +146,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
         row: dict[str, Any] = {"frame": frame.name}
         state, camera = frame.state, frame.camera
         if kind == "aligned":
-            state, camera = align_frame(gaussian_scene(scene, "--align"), frame)
+            fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
+            state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}

@@ -68,7 +68,12 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
         image = torch.where(mask[..., None], image, target)
     x = image.permute(2, 0, 1)  # [3, H, W]
     y = target.permute(2, 0, 1).to(x.dtype)
-    blurred = _blur(torch.cat([x, y, x * x, y * y, x * y]))  # [15, H, W]
+    planes = torch.cat([x, y, x * x, y * y, x * y])  # [15, H, W]
+    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window, pad = (weights / weights.sum()).to(planes), SSIM_WINDOW // 2
+    rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))  # separable: two passes of 11 taps
+    blurred = conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = blurred.split(3)
     var_x = mean_xx - mean_x * mean_x
     var_y = mean_yy - mean_y * mean_y
@@ -79,16 +84,6 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     if mask is not None:
         values = values[mask]
     return float(values.mean()) if values.numel() else math.nan
-
-
-def _blur(planes: Tensor) -> Tensor:
-    """Gaussian blur of [C, H, W] planes with zero padding; the window is separable, so two passes of 11 taps."""
-    offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    window = (weights / weights.sum()).to(planes)
-    pad = SSIM_WINDOW // 2
-    rows = conv2d(planes[:, None], window.view(1, 1, -1, 1), padding=(pad, 0))
-    return conv2d(rows, window.view(1, 1, 1, -1), padding=(0, pad))[:, 0]
 
 
 @dataclass(frozen=True)

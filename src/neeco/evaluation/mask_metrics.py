@@ -1,6 +1,6 @@
 """How well masks agree: intersection over union, Dice, and the same per part; contours; boxes.
 
-Boundary F and box AP are our own on purpose: DAVIS's contours to the pixel, and an AP of boxes without confidence.
+Boundary F is computed on the contours of DAVIS, to the pixel; box AP is that of boxes without confidence.
 """
 
 from __future__ import annotations
@@ -133,18 +133,14 @@ def boundary_f(
     if not judged[0] or not judged[1]:
         return float(judged[0] == judged[1] and mask.any() == truth.any())
     radius = math.ceil(tolerance * math.hypot(*mask.shape))
-    window = _window(contours[0] | contours[1])  # distances outside it are never asked for
+    either = contours[0] | contours[1]
+    (window,) = ndimage.find_objects(either.astype(np.uint8))  # distances outside it are never needed
     first, second, inside = (image[window] for image in (*contours, everywhere))
     near_second = ndimage.distance_transform_edt(~second) <= radius
     near_first = ndimage.distance_transform_edt(~first) <= radius
     precision = int((first & inside & near_second).sum()) / judged[0]
     recall = int((second & inside & near_first).sum()) / judged[1]
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
-
-
-def _window(pixels: np.ndarray) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def boxes_of(mask: np.ndarray, components: bool = False) -> np.ndarray:
@@ -185,6 +181,4 @@ def average_precision(
 
 def _matches(fits: np.ndarray) -> int:
     """How many pairs can be made where each row and each column is used once at most."""
-    if not fits.any():
-        return 0
-    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum())
+    return int((maximum_bipartite_matching(sparse.csr_matrix(fits)) >= 0).sum()) if fits.any() else 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import unmet_need
 from neeco.settings import plain
-from neeco.training.config import TrainConfig, variant_config
+from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run, require_same_capture
 
 COMPARISON_SCHEMA = "neeco-comparison/1"
@@ -221,8 +221,17 @@ def compare(
         results = run_and_record(plan.jobs, spec.workers, record, finished, events, {spec.capture: plan.capture})
         result = _measured(plan, _result(plan, results), progress or (lambda what, done, total: None))
         write_json(file, plain(result))
-        write_tables(spec.output, result)
+        write_files(spec.output, "comparison", table_texts(result), data_files(result))
     return result
+
+
+def read_comparison(folder: Path) -> ComparisonResult:
+    """What comparison.json in `folder` holds. Raises NeecoError when it is no comparison of this version."""
+    file, names = folder / COMPARISON_FILE, [field.name for field in fields(ComparisonResult)]
+    stored = read_json(file)
+    if not isinstance(stored, dict) or stored.get("schema") != COMPARISON_SCHEMA or not stored.keys() >= set(names):
+        raise NeecoError(f"{file}: is no {COMPARISON_SCHEMA}; compare again")
+    return ComparisonResult(**{name: stored[name] for name in names})
 
 
 def job_folder(output: Path, name: str, seed: int) -> Path:
@@ -235,9 +244,9 @@ def _configs(spec: ComparisonSpec) -> dict[str, TrainConfig]:
     if not spec.methods:
         raise NeecoError("--methods: none is given; name at least one")
     values = {"transforms": spec.transforms}
-    methods = {name: variant_config(name, values).method for name in spec.methods}
+    methods = {name: training_config(name, values).method for name in spec.methods}
     check_settings(spec.assignments, dict.fromkeys(methods.values()), "--seeds")
-    return {name: variant_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
+    return {name: training_config(name, values, settings_for(methods[name], spec.assignments)) for name in spec.methods}
 
 
 def _check_output(spec: ComparisonSpec) -> None:
@@ -413,18 +422,15 @@ def budget_words(comparison: ComparisonResult) -> str:
     return f"{Budget(**comparison.budget)} each, {seeds} seed{'s' if seeds > 1 else ''}"
 
 
-def markdown_text(comparison: ComparisonResult) -> str:
-    """Markdown: a heading, one table per split, the methods' own, and what is absent."""
-    lead = f"{budget_words(comparison)}. {machine_words(comparison.machine)}."
-    title = f"Comparison on {Path(comparison.capture).name}"
-    return markdown_document(title, lead, tables_of(comparison), "seeds", absent_notes(comparison))
-
-
-def latex_text(comparison: ComparisonResult) -> str:
-    """LaTeX tables for the package booktabs, one per split and one of the methods' own."""
-    caption = f"{Path(comparison.capture).name}, {{}}. {budget_words(comparison)}."
-    lead = [machine_words(comparison.machine)]
-    return latex_document(caption, tables_of(comparison), lead, absent_notes(comparison))
+def table_texts(comparison: ComparisonResult) -> dict[str, str]:
+    """The tables and what they lack by suffix: csv (unrounded), md, and tex for the package booktabs."""
+    tables, notes, name = tables_of(comparison), absent_notes(comparison), Path(comparison.capture).name
+    budget, computer = budget_words(comparison), machine_words(comparison.machine)
+    return {
+        "csv": comparison_csv(comparison),
+        "md": markdown_document(f"Comparison on {name}", f"{budget}. {computer}.", tables, "seeds", notes),
+        "tex": latex_document(f"{name}, {{}}. {budget}.", tables, [computer], notes),
+    }
 
 
 def comparison_csv(comparison: ComparisonResult) -> str:
@@ -448,9 +454,3 @@ def data_files(comparison: ComparisonResult) -> dict[str, str]:
         "distance.csv": csv_text(["name", "seed", "split", "frame", "distance", *FRAME_SCORES], comparison.distance),
         "speed.csv": csv_text(speed_columns, comparison.speed["rows"]),
     }
-
-
-def write_tables(output: Path, comparison: ComparisonResult) -> None:
-    """Write comparison.csv, .md and .tex, and data/*.csv behind them, into `output`."""
-    texts = {"csv": comparison_csv(comparison), "md": markdown_text(comparison), "tex": latex_text(comparison)}
-    write_files(output, "comparison", texts, data_files(comparison))

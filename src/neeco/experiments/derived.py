@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.model import Capture, Frame, InstrumentState, State
+from neeco.capture.model import Capture, Frame, InstrumentState, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import MASK_FOLDERS
@@ -31,58 +31,48 @@ def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: in
     The same seed gives the same noise, and the noise of one level is that of another times a number. Raises NeecoError
     when `output` holds something else, and what writing captures raises.
     """
-    recipe: dict[str, Any] = {
-        "source": str(capture.root.absolute()),
-        "transforms": transforms,
-        "states_sha256": _digest(capture),
-    }
-    recipe |= {"seed": seed, **asdict(derived)}
-    if (output / RECIPE_FILE).exists():
-        _require_same(output / RECIPE_FILE, recipe)
+    recipe: dict[str, Any] = {"source": str(capture.root.absolute()), "transforms": transforms}
+    recipe |= {"states_sha256": _digest(capture), "seed": seed, **asdict(derived)}
+    if (path := output / RECIPE_FILE).exists():
+        stored = read_json(path)
+        for key, value in recipe.items():
+            if stored.get(key) != value:
+                raise NeecoError(f"{path}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
         if (output / "transforms.json").exists():
             return output
     elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty, and not made by ablate; give another --output")
     changed = replace(capture, frames=_frames(capture, derived, seed))
     write_json(output / RECIPE_FILE, recipe)
-    for frame in changed.frames:
-        if frame.split != "train":
-            _copy_masks(capture.root, frame.name, output)
+    scored = [frame.name for frame in changed.frames if frame.split != "train"]
+    for mask in (Path(folder) / f"{name}.png" for name in scored for folder in MASK_FOLDERS):
+        if (capture.root / mask).is_file():
+            write_atomically(output / mask, partial(shutil.copyfile, capture.root / mask))
     write_capture(changed, output)  # transforms.json comes last: that it exists says that all is there
     return output
 
 
 def _digest(capture: Capture) -> str:
     """Tells recordings with other frames, splits or instrument states apart."""
-    rows = [
-        [
-            frame.name,
-            frame.split,
-            *((name, s.pose.tolist(), dict(s.joints)) for name, s in frame.state.instruments.items()),
-        ]
-        for frame in capture.frames
-    ]
+
+    def states(frame: Frame) -> list[Any]:
+        return [(name, s.pose.tolist(), dict(s.joints)) for name, s in frame.state.instruments.items()]
+
+    rows = [[frame.name, frame.split, *states(frame)] for frame in capture.frames]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-
-
-def _require_same(path: Path, recipe: dict[str, Any]) -> None:
-    stored = read_json(path)
-    for key, value in recipe.items():
-        if stored.get(key) != value:
-            raise NeecoError(f"{path}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
 
 
 def _frames(capture: Capture, derived: Derived, seed: int) -> tuple[Frame, ...]:
     """The frames of the derived capture, in recorded order."""
     train = [index for index, frame in enumerate(capture.frames) if frame.split == "train"]
     count = max(1, round(derived.train_share * len(train)))
-    kept = {train[place] for place in np.linspace(0, len(train) - 1, count).round().astype(int)}
+    used = {train[place] for place in evenly_spaced(len(train), count)}
     rng = np.random.default_rng(seed)
     frames = []
     for index, frame in enumerate(capture.frames):
         if frame.split != "train":
             frames.append(frame)
-        elif index in kept:
+        elif index in used:
             state = _with_noise(frame.state, derived.noise_mm, rng) if derived.noise_mm > 0 else frame.state
             frames.append(replace(frame, state=state))
     return tuple(frames)
@@ -99,11 +89,3 @@ def _with_noise(state: State, level: float, rng: np.random.Generator) -> State:
         pose[:3, 3] += torch.from_numpy(level * shift)
         moved[name] = InstrumentState(pose, given.joints)
     return replace(state, instruments=moved)
-
-
-def _copy_masks(root: Path, name: str, output: Path) -> None:
-    """What a frame is scored against, by the file names that scoring looks for."""
-    for folder in MASK_FOLDERS:
-        source = root / folder / f"{name}.png"
-        if source.is_file():
-            write_atomically(output / folder / source.name, partial(shutil.copyfile, source))

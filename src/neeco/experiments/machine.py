@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -69,11 +70,11 @@ def threads_per_worker(workers: int, cores: int | None = None) -> int:
 def processor_name() -> str:
     """The processor's name as the system knows it."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model"))]
-    return names[0] if names else platform.processor() or platform.machine()
+        text = ""
+    found = re.search(r"^(?:model name|Model)[^:\n]*:(.*)$", text, re.MULTILINE)
+    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def usable_cores() -> int:
@@ -99,11 +100,10 @@ def reset_peak_memory() -> bool:
 def peak_memory_mb() -> float | None:
     """Most resident memory of this process since the last reset, in MiB; None where the system does not tell."""
     try:
-        lines = STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        found = re.search(r"^VmHWM:\s+(\d+)", STATUS.read_text(encoding="ascii", errors="replace"), re.MULTILINE)
     except OSError:
         return None
-    peaks = [round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith("VmHWM:")]
-    return peaks[0] if peaks else None
+    return round(int(found[1]) / 1024, 1) if found else None
 
 
 @torch.no_grad()

@@ -12,13 +12,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.capture import Capture, read_capture
 from neeco.capture.check import read_checked
-from neeco.capture.model import Frame
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
@@ -54,17 +53,8 @@ SPLIT_SCORES = ("psnr", "ssim", "lpips", "psnr_instrument", "mask_iou", "frames"
 BUDGET = {"minutes": (float, None), "iterations": (int, None), "clock": str}
 IDENTITY = {"name": str, "method": str, "seed": int, "capture": str, "budget": BUDGET}
 TOTALS = {"seconds": float, "processor_seconds": float, "peak_memory_mb": (float, None)}
-RESULT = (
-    IDENTITY
-    | TOTALS
-    | {
-        "iterations": int,
-        "num_gaussians": (int, None),
-        "fps": float,
-        "lpips_networks": [str],
-        "splits": {str: dict.fromkeys(SPLIT_SCORES, (float, None))},
-    }
-)
+RESULT = IDENTITY | TOTALS | {"iterations": int, "num_gaussians": (int, None), "fps": float, "lpips_networks": [str]}
+RESULT |= {"splits": {str: dict.fromkeys(SPLIT_SCORES, (float, None))}}
 CURVE_ROW = {"iteration": int, "seconds": float, "processor_seconds": float, "progress": float, "split": str}
 
 
@@ -297,8 +287,8 @@ class HeldOutFrames:
         self.frames: dict[str, list[tuple[Frame, Tensor, Tensor | None]]] = {}
         for split in splits:
             frames = capture.split(split)
-            chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, count)})
-            self.frames[split] = [(f, f.load_image(), f.load_mask()) for f in (frames[index] for index in chosen)]
+            chosen = [frames[index] for index in evenly_spaced(len(frames), count)]
+            self.frames[split] = [(frame, frame.load_image(), frame.load_mask()) for frame in chosen]
 
     @torch.no_grad()
     def score(self, scene: Drawable) -> dict[str, float | None]:

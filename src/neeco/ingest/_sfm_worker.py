@@ -25,8 +25,10 @@ def say(stage: str, **facts: Any) -> None:
     print(json.dumps({"stage": stage, **facts}), flush=True)
 
 
-def extract(job: dict[str, Any], database: Path) -> None:
-    """Features of every image; one camera for all, its intrinsics given or to be estimated."""
+def extract_and_match(job: dict[str, Any], database: Path) -> None:
+    """Features of every image, matched in the pairs listed by the caller; one camera for all, its intrinsics given or
+    to be estimated."""
+    say("features")
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = job["threads"]
@@ -47,19 +49,15 @@ def extract(job: dict[str, Any], database: Path) -> None:
         extraction_options=options,
         device=pycolmap.Device.cpu,
     )
-
-
-def match(job: dict[str, Any], database: Path, work: Path) -> None:
-    """Neighbours in time, and pairs far apart in time that close loops (listed by the caller)."""
-    pairs = work / "pairs.txt"
-    pairs.write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    options.num_threads = job["threads"]
+    say("matching")
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = str(pairs)
+    pairing.match_list_path = str(database.with_name("pairs.txt"))
+    Path(pairing.match_list_path).write_text("".join(f"{a} {b}\n" for a, b in job["pairs"]))
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = job["threads"]
     pycolmap.match_image_pairs(
-        str(database), matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
+        str(database), matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
     )
 
 
@@ -169,49 +167,33 @@ def save(model: pycolmap.Reconstruction, path: Path) -> None:
     )
 
 
-def drop(model: pycolmap.Reconstruction, observations: list[tuple[str, int]]) -> None:
-    """Forget observations, each an image's name and its feature's number, and points left with fewer than two."""
-    by_name = {image.name: image.image_id for image in model.images.values()}
-    for name, number in observations:
-        if model.images[by_name[name]].points2D[number].has_point3D():
-            model.delete_observation(by_name[name], number)
-
-
 def main(job_file: str) -> int:
     job = json.loads(Path(job_file).read_text())
     work = Path(job["work"])
-    model_folder = work / "model"
     pycolmap.set_random_seed(0)
     pycolmap.logging.minloglevel = 3
     if "drop" in job:
         say("adjusting")
-        model = pycolmap.Reconstruction(str(model_folder))
-        drop(model, job["drop"])
+        model = pycolmap.Reconstruction(str(work / "model"))
+        by_name = {image.name: image.image_id for image in model.images.values()}
+        for name, number in job["drop"]:  # observations: an image's name and its feature's number
+            if model.images[by_name[name]].points2D[number].has_point3D():
+                model.delete_observation(by_name[name], number)
         adjust(model, job)
     else:
-        found = build(job, work)
+        database = work / "database.db"
+        extract_and_match(job, database)
+        say("mapping", done=0, total=len(job["names"]))
+        found = map_keyframes(job, database, work)
         if found is None:
             return 0
         model = found
-        model_folder.mkdir()
-        model.write(str(model_folder))
+        register_others(job, database, model)
+        (work / "model").mkdir()
+        model.write(str(work / "model"))
     save(model, work / "result.npz")
     say("done", images=model.num_reg_images(), points=model.num_points3D())
     return 0
-
-
-def build(job: dict[str, Any], work: Path) -> pycolmap.Reconstruction | None:
-    """Features, matches, cameras and points."""
-    database = work / "database.db"
-    say("features")
-    extract(job, database)
-    say("matching")
-    match(job, database, work)
-    say("mapping", done=0, total=len(job["names"]))
-    model = map_keyframes(job, database, work)
-    if model is not None:
-        register_others(job, database, model)
-    return model
 
 
 def end_with_parent() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neeco.errors import NeecoError
@@ -126,9 +126,7 @@ def scale_of(
         raise NeecoError(f"{path}: columns {listed}: named in different units; write them in one {kind} unit")
     unit = next(iter(found), None)
     if unit and stated and unit != stated:
-        raise NeecoError(
-            f"{path}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct whichever is wrong"
-        )
+        raise NeecoError(f"{path}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct one")
     unit = unit or stated or implied
     if unit is None:
         raise NeecoError(
@@ -196,16 +194,10 @@ def recognise_pose(header: Sequence[str]) -> RecognisedColumns:
     lower = [_plain(name) for name in header]
     ndi = {"state", "q0", "tx", "ty", "tz"} <= set(lower)
     ros = bool(position and _ROS.search(position[0].lower()))
-    return RecognisedColumns(
-        time=when.time,
-        position=position,
-        rotation=rotation,
-        form=form,
-        state=header[lower.index("state")] if ndi else None,
-        counts_frames=when.counts_frames,
-        time_unit=when.time_unit,
-        length_unit="mm" if ndi else "m" if ros else None,
-        unclear=unclear,
+    state = header[lower.index("state")] if ndi else None
+    unit = "mm" if ndi else "m" if ros else None
+    return replace(
+        when, position=position, rotation=rotation, form=form, state=state, length_unit=unit, unclear=unclear
     )
 
 

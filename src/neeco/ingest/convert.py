@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from neeco.capture.documents import Parsed, Problem, ProblemReport
+from neeco.capture.documents import Parsed, ProblemReport
 from neeco.capture.endonerf import MASKS, folder_images
 from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Frame
@@ -38,9 +37,15 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
             report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
         tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
         report.raise_first(folder)
-        frames = _with_tool_masks(parsed.frames, tool_masks, work / "tool")
+        frames = parsed.frames
+        if tool_masks:
+            pairs = zip(frames, tool_masks, strict=True)
+            frames = [_with_tool_mask(frame, mask, work / "tool") for frame, mask in pairs]
         write_capture(replace(capture_of(parsed), frames=tuple(frames)), work / "capture")
-    return (*_lacking(parsed, masked=bool(tool_masks)), *_warnings(report))
+    settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
+    warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
+    others = [str(problem) for problem in warnings if problem.field not in settled]
+    return (*_lacking(parsed, masked=bool(tool_masks)), *others)
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
@@ -52,17 +57,12 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
     return paths
 
 
-def _with_tool_masks(frames: list[Frame], tool_masks: list[Path], work: Path) -> list[Frame]:
-    """Frames whose loss mask ignores what their tool mask shows white. Raises NeecoError for a damaged mask."""
-    if not tool_masks:
-        return frames
-    masked = []
-    for frame, path in zip(frames, tool_masks, strict=True):
-        tool = read_mask(path, (frame.camera.width, frame.camera.height))
-        loss_path = work / f"{frame.name}.png"
-        write_labels(loss_path, (~tool).to(torch.uint8) * 255)
-        masked.append(replace(frame, mask_path=loss_path))
-    return masked
+def _with_tool_mask(frame: Frame, tool_mask: Path, work: Path) -> Frame:
+    """The frame, its loss mask ignoring what the tool mask shows white. Raises NeecoError for a damaged mask."""
+    tool = read_mask(tool_mask, (frame.camera.width, frame.camera.height))
+    loss_path = work / f"{frame.name}.png"
+    write_labels(loss_path, (~tool).to(torch.uint8) * 255)
+    return replace(frame, mask_path=loss_path)
 
 
 def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
@@ -88,20 +88,9 @@ def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:
         sentences.append("No times: the order of the frames stands in for seconds.")
     if masked:
         sentences.append("Tool masks became loss masks: the tool's pixels are ignored, so the tool is not learned.")
-    splits = Counter(frame.split for frame in parsed.frames)
-    if not splits["test"]:
+    if all(frame.split != "test" for frame in parsed.frames):
         sentences.append("No test frames: nothing will tell how good the scene is.")
     return sentences
-
-
-def _warnings(report: ProblemReport) -> list[str]:
-    """The reader's warnings, without those that `_lacking` says or that converting settles."""
-    said = {"instruments", "units"}
-
-    def is_new(problem: Problem) -> bool:
-        return problem.severity == "warning" and problem.field not in said and problem.file != f"{MASKS}/"
-
-    return [str(problem) for problem in report.problems if is_new(problem)]
 
 
 @contextmanager
@@ -121,7 +110,12 @@ def staged(output: Path) -> Iterator[Path]:
         raise NeecoError(f"{output}: exists already; choose another --output or remove it")
     with new_folder(place.parent), _emptied(folder, place):
         yield folder
-        _move(folder / "capture", place)
+        try:
+            if place.exists():
+                place.rmdir()
+            (folder / "capture").rename(place)
+        except OSError as error:
+            raise NeecoError(f"{place}: cannot write: {error.strerror or error}") from error
 
 
 @contextmanager
@@ -146,12 +140,3 @@ def _clear(folder: Path) -> None:
             shutil.rmtree(entry, ignore_errors=True)
         elif entry.name != LOCK:
             entry.unlink()
-
-
-def _move(capture: Path, place: Path) -> None:
-    try:
-        if place.exists():
-            place.rmdir()
-        capture.rename(place)
-    except OSError as error:
-        raise NeecoError(f"{place}: cannot write: {error.strerror or error}") from error

@@ -7,7 +7,7 @@ predicts each sample from its neighbours. (Slerp and RotationSpline of scipy go 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -43,16 +43,14 @@ def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> 
     Outside the log and inside its gaps poses are NaN.
     """
     times = np.asarray(times, dtype=np.float64)
-    widths = pose_smoothing(log) if smooth_s is None else None
-    position_s, rotation_s = (widths.position_s, widths.rotation_s) if widths else (smooth_s or 0.0, smooth_s or 0.0)
-    samples = _Samples(log.times, log.gaps)
-    valid = samples.covers(times)
+    widths = pose_smoothing(log) if smooth_s is None else Smoothing(smooth_s, smooth_s, 0.0, 0.0)
+    positions, rotations = _Series(log, log.positions), _RotationSeries(log, log.quats)
+    valid = positions.covers(times)
     poses = np.full((len(times), 4, 4), np.nan)
     poses[valid] = np.eye(4)
-    poses[valid, :3, 3] = _fit(samples, log.positions, times[valid], position_s)
-    quats = _fit_rotations(samples, log.quats, times[valid], rotation_s)
+    poses[valid, :3, 3] = positions.fit(times[valid], widths.position_s)
     if valid.any():
-        poses[valid, :3, :3] = _rotation(quats).as_matrix()
+        poses[valid, :3, :3] = _rotation(rotations.fit(times[valid], widths.rotation_s)).as_matrix()
     return poses, valid
 
 
@@ -60,58 +58,40 @@ def readings_at(log: ReadingLog, times: np.ndarray, smooth_s: float | None = Non
     """Readings [N] rad at times [N] on the log's clock, and bool [N] where the log has any; see `poses_at`."""
     times = np.asarray(times, dtype=np.float64)
     width = reading_smoothing(log).position_s if smooth_s is None else smooth_s
-    samples = _Samples(log.times, log.gaps)
-    valid = samples.covers(times)
+    series = _Series(log, log.values[:, None])
+    valid = series.covers(times)
     values = np.full(len(times), np.nan)
-    values[valid] = _fit(samples, log.values[:, None], times[valid], width)[:, 0]
+    values[valid] = series.fit(times[valid], width)[:, 0]
     return values, valid
 
 
 @lru_cache(maxsize=32)
 def pose_smoothing(log: PoseLog) -> Smoothing:
     """The windows that best predict each sample of this log from its neighbours (leave-one-out cross-validation)."""
-    samples = _Samples(log.times, log.gaps)
-    chosen = samples.validated()
-
-    def position_errors(width: float) -> np.ndarray:
-        fitted = _fit(samples, log.positions, log.times[chosen], width, leave_out=chosen)
-        return np.linalg.norm(fitted - log.positions[chosen], axis=1)
-
-    def rotation_errors(width: float) -> np.ndarray:
-        fitted = _fit_rotations(samples, log.quats, log.times[chosen], width, leave_out=chosen)
-        return (_rotation(fitted).inv() * _rotation(log.quats[chosen])).magnitude()
-
-    position_s, position_noise = _best_width(samples, position_errors)
-    rotation_s, rotation_noise = _best_width(samples, rotation_errors)
+    position_s, position_noise = _Series(log, log.positions).best_width()
+    rotation_s, rotation_noise = _RotationSeries(log, log.quats).best_width()
     return Smoothing(position_s, rotation_s, position_noise / 3**0.5, rotation_noise / 3**0.5)
 
 
 @lru_cache(maxsize=32)
 def reading_smoothing(log: ReadingLog) -> Smoothing:
     """The same for readings (the rotation's fields are 0)."""
-    samples = _Samples(log.times, log.gaps)
-    chosen = samples.validated()
-
-    def errors(width: float) -> np.ndarray:
-        fitted = _fit(samples, log.values[:, None], log.times[chosen], width, leave_out=chosen)
-        return np.abs(fitted[:, 0] - log.values[chosen])
-
-    width, noise = _best_width(samples, errors)
+    width, noise = _Series(log, log.values[:, None]).best_width()
     return Smoothing(width, 0.0, noise, 0.0)
 
 
-class _Samples:
-    """Times of samples [T] and the stretches without gaps they fall into."""
+class _Series:
+    """Samples [T, D] of a log, in stretches without gaps."""
 
-    def __init__(self, times: np.ndarray, gaps: tuple[tuple[float, float], ...]) -> None:
-        self.times = times
-        starts = np.searchsorted(times, [end for _, end in gaps])
-        stretch = np.zeros(len(times), dtype=np.int64)
+    def __init__(self, log: PoseLog | ReadingLog, values: np.ndarray) -> None:
+        self.times, self.values = log.times, values
+        starts = np.searchsorted(self.times, [end for _, end in log.gaps])
+        stretch = np.zeros(len(self.times), dtype=np.int64)
         stretch[starts] = 1
         self.stretch = np.cumsum(stretch)
         self.first = np.searchsorted(self.stretch, self.stretch)  # of each sample's stretch
         self.last = np.searchsorted(self.stretch, self.stretch, side="right")  # one past it
-        self.step = float(np.median(np.diff(times)))
+        self.step = float(np.median(np.diff(self.times)))
 
     def covers(self, times: np.ndarray) -> np.ndarray:
         """bool [N]: whether a time lies within a stretch."""
@@ -120,69 +100,102 @@ class _Samples:
         exact = (self.times[left] == times) | (self.times[right] == times)
         return inside & (exact | (self.stretch[left] == self.stretch[right]))
 
-    def validated(self) -> np.ndarray:
-        """Samples [M] to choose a width by: evenly spread, never the end of a stretch."""
-        inner = np.arange(len(self.times))
-        inner = inner[(inner > self.first) & (inner < self.last - 1)]
-        return inner[np.unique(np.linspace(0, len(inner) - 1, VALIDATED).astype(int))] if len(inner) else inner
-
-    def window(self, times: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-        """Samples within `width` of each time, of its own stretch: index [N, K] and bool [N, K]."""
-        left, right = self._around(times)
-        home = np.where(self.times[right] == times, right, left)
-        low = np.maximum(np.searchsorted(self.times, times - width), self.first[home])
-        high = np.minimum(np.searchsorted(self.times, times + width, side="right"), self.last[home])
-        index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
-        return np.minimum(index, len(self.times) - 1), index < high[:, None]
-
-    def neighbours(self, times: np.ndarray, leave_out: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The samples before and after each time [N] and the share [N] of the later one, for linear interpolation."""
-        left, right = self._around(times)
-        if leave_out is not None:
-            left, right = leave_out - 1, leave_out + 1
+    def fit(self, times: np.ndarray, width: float, leave_out: np.ndarray | None = None) -> np.ndarray:
+        """Values [N, D] at covered times [N]: local quadratics of half width `width` s where that has samples enough,
+        linear elsewhere. leave_out [N]: a sample per time that must not be used."""
+        left, right = self._around(times) if leave_out is None else (leave_out - 1, leave_out + 1)
         span = self.times[right] - self.times[left]
-        return left, right, np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
+        share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
+        if not len(times):
+            return np.zeros((0, self.values.shape[1]))
+        result = self._between(left, right, share[:, None])
+        if width > 0:
+            noise = _noise(self._flat())
+            for rows, index, used, offsets in self._windows(times, width, leave_out):
+                result[rows] = self._local_fit(index, used, offsets, noise)
+        return result
+
+    def best_width(self) -> tuple[float, float]:
+        """The half width s with the smallest prediction errors, and the typical size of those."""
+        inner = np.arange(len(self.times))
+        inner = inner[(inner > self.first) & (inner < self.last - 1)]  # never the end of a stretch
+        if not len(inner):
+            return 0.0, 0.0
+        chosen = inner[np.unique(np.linspace(0, len(inner) - 1, VALIDATED).astype(int))]
+        widths = [steps * self.step for steps in WIDTHS if steps == WIDTHS[0] or steps * self.step <= WIDEST_S]
+        widths = [0.0, *widths]
+        errors = [self._errors(self.fit(self.times[chosen], width, chosen), chosen) for width in widths]
+        # outliers are no reason for one width or another
+        limit = 5 * max(float(np.median(errors[0])), 1e-12)
+        scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in errors]
+        best = int(np.argmin(scores))
+        return widths[best], float(np.sqrt(scores[best]))
+
+    def _between(self, left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
+        return self.values[left] + share * (self.values[right] - self.values[left])
+
+    def _flat(self) -> np.ndarray:
+        """[T, D] whose second differences show the noise."""
+        return self.values
+
+    def _local_fit(self, index: np.ndarray, used: np.ndarray, offsets: np.ndarray, noise: float) -> np.ndarray:
+        return _local_polynomial(offsets, used, self.values[index], noise)
+
+    def _errors(self, fitted: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(fitted - self.values[chosen], axis=1)
+
+    def _windows(
+        self, times: np.ndarray, width: float, leave_out: np.ndarray | None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """Times with samples enough within `width`, some at once: which [N], their samples [N, K] with bool [N, K] of
+        those in use, and the samples' offsets [N, K] in half widths."""
+        size = max(int(CHUNK / max(2 * width / self.step, 8)), 1)
+        for start in range(0, len(times), size):
+            rows = np.arange(start, min(start + size, len(times)))
+            near = times[rows]
+            left, right = self._around(near)
+            home = np.where(self.times[right] == near, right, left)
+            low = np.maximum(np.searchsorted(self.times, near - width), self.first[home])
+            high = np.minimum(np.searchsorted(self.times, near + width, side="right"), self.last[home])
+            index = low[:, None] + np.arange(max(int((high - low).max(initial=0)), 1))
+            index, used = np.minimum(index, len(self.times) - 1), index < high[:, None]
+            if leave_out is not None:
+                used &= index != leave_out[rows, None]
+            enough = used.sum(axis=1) >= MIN_SAMPLES
+            if enough.any():
+                rows, index, used = rows[enough], index[enough], used[enough]
+                yield rows, index, used, (self.times[index] - times[rows, None]) / width
 
     def _around(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The samples before and after each time [N] (twice the same where one is at it)."""
         right = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         left = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
         return left, right
 
 
-def _fit(
-    samples: _Samples, values: np.ndarray, times: np.ndarray, width: float, leave_out: np.ndarray | None = None
-) -> np.ndarray:
-    """Values [N, D] at covered times [N] from samples [T, D]; `leave_out`: a sample [N] each time may not use."""
-    left, right, share = samples.neighbours(times, leave_out)
-    result = values[left] + share[:, None] * (values[right] - values[left])
-    if width <= 0 or not len(times):
-        return result
-    noise = _noise(values)
-    for rows, index, used, offsets in _windows(samples, times, width, leave_out):
-        result[rows] = _local_polynomial(offsets, used, values[index], noise)
-    return result
+class _RotationSeries(_Series):
+    """Unit quaternions wxyz [T, 4], sign-continuous, fitted about each local mean."""
 
+    def _between(self, left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
+        start = _rotation(self.values[left])
+        step = (start.inv() * _rotation(self.values[right])).as_rotvec()
+        return (start * Rotation.from_rotvec(step * share)).as_quat(scalar_first=True)
 
-def _fit_rotations(
-    samples: _Samples, quats: np.ndarray, times: np.ndarray, width: float, leave_out: np.ndarray | None = None
-) -> np.ndarray:
-    """Unit quaternions wxyz [N, 4] at covered times [N] from samples [T, 4]; as `_fit`, about each local mean."""
-    left, right, share = samples.neighbours(times, leave_out)
-    if not len(times):
-        return np.zeros((0, 4))
-    step = (_rotation(quats[left]).inv() * _rotation(quats[right])).as_rotvec()
-    result = (_rotation(quats[left]) * Rotation.from_rotvec(step * share[:, None])).as_quat(scalar_first=True)
-    if width <= 0:
-        return result
-    noise = _noise(_turns(quats))
-    for rows, index, used, offsets in _windows(samples, times, width, leave_out):
-        around = quats[index]  # sign-continuous, so their mean is a mean of rotations
+    def _flat(self) -> np.ndarray:
+        """Turns [T, 3] rad summed up from sample to sample, each in its own axes."""
+        steps = (_rotation(self.values[:-1]).inv() * _rotation(self.values[1:])).as_rotvec()
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def _local_fit(self, index: np.ndarray, used: np.ndarray, offsets: np.ndarray, noise: float) -> np.ndarray:
+        around = self.values[index]  # sign-continuous, so their mean is a mean of rotations
         mean = _rotation((around * (used * _tricube(offsets))[..., None]).sum(axis=1))
         flat = np.repeat(np.arange(len(index)), index.shape[1])
         vectors = (mean[flat].inv() * _rotation(around.reshape(-1, 4))).as_rotvec().reshape(*index.shape, 3)
         vector = _local_polynomial(offsets, used, vectors, noise)
-        result[rows] = (mean * Rotation.from_rotvec(vector)).as_quat(scalar_first=True)
-    return result
+        return (mean * Rotation.from_rotvec(vector)).as_quat(scalar_first=True)
+
+    def _errors(self, fitted: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        return (_rotation(fitted).inv() * _rotation(self.values[chosen])).magnitude()
 
 
 def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
@@ -216,48 +229,10 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
     return coefficients[:, 0]
 
 
-def _best_width(samples: _Samples, errors: Callable[[float], np.ndarray]) -> tuple[float, float]:
-    """The half width s with the smallest prediction errors, and the typical size of those."""
-    widths = [0.0] + [
-        steps * samples.step for steps in WIDTHS if steps == WIDTHS[0] or steps * samples.step <= WIDEST_S
-    ]
-    found = [errors(width) for width in widths]
-    if not len(found[0]):
-        return 0.0, 0.0
-    # outliers are no reason for one width or another
-    limit = 5 * max(float(np.median(found[0])), 1e-12)
-    scores = [float(np.mean(np.minimum(error, limit) ** 2)) for error in found]
-    best = int(np.argmin(scores))
-    return widths[best], float(np.sqrt(scores[best]))
-
-
-def _windows(
-    samples: _Samples, times: np.ndarray, width: float, leave_out: np.ndarray | None
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Times with samples enough around them, some at once: which [N], their samples [N, K] with bool [N, K] of those
-    in use, and the samples' offsets [N, K] in half widths."""
-    size = max(int(CHUNK / max(2 * width / samples.step, 8)), 1)
-    for start in range(0, len(times), size):
-        rows = np.arange(start, min(start + size, len(times)))
-        index, used = samples.window(times[rows], width)
-        if leave_out is not None:
-            used &= index != leave_out[rows, None]
-        enough = used.sum(axis=1) >= MIN_SAMPLES
-        if enough.any():
-            rows, index, used = rows[enough], index[enough], used[enough]
-            yield rows, index, used, (samples.times[index] - times[rows, None]) / width
-
-
 def _noise(values: np.ndarray) -> float:
     """How far one sample [T, D] is off the line through its neighbours, per axis, robustly."""
     bend = values[1:-1] - (values[:-2] + values[2:]) / 2
     return max(1.48 * float(np.median(np.abs(bend))) / np.sqrt(1.5), 1e-9)
-
-
-def _turns(quats: np.ndarray) -> np.ndarray:
-    """Turns [T, 3] rad summed up from sample to sample, each in its own axes: second differences show the noise."""
-    steps = (_rotation(quats[:-1]).inv() * _rotation(quats[1:])).as_rotvec()
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _median(values: np.ndarray, used: np.ndarray) -> np.ndarray:

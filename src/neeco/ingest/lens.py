@@ -154,11 +154,8 @@ def _maps(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
 def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
-    model = str(document.get("camera_model", "")).lower()
-    if model in FISHEYE:
-        raise _fisheye(path, "camera_model", model)
-    width, height = document.get("w"), document.get("h")
-    size = _size(path, width, height)
+    _refuse_fisheye(path, document, "camera_model")
+    size = _size(path, document.get("w"), document.get("h"))
     if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
         angle = float(document["camera_angle_x"])
         focal = size[0] / 2 / math.tan(angle / 2) if angle else math.nan
@@ -178,9 +175,7 @@ def _opencv(path: Path, document: Any) -> Lens:
     matrix = _numbers(path, _first(document, MATRIX_NAMES), "camera_matrix")
     if len(matrix) != 9:
         raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
-    model = str(document.get("distortion_model", "")).lower()
-    if model in FISHEYE:
-        raise _fisheye(path, "distortion_model", model)
+    _refuse_fisheye(path, document, "distortion_model")
     found = _first(document, DISTORTION_NAMES)
     size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
@@ -197,9 +192,7 @@ def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], s
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
     if len(coefficients) not in COEFFICIENTS:
-        raise NeecoError(
-            f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV's models have 4, 5, 8, 12 or 14"
-        )
+        raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if not any(coefficients):
         coefficients = ()
     fl_x, fl_y, cx, cy = (float(value) for value in values)
@@ -214,10 +207,11 @@ def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _fisheye(path: Path, field: str, model: str) -> NeecoError:
-    return NeecoError(
-        f"{path}: {field}: {model} lenses are not supported; calibrate with OpenCV's standard model (calibrateCamera)"
-    )
+def _refuse_fisheye(path: Path, document: dict[Any, Any], field: str) -> None:
+    model = str(document.get(field, "")).lower()
+    if model in FISHEYE:
+        remedy = "calibrate with OpenCV's standard model (calibrateCamera)"
+        raise NeecoError(f"{path}: {field}: {model} lenses are not supported; {remedy}")
 
 
 class _Loader(yaml.SafeLoader):

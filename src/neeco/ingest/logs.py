@@ -14,24 +14,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import (
-    EULER,
-    FORMS,
-    MATRIX,
-    QUATERNION_WXYZ,
-    QUATERNION_XYZW,
-    ROTATION_MATRIX,
-    ROTATION_VECTOR,
-    UNITS,
-    JointColumns,
-    PoseColumns,
-    RecognisedColumns,
-    recognise_pose,
-    recognise_time,
-    recognise_value,
-    scale_of,
-    split_unit,
-)
+from neeco.ingest import columns as named
+from neeco.ingest.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
 from neeco.ingest.formats import Table, column_index, count_rows, list_lines, numbers, read_table
 from neeco.raster.rotations import rotation_error
 
@@ -111,7 +95,7 @@ class Rows:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = read_table(source.path)
-    found = recognise_pose(table.header)
+    found = named.recognise_pose(table.header)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
     times = _times(rows, source, found)
@@ -128,24 +112,19 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path)
-    value, found = recognise_value(table.header)
+    value, found = named.recognise_value(table.header)
     value = source.value or value
     if value is None:
-        raise NeecoError(
-            f"{table.path}: header: which column is the joint's reading? Name it in the recording: columns.value"
-        )
+        raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
     times = _times(rows, source, found)
     values = _cells(rows, (value,))[:, 0]
     clamped: tuple[str, ...] = ()
     if source.calibration is not None:
-        calibration = read_calibration(source.calibration, source.units.angle)
-        values, outside, clamped = apply_calibration(calibration, table, value, values, rows.keep)
-        reason = f"{value} lies far outside the calibration table {source.calibration.name}"
-        rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
+        values, clamped = _calibrated(rows, value, values, source, source.calibration)
     else:
         hint = " Counts need a calibration table, `calibration`."
-        values = values * scale_of(table.path, (value,), "angle", source.units.angle, None, hint)
+        values = values * named.scale_of(table.path, (value,), "angle", source.units.angle, None, hint)
         wild = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(wild, reason)
@@ -162,14 +141,14 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     if form == MATRIX:
         position, read = tuple(rotation[i] for i in (3, 7, 11)), rotation
     elif position is None:
-        raise NeecoError(f"{table.path}: header: {_unclear(table, found.unclear, 'position', 'x, y, z columns')}")
+        raise _unclear(table, found, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
     implied = found.length_unit if position == found.position else None
-    scale = scale_of(table.path, position, "length", source.units.length, implied, "")
+    scale = named.scale_of(table.path, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
-        angle = scale_of(table.path, rotation, "angle", source.units.angle, None, "")
+        angle = named.scale_of(table.path, rotation, "angle", source.units.angle, None, "")
     positions, turns = _parts(table, form, _cells(rows, read))
     positions = positions * scale
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
@@ -194,13 +173,13 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
     """
     quats = np.full((len(cells), 4), np.nan)
     finite = np.isfinite(cells).all(axis=1)
-    if form in (QUATERNION_WXYZ, QUATERNION_XYZW):
+    if form in (named.QUATERNION_WXYZ, named.QUATERNION_XYZW):
         norms = np.linalg.norm(cells, axis=1)
         good = finite & (np.abs(norms - 1) <= NORM_TOLERANCE)
-        wxyz = cells if form == QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
+        wxyz = cells if form == named.QUATERNION_WXYZ else cells[:, [3, 0, 1, 2]]
         quats[good] = wxyz[good] / norms[good, None]
         return quats, good
-    if form in (ROTATION_MATRIX, MATRIX):
+    if form in (named.ROTATION_MATRIX, MATRIX):
         matrices = cells.reshape(-1, 3, 3)
         with np.errstate(all="ignore"):
             good = finite & (rotation_error(matrices) <= ROUNDED_TOLERANCE)
@@ -209,7 +188,7 @@ def to_quaternions(form: str, cells: np.ndarray, convention: str | None, scale: 
         # beyond this, angles are something else (or the sine of them is noise)
         good = finite & (np.abs(cells * scale) < 1e4).all(axis=1)
     if good.any():
-        if form in (ROTATION_MATRIX, MATRIX):
+        if form in (named.ROTATION_MATRIX, MATRIX):
             rotations = Rotation.from_matrix(matrices[good])
         elif form == EULER:
             rotations = Rotation.from_euler(convention or "", cells[good] * scale)
@@ -253,11 +232,9 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
     """Times [R] in s; rows without one are dropped."""
     table, names = rows.table, source.time or found.time
     if names is None:
-        raise NeecoError(
-            f"{table.path}: header: no column of times found; name it in the recording: columns.time (or add t_s)"
-        )
+        raise NeecoError(f"{table.path}: header: no column of times found; name it as columns.time (or add t_s)")
     cells = _cells(rows, names)
-    known = recognise_time(names)
+    known = named.recognise_time(names)
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
     if source.rate_hz is not None:
@@ -274,7 +251,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
         rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
         likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
         hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * scale_of(table.path, names, "time", source.units.time, known.time_unit, hint)
+    return cells[:, 0] * named.scale_of(table.path, names, "time", source.units.time, known.time_unit, hint)
 
 
 def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
@@ -301,23 +278,21 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
     """Form and columns of the rotation."""
     rotation, form = (source.rotation, source.form) if source.rotation else (found.rotation, found.form)
     if rotation is None or form is None:
-        raise NeecoError(
-            f"{table.path}: header: {_unclear(table, found.unclear, 'rotation', 'qw, qx, qy, qz columns')}"
-        )
-    if len(rotation) not in FORMS[form]:
-        wanted = " or ".join(map(str, FORMS[form]))
+        raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
+    if len(rotation) not in named.FORMS[form]:
+        wanted = " or ".join(map(str, named.FORMS[form]))
         raise NeecoError(f"{table.path}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
     if form == EULER and not source.euler_convention:
         raise NeecoError(f"{table.path}: {', '.join(rotation)}: say their euler_convention in the recording (like XYZ)")
     return form, rotation
 
 
-def _unclear(table: Table, unclear: dict[str, str], what: str, expected: str) -> str:
-    reason = unclear.get(what) or (unclear.get("quaternion") if what == "rotation" else None)
-    if reason:
-        return f"{what}: {reason}"
-    names = ", ".join(table.header[:12])
-    return f"no {expected} found among {names[:120]!r}; name them in the recording under columns"
+def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
+    reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
+    problem = (
+        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns"
+    )
+    return NeecoError(f"{table.path}: header: {f'{what}: {reason}' if reason else problem}")
 
 
 def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -328,9 +303,7 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     if cells.shape[1] == 16:
         last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
         if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(
-                f"{table.path}: matrix: is written by columns; list its columns in the recording row by row"
-            )
+            raise NeecoError(f"{table.path}: matrix: is written by columns; list them in the recording row by row")
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
@@ -366,46 +339,37 @@ def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], .
     return gaps, (f"{table.path.name}: {count}, {total:.2f} s in all ({first}); not bridged",)
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """A joint sensor's table: counts [K] increasing, angles [K] rad, increasing or decreasing. Between its points PCHIP
-    (Fritsch & Carlson 1980) is as monotone as they are."""
+def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A joint sensor's calibration table: counts [K] increasing, angles [K] rad, increasing or decreasing.
 
-    path: Path
-    counts: np.ndarray
-    angles: np.ndarray
-
-
-def read_calibration(path: Path, angle_unit: str | None = None) -> Calibration:
-    """Read a table of two columns, counts and angle. The angle is the column with an angle's unit in its name, else
-    the second; its unit comes from there or from `angle_unit`. Raises NeecoError naming file, row and remedy."""
+    It has two columns; the angle is the one with an angle's unit in its name, else the second. The unit comes from
+    there or from `angle_unit`. Raises NeecoError naming file, row and remedy.
+    """
     table = read_table(path)
     names = [name for name in table.header if name]
-    angle_names = [name for name in names if split_unit(name, "angle")[1] or split_unit(name, "angle")[0] == "angle"]
+    angle_names = [
+        name for name in names if named.split_unit(name, "angle")[1] or named.split_unit(name, "angle")[0] == "angle"
+    ]
     if len(names) < 2 or (len(names) > 2 and len(angle_names) != 1):
         raise NeecoError(f"{path}: header: expected two columns, counts and angle_rad (or angle_deg); repair the table")
     angle_name = angle_names[0] if len(angle_names) == 1 else names[1]
     count_name = next(name for name in names if name != angle_name)
-    unit = split_unit(angle_name, "angle")[1] or angle_unit
+    unit = named.split_unit(angle_name, "angle")[1] or angle_unit
     if unit is None:
-        raise NeecoError(
-            f"{path}: column {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg"
-        )
+        raise NeecoError(f"{path}: {angle_name}: radians or degrees? Name it {angle_name}_rad or {angle_name}_deg")
     values, missing, bad = numbers(table, (count_name, angle_name))
     wrong = [*bad, *((int(row), "has an empty cell") for row in np.flatnonzero(missing))]
     if wrong:
         row, what = min(wrong)
         raise NeecoError(f"{path}: line {table.lines[row]}: {what}; repair or remove the line")
     order = np.argsort(values[:, 0], kind="stable")
-    counts, angles, lines = values[order, 0], values[order, 1] * UNITS["angle"][unit], table.lines[order]
+    counts, angles, lines = values[order, 0], values[order, 1] * named.UNITS["angle"][unit], table.lines[order]
     if len(counts) < 2:
         raise NeecoError(f"{path}: has one point; a calibration table needs two or more")
     same = np.flatnonzero(np.diff(counts) <= 0)
     if len(same):
         first, second = lines[same[0] : same[0] + 2]
-        raise NeecoError(
-            f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one of them"
-        )
+        raise NeecoError(f"{path}: lines {first} and {second}: the same count {counts[same[0]]:g} twice; keep one")
     turning = np.flatnonzero(np.diff(angles) * np.sign(angles[-1] - angles[0]) <= 0)
     if len(turning):
         first, second = lines[turning[0] : turning[0] + 2]
@@ -415,27 +379,29 @@ def read_calibration(path: Path, angle_unit: str | None = None) -> Calibration:
         )
     if np.abs(angles).max() > TWO_TURNS:
         raise NeecoError(f"{path}: {angle_name}: goes beyond two turns; correct the column's unit")
-    return Calibration(Path(path), counts, angles)
+    return counts, angles
 
 
-def apply_calibration(
-    calibration: Calibration, table: Table, name: str, counts: np.ndarray, keep: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Angles [R] rad of counts [R]; bool [R] rows too far outside the table to be used; notes.
-
-    Readings outside by less than 5% of the table's range are read as its end.
-    """
-    low, high = calibration.counts[0], calibration.counts[-1]
-    counts = np.where(keep, counts, low)
-    excess = np.maximum(low - counts, counts - high)
+def _calibrated(
+    rows: Rows, name: str, readings: np.ndarray, source: JointColumns, path: Path
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Angles [R] rad of a column of counts, by PCHIP through the table (Fritsch & Carlson 1980), which is as monotone
+    as its points. Just outside the table, its end is taken, with a note; rows farther outside are dropped."""
+    table = rows.table
+    counts, angles = read_calibration(path, source.units.angle)
+    low, high = counts[0], counts[-1]
+    readings = np.where(rows.keep, readings, low)
+    excess = np.maximum(low - readings, readings - high)
     outside = excess > CLAMPED * (high - low)
-    angles = PchipInterpolator(calibration.counts, calibration.angles)(np.clip(counts, low, high))
+    values = PchipInterpolator(counts, angles)(np.clip(readings, low, high))
     clamped = (excess > 0) & ~outside
-    if not clamped.any():
-        return angles, outside, ()
-    note = (
-        f"{table.path.name}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
-        f"{calibration.path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
-        f"read as its end ({list_lines(table.lines[clamped])})"
-    )
-    return angles, outside, (note,)
+    note = ""
+    if clamped.any():
+        note = (
+            f"{table.path.name}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
+            f"{path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
+            f"read as its end ({list_lines(table.lines[clamped])})"
+        )
+    reason = f"{name} lies far outside the calibration table {path.name}"
+    rows.drop_wrong(outside, reason + "; extend the table, or name the right column")
+    return values, (note,) if note else ()

@@ -42,36 +42,11 @@ class RoughShape:
     agreement: float  # share of frames in which a point of it lies on moving pixels, [0, 1]
 
 
-def moving_pixels(
-    load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens, rows: np.ndarray, moving_px: float
-) -> np.ndarray:
-    """[R, h, w] share of neighbours, at every STEP-th pixel, against which the pixel moved otherwise than tissue would.
+class ResidualFlow:
+    """Optical flow between frames at every STEP-th pixel, less what a still scene explains.
 
-    load(row): image [H, W, 3] uint8 of a row of `sfm`; rows [R]: the ones wanted; moving_px: residual flow from which
-    a pixel counts as moving.
+    load(row): image [H, W, 3] uint8 of a row of `sfm`.
     """
-    flow = _ResidualFlow(load, sfm, pinhole)
-    evidence = []
-    for row in rows.tolist():
-        others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(sfm.indices)]
-        moved = sum((motion > moving_px for motion in flow.residuals(row, others)), np.zeros(flow.u.shape))
-        evidence.append(moved / max(len(others), 1))
-    return np.stack(evidence)
-
-
-def motion_between(load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> np.ndarray:
-    """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
-    flow = _ResidualFlow(load, sfm, pinhole)
-    patch = max(1, round(PATCH * flow.u.size))
-    motion = np.zeros(len(sfm.indices) - 1)
-    for row in range(len(motion)):
-        (left,) = flow.residuals(row, [row + 1])
-        motion[row] = np.sort(left, axis=None)[-patch:].mean()
-    return motion
-
-
-class _ResidualFlow:
-    """Optical flow at every STEP-th pixel, and what of it a still scene does not explain."""
 
     def __init__(self, load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> None:
         self.sfm, self.pinhole = sfm, pinhole
@@ -80,21 +55,63 @@ class _ResidualFlow:
         height, width = self.grey(0).shape
         self.v, self.u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
 
-    def residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
+    def moving_pixels(self, rows: np.ndarray, moving_px: float) -> np.ndarray:
+        """[R, h, w] share of the neighbours of rows [R] against which a pixel moved by more than tissue would and
+        `moving_px`."""
+        evidence = []
+        for row in rows.tolist():
+            others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(self.sfm.indices)]
+            moved = sum((motion > moving_px for motion in self._residuals(row, others)), np.zeros(self.u.shape))
+            evidence.append(moved / max(len(others), 1))
+        return np.stack(evidence)
+
+    def fastest_motion(self) -> np.ndarray:
+        """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
+        patch = max(1, round(PATCH * self.u.size))
+        motion = np.zeros(len(self.sfm.indices) - 1)
+        for row in range(len(motion)):
+            (residual,) = self._residuals(row, [row + 1])
+            motion[row] = np.sort(residual, axis=None)[-patch:].mean()
+        return motion
+
+    def _residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
         """[h, w] px by which the flow from a row of `sfm` to each of the others differs from a still scene's."""
-        cameras = self.sfm.world_from_camera
-        depth = _still_depth(self.sfm, row, self.pinhole, self.u, self.v)
+        cameras, lens = self.sfm.world_from_camera, self.pinhole
+        rays = np.stack(
+            [(self.u + 0.5 - lens.cx) / lens.fl_x, (self.v + 0.5 - lens.cy) / lens.fl_y, np.ones(self.u.shape)], -1
+        )
+        points = rays * self._still_depth(row)[..., None]
         for other in others:
             flow = self.estimator.calc(self.grey(row), self.grey(other), None)[self.v, self.u]  # [h, w, 2]
-            still = _still_flow(cameras[row], cameras[other], depth, self.pinhole, self.u, self.v)
-            yield np.linalg.norm(flow - still, axis=-1)
+            relative = np.linalg.inv(cameras[other]) @ cameras[row]
+            moved = points @ relative[:3, :3].T + relative[:3, 3]
+            x, y = project(moved, *lens.intrinsics, nearest=TINY)
+            yield np.linalg.norm(flow - np.stack([x - self.u - 0.5, y - self.v - 0.5], -1), axis=-1)
+
+    def _still_depth(self, row: int) -> np.ndarray:
+        """[h, w] depth of the still scene: between the points that this frame sees, and of the nearest beyond them."""
+        seen = self.sfm.observations[:, 0] == row
+        points = self.sfm.points[self.sfm.observations[seen, 1].astype(int)]
+        pixels, depth = project_world(points, self.pinhole.camera(self.sfm.world_from_camera[row]), nearest=TINY)
+        near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
+        keep = (depth > 0.3 * near) & (depth < 3 * near)
+        pixels, inverse = pixels[keep], 1 / depth[keep]
+        if len(pixels) == 0:
+            return np.full(self.u.shape, np.nan)  # nothing is known, so nothing is seen to move
+        places = np.stack([self.u + 0.5, self.v + 0.5], -1)
+        nearest = NearestNDInterpolator(pixels, inverse)(places)
+        try:
+            between = LinearNDInterpolator(pixels, inverse)(places)
+        except QhullError:  # fewer than three, or all on one line
+            return np.asarray(1 / nearest)
+        return np.asarray(1 / np.where(np.isnan(between), nearest, between))
 
 
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
     """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
 
-    evidence [R, h, w] from `moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands out: the
-    instrument hardly moves, or its poses do not fit the cameras.
+    evidence [R, h, w] from `ResidualFlow.moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands
+    out: the instrument hardly moves, or its poses do not fit the cameras.
     """
     distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:
@@ -154,40 +171,3 @@ def _raster_cells(
     x, y = (np.floor(place / STEP) for place in project(camera, *intrinsics, nearest=NEAREST))
     inside = (camera[:, 2] > NEAREST) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
     return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
-
-
-def _still_depth(sfm: SfmResult, row: int, pinhole: Lens, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[h, w] depth of the still scene at pixels u, v: between the points this frame sees, nearest beyond them."""
-    seen = sfm.observations[:, 0] == row
-    points = sfm.points[sfm.observations[seen, 1].astype(int)]
-    pixels, depth = project_world(points, pinhole.camera(sfm.world_from_camera[row]), nearest=TINY)
-    near = np.median(depth[depth > 0]) if (depth > 0).any() else np.nan
-    keep = (depth > 0.3 * near) & (depth < 3 * near)
-    pixels, inverse = pixels[keep], 1 / depth[keep]
-    if len(pixels) == 0:
-        return np.full(u.shape, np.nan)  # nothing is known, so nothing is seen to move
-    places = np.stack([u + 0.5, v + 0.5], -1)
-    nearest = NearestNDInterpolator(pixels, inverse)(places)
-    try:
-        between = LinearNDInterpolator(pixels, inverse)(places)
-    except QhullError:  # fewer than three, or all on one line
-        return np.asarray(1 / nearest)
-    return np.asarray(1 / np.where(np.isnan(between), nearest, between))
-
-
-def _still_flow(
-    world_from_first: np.ndarray,
-    world_from_second: np.ndarray,
-    depth: np.ndarray,
-    pinhole: Lens,
-    u: np.ndarray,
-    v: np.ndarray,
-) -> np.ndarray:
-    """[h, w, 2] px by which a still point at that depth moves from the first frame to the second."""
-    rays = np.stack(
-        [(u + 0.5 - pinhole.cx) / pinhole.fl_x, (v + 0.5 - pinhole.cy) / pinhole.fl_y, np.ones(u.shape)], -1
-    )
-    relative = np.linalg.inv(world_from_second) @ world_from_first
-    moved = (rays * depth[..., None]) @ relative[:3, :3].T + relative[:3, 3]
-    x, y = project(moved, *pinhole.intrinsics, nearest=TINY)
-    return np.stack([x - u - 0.5, y - v - 0.5], -1)

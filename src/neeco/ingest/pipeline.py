@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.convert import staged
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, Lens, read_lens, visible_mask
-from neeco.ingest.motion import RoughShape, carve_shape, motion_between, moving_pixels, observations_on
+from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, Recording, Splits
 from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
@@ -112,13 +112,7 @@ class _Ingest:
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
-            folder / "sfm",
-            self.data.video.path,
-            folder / "raw",
-            self.names,
-            self.pinhole,
-            self.visible,
-            self.settings,
+            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.pinhole, self.visible, self.settings
         )
 
     def run(self, output: Path) -> IngestResult:
@@ -235,13 +229,11 @@ class _Ingest:
         data.clocks[scope.clock] = registration.clock
         return registration
 
-    def _image_loader(self, sfm: SfmResult) -> Callable[[int], np.ndarray]:
-        """Image [H, W, 3] uint8 of a row of `sfm`."""
-
+    def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
         def load(row: int) -> np.ndarray:
             return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
 
-        return load
+        return ResidualFlow(load, sfm, pinhole)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope told: from how the instruments move in the images."""
@@ -249,7 +241,7 @@ class _Ingest:
         if not unknown:
             return
         self.progress("finding the instrument's clock", 0, 0)
-        moved = motion_between(self._image_loader(sfm), sfm, pinhole)
+        moved = self._residual_flow(sfm, pinhole).fastest_motion()
         for clock, log in unknown.items():
             try:
                 self.data.clocks[clock] = offset_from_instrument(moved, self._times(sfm), log)
@@ -265,7 +257,7 @@ class _Ingest:
             return on_instruments, {}
         self.progress("finding the instrument", 0, 0)
         rows = np.unique(np.linspace(0, len(sfm.indices) - 1, self.settings.shape_frames).astype(int))
-        evidence = moving_pixels(self._image_loader(sfm), sfm, pinhole, rows, self.settings.moving_px)
+        evidence = self._residual_flow(sfm, pinhole).moving_pixels(rows, self.settings.moving_px)
         cameras, points = registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         shapes = {}
         for name, log in self.data.poses.items():
@@ -369,7 +361,7 @@ class _Ingest:
             owner = next((values for _, values in states.values() if by in values), None)
             if owner is None:
                 raise NeecoError(
-                    f"{where}: splits.unseen_by: {by!r} is the joint of an instrument without poses; name another"
+                    f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another"
                 )
             joints = owner
         rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))

@@ -14,18 +14,8 @@ import yaml
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
-from neeco.ingest.columns import (
-    EULER,
-    FORMS,
-    MATRIX,
-    TRACKER_CLOCK,
-    UNITS,
-    JointColumns,
-    PoseColumns,
-    Units,
-    canonical_unit,
-    quaternion_form,
-)
+from neeco.ingest import columns as named
+from neeco.ingest.columns import FORMS, TRACKER_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.video import VideoSource, open_images, open_video
 
 MIN_FRAMES = 10  # that cameras can be found from
@@ -130,7 +120,6 @@ def recording_from_flags(
     sync: Path | None = None,
     frames: int | None = None,
     fps: float | None = None,
-    name: str = "instrument",
 ) -> Recording:
     """The same from the command line: columns are recognised from the headers. `video`: a file or a folder of images;
     joints: (name, log, calibration or None). Raises NeecoError naming the option."""
@@ -146,7 +135,7 @@ def recording_from_flags(
     if joints and instrument is None:
         raise NeecoError(f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to")
     logs = {joint: JointColumns(Path(log), joint, calibration=table and Path(table)) for joint, log, table in joints}
-    instruments = (InstrumentLogs(name, PoseColumns(Path(instrument)), logs),) if instrument else ()
+    instruments = (InstrumentLogs("instrument", PoseColumns(Path(instrument)), logs),) if instrument else ()
     scope = PoseColumns(Path(laparoscope)) if laparoscope else None
     values: Path | tuple[float, ...] | None = None
     if isinstance(intrinsics, str | Path):
@@ -206,34 +195,27 @@ class Section:
         value = self.value.get(key)
         return Section(self.file, self.at(key), {} if value is None else value, keys)
 
-    def text(self, key: str) -> str | None:
-        """A name; YAML makes whole numbers of some."""
+    def text(self, key: str, required: bool = False) -> Any:
+        """A name (YAML makes whole numbers of some), or None."""
         value = self.value.get(key)
+        if value is None and required:
+            raise self.error(key, "missing; give it")
         if isinstance(value, int) and not isinstance(value, bool):
             return str(value)
         return None if value is None else self.node.child(key).text("put it in quotes if it is a name")
 
-    def required_text(self, key: str) -> str:
-        text = self.text(key)
+    def path(self, key: str, required: bool = False) -> Any:
+        """An existing file or folder, relative to this file, or None."""
+        text = self.text(key, required)
         if text is None:
-            raise self.error(key, "missing; give it")
-        return text
-
-    def path(self, key: str) -> Path | None:
-        """An existing file or folder, relative to this file."""
-        return None if self.text(key) is None else self.required_path(key)
-
-    def required_path(self, key: str) -> Path:
-        text = self.required_text(key)
+            return None
         try:
             path = self.file.parent / Path(text).expanduser()
             found = path.exists()
         except (OSError, ValueError, RuntimeError):
             found = False
         if not found:
-            raise self.error(
-                key, f"no such file: {printable(text, 120)}; correct the path (relative to {self.file.name})"
-            )
+            raise self.error(key, f"no such file: {printable(text, 120)}; correct it (relative to {self.file.name})")
         return path
 
     def number(
@@ -303,13 +285,11 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     """Video, images, fps and times of images."""
     video, images = top.value.get("video"), top.value.get("images")
     if (video is None) == (images is None):
-        raise top.error(
-            "video", "missing or given twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`"
-        )
+        raise top.error("video", "missing or twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`")
     key, keys = ("video", ("file", "fps")) if images is None else ("images", ("folder", "fps", "times"))
     value = top.value[key]
     section = Section(top.file, key, value if isinstance(value, dict) else {keys[0]: value}, keys)
-    source = section.required_path(keys[0])
+    source = section.path(keys[0], required=True)
     fps = section.number("fps", above=0.0)
     if images is None:
         return source, None, fps, None
@@ -337,7 +317,7 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
     sections = [
         Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints")) for i, item in enumerate(value)
     ]
-    names = [section.required_text("name") for section in sections]
+    names = [section.text("name", required=True) for section in sections]
     joint_names = [joint for section in sections for joint in _joints_of(section)]
     found = []
     for section, name in zip(sections, names, strict=True):
@@ -374,16 +354,16 @@ def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
     if forms:
         rotation = columns.names(forms[0], FORMS.get(forms[0], (4,)))
         assert rotation is not None
-        form = forms[0] if forms[0] in FORMS else quaternion_form(rotation)
+        form = forms[0] if forms[0] in FORMS else named.quaternion_form(rotation)
         if form is None:
             raise columns.error("quaternion", "the names do not say the order; use quaternion_wxyz or quaternion_xyzw")
-    if form == MATRIX and columns.value.get("position") is not None:
+    if form == named.MATRIX and columns.value.get("position") is not None:
         raise columns.error("position", "the 4x4 matrix holds the position already; remove it (or use rotation_matrix)")
     convention = columns.text("euler_convention")
     if convention is not None and not _EULER.fullmatch(convention):
         problem = f"{printable(convention)} is none; three axes: XYZ intrinsic, xyz extrinsic"
         raise columns.error("euler_convention", problem)
-    if form == EULER and convention is None:
+    if form == named.EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
     good = columns.value.get("good")
     goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
@@ -411,15 +391,15 @@ def _log(parent: Section, key: str, value: Any, more: tuple[str, ...] = ()) -> t
     """What the recording says of one log, and the log's file. more: keys that only this kind of log has."""
     value = value if isinstance(value, dict) else {"file": value}
     section = Section(parent.file, parent.at(key), value, ("file", "clock", "columns", "units", "rate_hz", *more))
-    return section, section.required_path("file")
+    return section, section.path("file", required=True)
 
 
 def _units(section: Section) -> Units:
     given = section.section("units", ("length", "angle", "time"))
     found: dict[str, str | None] = {}
-    for kind, units in UNITS.items():
+    for kind, units in named.UNITS.items():
         text = given.text(kind)
-        found[kind] = None if text is None else canonical_unit(text)
+        found[kind] = None if text is None else named.canonical_unit(text)
         if found[kind] is not None and found[kind] not in units:
             raise given.error(kind, f"{printable(text)} is no unit of {kind}; use {', '.join(units)}")
     return Units(**found)
@@ -432,7 +412,7 @@ def _sync(top: Section, clocks: tuple[str, ...]) -> tuple[dict[str, float], tupl
         return {}, ()
     source = top
     if isinstance(value, str):
-        file = top.required_path("sync")
+        file = top.path("sync", required=True)
         require_file(file, "clock offsets as JSON")
         value = read_json(file)
         if not isinstance(value, dict):
@@ -471,9 +451,8 @@ def _clock_of(source: Section, place: str, name: str, clocks: tuple[str, ...]) -
         return longer[0]
     likely = _close_match(name, clocks)
     if likely or len(longer) > 1:
-        raise source.error(
-            place, f"no log has the clock {printable(name)}; did you mean {likely or ' or '.join(longer)}?"
-        )
+        meant = likely or " or ".join(longer)
+        raise source.error(place, f"no log has the clock {printable(name)}; did you mean {meant}?")
     return None
 
 
@@ -484,9 +463,8 @@ def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | N
     by = section.text("unseen_by")
     joints = [joint for instrument in instruments for joint in instrument.joints]
     if by is not None and by not in joints:
-        raise section.error(
-            "unseen_by", f"no joint is called {printable(by)}; the joints are {', '.join(joints) or 'none'}"
-        )
+        known = ", ".join(joints) or "none"
+        raise section.error("unseen_by", f"no joint is called {printable(by)}; the joints are {known}")
     fraction, every = section.number("unseen_fraction", least=0.0, below=0.9), section.integer("test_every", 0)
     given: dict[str, Any] = {} if fraction is None else {"unseen_fraction": fraction}
     given |= {} if every is None else {"test_every": every}

@@ -189,83 +189,19 @@ def register_with_laparoscope(
 ) -> Registration:
     """Similarity, hand-eye and clock offset from SfM cameras [N, 4, 4] at video `times` [N] s and the scope's log.
 
-    The offset is estimated unless known; a known one is kept. Raises NeecoError when the scope moved too little.
+    From a closed form all unknowns are refined under a soft-L1 loss, the tracker's slow drift among them: left out, it
+    (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents. The offset is
+    estimated unless known; a known one is kept. Raises NeecoError when the scope moved too little.
     """
+    settings = settings or IngestSettings()
     offset = offset_from_turning(world_from_camera, times, log) if known_offset is None else known_offset
     start = _closed_form(world_from_camera, times, log, offset)
-    keep_offset = known_offset is not None
-    return _refine(world_from_camera, times, log, start, offset, keep_offset, settings or IngestSettings())
-
-
-def _sensor_poses(times: np.ndarray, log: PoseLog, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    poses, valid = poses_at(log, times + offset)
-    if valid.sum() < MIN_FRAMES:
-        raise NeecoError(
-            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least {MIN_FRAMES} are needed); "
-            "check the clock offset in `sync` and that log and video are of the same recording"
-        )
-    return poses, valid
-
-
-@dataclass(frozen=True)
-class _Start:
-    scale: float
-    rotation: Rotation  # world_from_sfm
-    translation: np.ndarray
-    camera_from_sensor: Rotation
-    lever: np.ndarray  # [3] mm, sensor origin in the camera's frame
-
-
-def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, offset: float) -> _Start:
-    """Hand-eye rotation from relative turns (their rotation vectors differ by it alone), the rest linear in turn."""
-    poses, valid = _sensor_poses(times, log, offset)
-    cameras, sensors = world_from_camera[valid], poses[valid]
-    camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
-    middle = len(cameras) // 2
-    steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
-    # relative turns [3N, 3] in the camera's and in the sensor's frame
-    a, b = (
-        np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
-        for turns in (camera_turns, sensor_turns)
-    )
-    spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
-    if spread[1] < MIN_TURN:
-        raise NeecoError(
-            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
-            "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
-            "by 10 deg or more"
-        )
-    camera_from_sensor, _ = Rotation.align_vectors(a, b)
-    world_from_sfm = (sensor_turns * camera_from_sensor.inv() * camera_turns.inv()).mean()
-    turned = world_from_sfm.as_matrix() @ cameras[:, :3, :3]  # [N, 3, 3] world_from_camera rotations
-    travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
-    system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
-    solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
-    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL:
-        raise NeecoError(
-            f"{log.path}: the laparoscope travelled too little for its scale to be found; move it by 20 mm or more"
-        )
-    return _Start(float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:])
-
-
-def _refine(
-    world_from_camera: np.ndarray,
-    times: np.ndarray,
-    log: PoseLog,
-    start: _Start,
-    offset: float,
-    keep_offset: bool,
-    settings: IngestSettings,
-) -> Registration:
-    """All unknowns at once under a soft-L1 loss, the tracker's slow drift among them.
-
-    Left out, the drift (a few tenths of a mm over seconds) is taken for scope motion and bends the scale by percents.
-    Cameras are centred first so that scale and translation decouple.
-    """
+    first_scale, first_rotation, first_translation, first_hand, first_lever = start
+    # centred, so that scale and translation decouple
     centre = world_from_camera[:, :3, 3].mean(0)
     arms = world_from_camera[:, :3, 3] - centre
     turns = Rotation.from_matrix(world_from_camera[:, :3, :3])
-    middle = start.scale * start.rotation.apply(centre) + start.translation
+    middle = first_scale * first_rotation.apply(centre) + first_translation
     _, valid = _sensor_poses(times, log, offset)
     # on the video's clock: seconds since 1970 leave too few digits for derivatives
     near = replace(
@@ -280,10 +216,10 @@ def _refine(
     knots = hats.shape[1]
 
     def unpack(x: np.ndarray) -> tuple[float, Rotation, np.ndarray, Rotation, np.ndarray, float]:
-        rotation = Rotation.from_rotvec(x[1:4]) * start.rotation
-        hand = start.camera_from_sensor * Rotation.from_rotvec(x[7:10])
-        clock = 0.0 if keep_offset else float(x[13])
-        return start.scale * np.exp(x[0]), rotation, middle + x[4:7], hand, start.lever + x[10:13], clock
+        rotation = Rotation.from_rotvec(x[1:4]) * first_rotation
+        hand = first_hand * Rotation.from_rotvec(x[7:10])
+        clock = float(x[13]) if known_offset is None else 0.0
+        return first_scale * np.exp(x[0]), rotation, middle + x[4:7], hand, first_lever + x[10:13], clock
 
     def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position error [N, 3] mm (drift not yet taken off), rotation error [N, 3] rad, on the log [N]."""
@@ -315,9 +251,9 @@ def _refine(
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)), 0.0))
     camera_from_sensor = np.eye(4)
     camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
-    found = (
-        ClockOffset(offset, 0.0, "given") if keep_offset else ClockOffset(offset + clock, float(sd[13]), "scope motion")
-    )
+    found = ClockOffset(offset, 0.0, "given")
+    if known_offset is None:
+        found = ClockOffset(offset + clock, float(sd[13]), "scope motion")
     return Registration(
         scale,
         rotation.as_matrix(),
@@ -329,6 +265,52 @@ def _refine(
         np.linalg.norm(turn[used], axis=1),
         used,
     )
+
+
+def _sensor_poses(times: np.ndarray, log: PoseLog, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    poses, valid = poses_at(log, times + offset)
+    if valid.sum() < MIN_FRAMES:
+        raise NeecoError(
+            f"{log.path}: only {int(valid.sum())} video frames fall on its samples (at least {MIN_FRAMES} are needed); "
+            "check the clock offset in `sync` and that log and video are of the same recording"
+        )
+    return poses, valid
+
+
+_Start = tuple[float, Rotation, np.ndarray, Rotation, np.ndarray]
+# scale, world_from_sfm, translation, camera_from_sensor, and the sensor's origin in the camera's frame [3] mm
+
+
+def _closed_form(world_from_camera: np.ndarray, times: np.ndarray, log: PoseLog, offset: float) -> _Start:
+    """Hand-eye rotation from relative turns (their rotation vectors differ by it alone), the rest linear in turn."""
+    poses, valid = _sensor_poses(times, log, offset)
+    cameras, sensors = world_from_camera[valid], poses[valid]
+    camera_turns, sensor_turns = Rotation.from_matrix(cameras[:, :3, :3]), Rotation.from_matrix(sensors[:, :3, :3])
+    middle = len(cameras) // 2
+    steps = [(0, slice(None)), (middle, slice(None)), (len(cameras) - 1, slice(None))]
+    # relative turns [3N, 3] in the camera's and in the sensor's frame
+    a, b = (
+        np.concatenate([(turns[i].inv() * turns[j]).as_rotvec() for i, j in steps])
+        for turns in (camera_turns, sensor_turns)
+    )
+    spread = np.linalg.svd(b, compute_uv=False) / np.sqrt(len(b))
+    if spread[1] < MIN_TURN:
+        raise NeecoError(
+            f"{log.path}: the laparoscope turned about hardly more than one axis ({np.degrees(spread[1]):.1f} deg "
+            "across the others), so its hand-eye calibration cannot be found; record the scope turning about two axes "
+            "by 10 deg or more"
+        )
+    camera_from_sensor, _ = Rotation.align_vectors(a, b)
+    world_from_sfm = (sensor_turns * camera_from_sensor.inv() * camera_turns.inv()).mean()
+    turned = world_from_sfm.as_matrix() @ cameras[:, :3, :3]  # [N, 3, 3] world_from_camera rotations
+    travel = cameras[:, :3, 3] @ world_from_sfm.as_matrix().T  # [N, 3]
+    system = np.concatenate([travel[:, :, None], np.tile(np.eye(3), (len(cameras), 1, 1)), turned], -1).reshape(-1, 7)
+    solution = np.linalg.lstsq(system, sensors[:, :3, 3].ravel(), rcond=None)[0]
+    if solution[0] <= 0 or np.linalg.norm(travel.std(0)) * solution[0] < MIN_TRAVEL:
+        raise NeecoError(
+            f"{log.path}: the laparoscope travelled too little to tell the scale; move it by 20 mm or more"
+        )
+    return float(solution[0]), world_from_sfm, solution[1:4], camera_from_sensor, solution[4:]
 
 
 def _hat_functions(times: np.ndarray, spacing: float) -> np.ndarray:

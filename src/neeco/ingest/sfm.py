@@ -95,10 +95,7 @@ class StructureFromMotion:
         }
 
     def reconstruct(self, progress: StageProgress) -> SfmResult:
-        """Cameras and points, not yet adjusted together.
-
-        Raises NeecoError when fewer than MIN_FRAMES images get a camera.
-        """
+        """Cameras and points, not yet adjusted together. Raises NeecoError when too few images get a camera."""
         count = len(self.names)
         keys = range(0, count, max(1, count // self.settings.sfm_keyframes))
         pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(count, keys)]
@@ -121,7 +118,22 @@ class StructureFromMotion:
                 f"{self.source}: no cameras could be found: too few features match between the frames (dark, blurred "
                 "or textureless images, or a scope that does not move); see docs/recording.md"
             )
-        return _load(result, self.names, self.source)
+        with np.load(result) as saved:  # plain arrays; object arrays are refused by default
+            found = [str(name) for name in saved["names"]]
+            if len(found) < MIN_FRAMES:
+                raise NeecoError(
+                    f"{self.source}: a camera was found for only {len(found)} of {len(self.names)} frames (at least "
+                    f"{MIN_FRAMES} are needed); see docs/recording.md"
+                )
+            if len(saved["points"]) == 0:
+                raise NeecoError(f"{self.source}: no tissue point was found between the frames; see docs/recording.md")
+            row = {name: index for index, name in enumerate(self.names)}
+            arrays = ("world_from_camera", "points", "colors", "errors", "lengths", "observations", "camera_params")
+            return SfmResult(
+                indices=np.array([row[name] for name in found]),
+                reprojection_px=float(saved["reprojection"]),
+                **{name: saved[name] for name in arrays},
+            )
 
 
 def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
@@ -153,23 +165,4 @@ def run_worker(job_file: Path, source: Path, progress: StageProgress) -> None:
         raise NeecoError(
             f"{source}: structure from motion stopped with status {code} ({tail[0][:300]}); is there memory left? "
             "Try fewer --frames"
-        )
-
-
-def _load(path: Path, names: list[str], source: Path) -> SfmResult:
-    with np.load(path) as saved:  # plain arrays; object arrays are refused by default
-        found = [str(name) for name in saved["names"]]
-        if len(found) < MIN_FRAMES:
-            raise NeecoError(
-                f"{source}: a camera was found for only {len(found)} of {len(names)} frames (at least {MIN_FRAMES} "
-                "are needed); see docs/recording.md"
-            )
-        if len(saved["points"]) == 0:
-            raise NeecoError(f"{source}: no tissue point could be found between the frames; see docs/recording.md")
-        row = {name: index for index, name in enumerate(names)}
-        arrays = ("world_from_camera", "points", "colors", "errors", "lengths", "observations", "camera_params")
-        return SfmResult(
-            indices=np.array([row[name] for name in found]),
-            reprojection_px=float(saved["reprojection"]),
-            **{name: saved[name] for name in arrays},
         )

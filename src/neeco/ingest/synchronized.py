@@ -76,7 +76,7 @@ class SynchronizedRecording:
             states[name] = (poses, readings)
         if not usable.any():
             raise NeecoError(
-                f"{self.recording.path}: no frame has a state of every instrument; check the logs' clocks in `sync`"
+                f"{self.recording.path}: no frame has a state of every instrument; check the clocks, `sync`"
             )
         return states, usable
 

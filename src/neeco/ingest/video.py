@@ -59,15 +59,11 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     and perhaps one of file names. Images that cannot be read are left out and noted. Raises NeecoError."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise NeecoError(
-            f"{folder}: {'is a file, expected a folder of images' if folder.exists() else 'no such folder'}"
-        )
+        raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
     folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
     files = sorted((file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=_natural_order)
     if len(files) < MIN_IMAGES:
-        raise NeecoError(
-            f"{folder}: holds {len(files)} images; expected a video's frames as {', '.join(IMAGES[:3])} files"
-        )
+        raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
     if times is not None:
         files, stamps = _image_times(folder, files, Path(times))
     elif fps is not None:
@@ -121,9 +117,7 @@ class _Video(VideoSource):
             if index is not None:
                 yield index, _rgb(frame)
         if wanted:
-            raise NeecoError(
-                f"{self.path}: frame {min(wanted.values())} cannot be read any more; do not change the file"
-            )
+            raise NeecoError(f"{self.path}: frame {min(wanted.values())} can no longer be read; do not change the file")
 
 
 @dataclass
@@ -185,9 +179,7 @@ class _Scan:
         for frame in self.decoded():
             size = (frame.width, frame.height)
             if self.size not in (None, size):
-                raise NeecoError(
-                    f"{self.path}: changes from {self.size} to {size} pixels midway; cut it into one video each"
-                )
+                raise NeecoError(f"{self.path}: changes from {self.size} to {size} pixels midway; cut it there")
             self.size = size
             self.stamps.append(frame.pts)
             self.interlaced |= bool(frame.interlaced_frame)
@@ -277,9 +269,7 @@ def _image_times(folder: Path, files: list[Path], table_path: Path) -> tuple[lis
             break
     else:
         if len(times) != len(files):
-            raise NeecoError(
-                f"{table_path}: has {len(times)} times for {len(files)} images; add a column with file names"
-            )
+            raise NeecoError(f"{table_path}: has {len(times)} times for {len(files)} images; add a column of names")
     falling = np.flatnonzero(np.diff(times) <= 0)
     if len(falling):
         raise NeecoError(f"{table_path}: line {table.lines[falling[0] + 1]}: {column} does not increase; sort the rows")

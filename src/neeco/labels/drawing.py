@@ -87,19 +87,18 @@ def draw_layers(
     Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
     """
     gaussians = scene.at(state)
-    learned_camera = scene.camera(camera)
     owners = labeller.owners(state, gaussians)
-    unobserved = scene.unobserved(gaussians, learned_camera)
-    rendering, parts, share = labeller.draw(gaussians, learned_camera, owners, unobserved)
+    unobserved = scene.unobserved(gaussians, camera)
+    rendering, parts, share = labeller.draw(gaussians, camera, owners, unobserved)
     assert rendering.channels is not None
     parts, share = _drop_small_components(parts.cpu(), share.clamp(0, 1).cpu(), labeller.names, min_component)
     colorless = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)  # depth needs no colour, which takes time
     layers = {}
     for k, name in enumerate(instruments_of(labeller.names)):
         if name in state.instruments:
-            single = rasterize(colorless.select(owners == k), learned_camera)
+            single = rasterize(colorless.select(owners == k), camera)
             layers[name] = InstrumentLayer((single.alpha > threshold_of(scene)).cpu().numpy(), surface_depth(single))
-    tissue = rasterize((gaussians if tissue_image else colorless).select(owners < 0), learned_camera)
+    tissue = rasterize((gaussians if tissue_image else colorless).select(owners < 0), camera)
     return LayeredDrawing(
         image=rendering.color.clamp(0, 1).cpu(),
         parts=parts,

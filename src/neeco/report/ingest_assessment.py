@@ -87,16 +87,16 @@ def _measured(result: IngestResult, capture: Capture) -> list[tuple[float, float
             (scale, SCALE, f"Lengths are known to {scale:.1%} only: the scope travelled too little."),
         ]
     for name, clock in result.clocks.items():
-        moved = clock_cost_mm(name, clock.sd, result, capture)
+        moved = clock_cost_mm(name, clock.sd, capture)
         if moved is not None:
             sentence = f"Clock {name} is known to ±{clock.sd * 1000:.0f} ms, up to {moved:.1f} mm of instrument motion."
             measured.append((moved, CLOCK_MM, sentence))
     return measured
 
 
-def clock_cost_mm(name: str, sd: float, result: IngestResult, capture: Capture) -> float | None:
+def clock_cost_mm(name: str, sd: float, capture: Capture) -> float | None:
     """How far an instrument moves in the clock's standard deviation, at its 90th percentile of speed; None for a
-    joint's clock or where it cannot be said."""
+    joint's clock or where it is not known."""
     joints = {joint for instrument in capture.instruments for joint in instrument.joints}
     speeds = [instrument_speed(capture, instrument.name) for instrument in capture.instruments]
     if name in joints or not speeds or not np.isfinite(sd):

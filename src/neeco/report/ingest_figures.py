@@ -1,11 +1,13 @@
-"""Sample frames of an ingested capture with what the tracker says drawn over them."""
+"""Pictures of an ingested capture: sample frames with the tracked poses drawn over them, and the tracks in 3D."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.axes import Axes
 from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
@@ -14,16 +16,23 @@ from neeco.evaluation.image_metrics import outline
 from neeco.ingest.motion import RoughShape
 from neeco.raster.pinhole import project_world
 from neeco.raster.types import Camera
+from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
-from neeco.report.tracks import round_length
 
-FIGURES = 8
+SAMPLES = 8  # frames shown
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 MAIN_AXIS_COLOR = "#ff6bff"
 OUTLINE_COLOR = "#ffe14a"
 NEAR = 1.0  # mm: nearer points are not drawn
-ORIGIN = np.zeros((1, 3))
 AXIS_SHARE = 0.16  # of the image's width: how long the drawn frame axes are
+ORIGIN = np.zeros((1, 3))
+
+WIDTH, HEIGHT, MARGIN = 420, 320, 16  # of a view of the tracks, view box units
+SVG_POINTS, CANVAS_POINTS = 1500, 4000
+STRAY = 0.01  # share of the points at either end that may lie outside the view
+GAP = 4.0  # median time steps: a longer one breaks the line
+RAYS = 10  # cameras drawn with the direction they look in
+LINE_COLORS = ("phase", "good", "bad")  # of the instruments; the camera's is accent
 
 
 @dataclass(frozen=True)
@@ -64,13 +73,10 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
 def sample_figures(
     capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> list[tuple[str, Frame]]:
-    """(data URI, frame) of up to FIGURES frames, evenly spread over time. Frame axes are `length` mm long; unregistered
-    poses are not drawn.
-
-    Raises NeecoError when an image cannot be read.
-    """
+    """(data URI, frame) of up to SAMPLES frames, evenly spread over time. Frame axes are `length` mm long; unregistered
+    poses are not drawn. Raises NeecoError when an image cannot be read."""
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(FIGURES, len(frames))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))
     return [(_draw(frames[index], capture, shapes, axes, length), frames[index]) for index in chosen]
 
 
@@ -85,14 +91,14 @@ def axis_length(capture: Capture) -> float:
     return round_length(float(np.median(sizes)) if sizes else 10.0)
 
 
-def in_view(capture: Capture, name: str) -> tuple[int, int]:
-    """In how many frames an instrument's tracked origin lies inside the image, and how many have the instrument."""
+def in_view(capture: Capture, name: str) -> float:
+    """Share of an instrument's frames in which its tracked origin lies inside the image."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
     inside = 0
     for frame in frames:
         ((x, y),), (depth,) = _project(ORIGIN, frame.state.instruments[name].pose, frame.camera)
         inside += bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
-    return inside, len(frames)
+    return inside / max(len(frames), 1)
 
 
 def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
@@ -108,10 +114,12 @@ def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
 def _draw(
     frame: Frame, capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
 ) -> str:
-    pixels = to_bytes(frame.load_image().numpy())
     # drawn at twice the size shown, then shrunk: smooth lines
-    camera = _resized(frame.camera, 2 * MAX_WIDTH)
-    image = Image.fromarray(pixels).resize((camera.width, camera.height), Image.Resampling.BICUBIC)
+    scale = 2 * MAX_WIDTH / frame.camera.width
+    fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
+    size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
+    camera = Camera(frame.camera.world_from_camera, fx, fy, cx, cy, *size)
+    image = Image.fromarray(to_bytes(frame.load_image().numpy())).resize(size, Image.Resampling.BICUBIC)
     if capture.registered:
         for name, state in frame.state.instruments.items():
             if name in shapes:
@@ -121,13 +129,6 @@ def _draw(
                 _draw_main_axis(painter, axes[name], state.pose, camera)
             _draw_frame(painter, state.pose, camera, length)
     return jpeg(np.asarray(image))
-
-
-def _resized(camera: Camera, width: int) -> Camera:
-    """The camera of an image scaled to so many px across."""
-    scale = width / camera.width
-    fx, fy, cx, cy = (scale * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    return Camera(camera.world_from_camera, fx, fy, cx, cy, width, round(camera.height * scale))
 
 
 def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: Camera) -> None:
@@ -171,3 +172,131 @@ def _project(points: np.ndarray, pose: Tensor, camera: Camera) -> tuple[np.ndarr
     world_from_instrument = pose.numpy()
     world = points @ world_from_instrument[:3, :3].T + world_from_instrument[:3, 3]
     return project_world(world, camera, nearest=NEAR)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Everything in one frame: x right, y down, z forward as the cameras look on average; mm."""
+
+    points: np.ndarray  # [P, 3]
+    colors: np.ndarray  # [P, 3] in [0, 1]
+    camera: np.ndarray  # [F, 3] in order of time
+    looking: np.ndarray  # [F, 3] unit
+    breaks: np.ndarray  # [F - 1] bool: time jumps after this frame
+    instruments: dict[str, np.ndarray]  # name -> [F, 3], NaN where a frame lacks it
+    measured: bool  # the points are real
+
+
+def read_tracks(capture: Capture) -> Tracks:
+    """The tracks of a capture. Unregistered instruments are left out: their frame is not the cameras'."""
+    frames = sorted(capture.frames, key=lambda frame: frame.state.time)
+    poses = np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames])
+    axes = _mean_axes(poses)  # [3, 3] columns right, down, forward
+    times = np.array([frame.state.time for frame in frames])
+    steps = np.diff(times)
+    middle = np.median(capture.points.positions.astype(np.float64), axis=0) if len(capture.points.positions) else 0.0
+    instruments = {}
+    for instrument in capture.instruments if capture.registered else ():
+        track = np.full((len(frames), 3), np.nan)
+        for index, frame in enumerate(frames):
+            if instrument.name in frame.state.instruments:
+                track[index] = frame.state.instruments[instrument.name].pose.numpy()[:3, 3]
+        instruments[instrument.name] = (track - middle) @ axes
+    return Tracks(
+        (capture.points.positions.astype(np.float64) - middle) @ axes,
+        np.asarray(capture.points.colors, dtype=np.float64),
+        (poses[:, :3, 3] - middle) @ axes,
+        poses[:, :3, 2] @ axes,
+        steps > GAP * max(float(np.median(steps)), 1e-9) if len(steps) else np.zeros(0, dtype=bool),
+        instruments,
+        capture.points.measured,
+    )
+
+
+def _mean_axes(poses: np.ndarray) -> np.ndarray:
+    forward = poses[:, :3, 2].mean(axis=0)
+    if np.linalg.norm(forward) < 1e-6:  # cameras all around: any view is as good
+        return np.eye(3)
+    forward /= np.linalg.norm(forward)
+    right = poses[:, :3, 0].mean(axis=0)
+    right -= forward * (right @ forward)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+@page_style()
+def view(tracks: Tracks, title: str, across: np.ndarray, down: np.ndarray) -> str:
+    """The tracks seen along across x down, as inline SVG; both [3] in the tracks' frame."""
+    plane = np.stack([across, down], axis=1).astype(np.float64)  # [3, 2]
+    low, high = _extent(tracks, plane)
+    scale = min((WIDTH - 2 * MARGIN) / max(high[0] - low[0], 1e-9), (HEIGHT - 3 * MARGIN) / max(high[1] - low[1], 1e-9))
+    offset = np.array([WIDTH, HEIGHT + MARGIN]) / 2 - scale * (low + high) / 2
+
+    def place(positions: np.ndarray) -> np.ndarray:
+        return scale * (positions @ plane) + offset
+
+    axes = new_axes((WIDTH, HEIGHT), 0, 0, 0, 0)
+    axes.set_axis_off()
+    axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
+    axes.text(12, 18, title, color=PALETTE["ink"], fontsize=12)
+    step = -(-len(tracks.points) // SVG_POINTS) or 1
+    dots = place(tracks.points[::step])
+    inside = ((dots > 0) & (dots < [WIDTH, HEIGHT])).all(axis=1)
+    draw_dots(axes, dots[inside], gid="points", color=PALETTE["soft"], linewidth=1.7, alpha=0.55)
+    _draw_line(axes, place(tracks.camera), tracks.breaks, "accent", 1.8)
+    chosen = np.unique(np.linspace(0, len(tracks.camera) - 1, RAYS).round().astype(int))
+    ends = tracks.camera[chosen] + 0.12 * float(np.linalg.norm(high - low)) * tracks.looking[chosen]
+    rays = np.stack([place(tracks.camera[chosen]), place(ends)], axis=1).reshape(-1, 2)
+    _draw_line(axes, rays, np.arange(1, len(rays)) % 2 == 0, "accent", 1.0)
+    for index, track in enumerate(tracks.instruments.values()):
+        _draw_line(axes, place(track), tracks.breaks, LINE_COLORS[index % len(LINE_COLORS)], 1.8)
+    length = round_length(0.25 * (WIDTH - 2 * MARGIN) / scale)
+    end = WIDTH - 12
+    axes.plot([end - length * scale, end], [HEIGHT - 10] * 2, color=PALETTE["ink"], linewidth=2, clip_on=False)
+    axes.text(end, HEIGHT - 16, f"{length:g} mm", ha="right")
+    return inline_svg(axes, title)
+
+
+def _extent(tracks: Tracks, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[2] low and high of the picture: all tracks, and the points but for strays."""
+    seen = [tracks.camera @ plane, *(track[np.isfinite(track[:, 0])] @ plane for track in tracks.instruments.values())]
+    if len(tracks.points):
+        seen.append(np.quantile(tracks.points @ plane, [STRAY, 1 - STRAY], axis=0))
+    all_of = np.concatenate(seen)
+    return all_of.min(axis=0), all_of.max(axis=0)
+
+
+def _draw_line(axes: Axes, places: np.ndarray, breaks: np.ndarray, color: str, width: float) -> None:
+    """A line through [F, 2], interrupted at breaks [F - 1] and where a place is unknown."""
+    line = np.insert(places, np.flatnonzero(breaks) + 1, np.nan, axis=0)
+    axes.plot(line[:, 0], line[:, 1], color=PALETTE[color], linewidth=width, clip_on=False)
+
+
+def round_length(wanted: float) -> float:
+    """The greatest of 1, 2, 5, 10, 20, ... that is not above `wanted`."""
+    power = 10.0 ** np.floor(np.log10(max(wanted, 1e-9)))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
+
+
+def turning_data(tracks: Tracks) -> dict[str, object]:
+    """What the canvas needs that turns when it is dragged (templates/turning.js)."""
+    step = -(-len(tracks.points) // CANVAS_POINTS) or 1
+    low, high = _extent(tracks, np.eye(3))
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+
+    def packed(positions: np.ndarray) -> str:
+        """Little-endian int16 of positions in units of size / 16000; unknown ones as -32768."""
+        units = np.clip((positions - centre) / size * 16000, -32000, 32000)
+        whole = np.where(np.isfinite(units), np.rint(np.nan_to_num(units)), -32768).astype("<i2")
+        return base64.b64encode(whole.tobytes()).decode("ascii")
+
+    colors = to_bytes(tracks.colors[::step])
+    return {
+        "points": packed(tracks.points[::step]),
+        "colors": base64.b64encode(colors.tobytes()).decode("ascii"),
+        "lines": [packed(tracks.camera), *(packed(track) for track in tracks.instruments.values())],
+        "breaks": np.flatnonzero(tracks.breaks).tolist(),
+        "names": ["--accent", *(f"--{color}" for color in LINE_COLORS)],
+    }

@@ -69,9 +69,6 @@ class Drawable(Protocol):
     def num_gaussians(self) -> int | None:
         """How many Gaussians one drawing uses; None: the scene has none."""
 
-    def camera(self, camera: Camera) -> Camera:
-        """The camera to draw with for a recorded one."""
-
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
 

@@ -87,7 +87,7 @@ class Hinges(nn.Module):
     def hinges(self, shaft: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """(pivots [J, 3] mm, unit axes [J, 3]) of all joints, instrument frame; `shaft`, where it is there already.
 
-        The shaft is taken as it is: only spinning it teaches where it lies, or the hinges would drag it along.
+        No gradient reaches the shaft: only spinning it teaches where it lies, or the hinges would move it.
         """
         origin, direction = (part.detach() for part in shaft or self.shaft())
         angle = self.hinge_angle
@@ -143,24 +143,24 @@ class Hinges(nn.Module):
         """[2] rad by which a joint's two parts are turned."""
         return self.offsets[joint] + self.gains[joint] * (reading - self.middle[joint])
 
-    def opened(self, joint: int, reading: float) -> Tensor:
-        """[2] rad by which a joint's two parts stand off the shaft, which they lie along where it is closed."""
-        opened = self.gains[joint] * (reading - self.closed[joint])
-        return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), opened)
+    def opening(self, joint: int, reading: float) -> Tensor:
+        """[2] rad between a joint's two parts and the shaft, along which they lie where the joint is closed."""
+        from_closed = self.gains[joint] * (reading - self.closed[joint])
+        return torch.where(self.closed[joint].isnan(), self.turns(joint, reading), from_closed)
 
     def tips_at(self, joint: int, reading: float) -> Tensor:
-        """[2, 3] mm, instrument frame: the tips of a joint's left and right part. For one that was not measured the
-        shaft's end is taken, from where the joint lies closed."""
+        """[2, 3] mm, instrument frame: the tips of a joint's left and right part. A tip that was not measured starts at
+        the shaft's end where the joint is closed."""
         pivot, axis = self.hinge(joint)
         origin, direction = self.shaft()
         known = self.tips[joint].isfinite().all(1)  # [2]
         points = torch.where(known[:, None], self.tips[joint], origin + self.extent[1] * direction)  # [2, 3]
-        angles = torch.where(known, self.turns(joint, reading), self.opened(joint, reading))
+        angles = torch.where(known, self.turns(joint, reading), self.opening(joint, reading))
         return rotate_about(points, axis, pivot, angles).index_select(0, self.left_right_order(joint))
 
     def longest(self, weights: Tensor) -> Tensor:
-        """[M, 1] mm: how long the Gaussians may be (standard deviation), by their part weights [M, part_count]: what
-        does not turn as long as it likes."""
+        """[M, 1] mm: largest standard deviation of Gaussians by their part weights [M, part_count]; what does not turn
+        is not limited."""
         turning = 1 - weights[:, :1]
         return MAX_JAW_SCALE * self.radius / turning.clamp_min(1e-6)
 
@@ -168,17 +168,17 @@ class Hinges(nn.Module):
         """[M, 2 + 2 J] shares of shaft, wrist, and every joint's left and right part in Gaussians at points [M, 3] mm
         of part weights [M, part_count].
 
-        A jaw that stands still is learned as body, since it moves like it: beyond the hinge nothing but jaws is.
+        A fixed jaw is learned as body, since it moves like it: beyond the hinge there are only jaws.
         """
         along, body = self.along_shaft(points), weights[:, 0]
         jaws: list[Tensor] = []
         for joint in range(len(self.joint_names)):
             gains = self.gains[joint].detach().abs()
-            still = (gains < FIXED_JAW_GAIN) & (gains == gains.min())  # [2]
+            fixed = (gains < FIXED_JAW_GAIN) & (gains == gains.min())  # [2]
             beyond = along > self.hinge_depth[joint] + JAWS_BEYOND * self.radius  # [M]
-            kept = body[:, None] * (beyond[:, None] & still)
-            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + kept
-            body = body - kept.sum(1)
+            fixed_jaw = body[:, None] * (beyond[:, None] & fixed)
+            pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
+            body = body - fixed_jaw.sum(1)
             jaws += pair.index_select(1, self.left_right_order(joint)).unbind(1)
         wrist = (along >= self.wrist_start).to(weights.dtype)
         return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)

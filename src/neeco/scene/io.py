@@ -17,6 +17,7 @@ from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
+from neeco.scene.deformations.base import Deformation
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.method import Stored
 from neeco.scene.methods import method_class, method_settings
@@ -24,11 +25,13 @@ from neeco.scene.scene import Scene
 from neeco.settings import plain
 
 SCHEMA = "neeco-scene/2"
-MOST_SAID = 200  # characters
-BEFORE_SHADOWS = "neeco-scene/1"  # read as scenes that cast none, with readings counted from zero
-MOST_PIXELS = 2**26  # of a recorded image
-FARTHEST = 1e9  # mm, rad, s or px: what is more was not recorded
-# what reading a damaged file raises; a nesting without end is a RuntimeError
+OLD_SCHEMA = "neeco-scene/1"  # read as scenes without shadows, with readings counted from zero
+# tensors of modules that it lacks
+ADDED = {"shadow_offsets", "shadow_strengths", "shadow_width", "middle", "closed", "radius", "tips"}
+MAX_REASON = 200  # characters of an error's message
+MAX_PIXELS = 2**26  # of a recorded image
+MAX_NUMBER = 1e9  # mm, rad, s or px: what is more was not recorded
+# what reading a damaged file raises; endless nesting is a RuntimeError
 DAMAGED = (SafetensorError, OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
 HEADER = {  # what every scene's header holds, whatever its method
     "method": str,
@@ -37,15 +40,6 @@ HEADER = {  # what every scene's header holds, whatever its method
     "instruments": [{"name": str, "joints": {str: ([float], None)}}],
     "recorded": [{"name": str, "split": str, "time": float, "joints": {str: {str: float}}, "intrinsics": [float]}],
 }
-SINCE = {
-    "shadow_offsets",
-    "shadow_strengths",
-    "shadow_width",
-    "middle",
-    "closed",
-    "radius",
-    "tips",
-}  # modules' tensors that it lacks
 
 
 def save_scene(scene: Learned, path: Path) -> None:
@@ -76,19 +70,19 @@ def load_scene(path: Path) -> Learned:
             header = json.loads((stream.metadata() or {})["neeco"])
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
     except DAMAGED as error:
-        said = " ".join(str(error).split())
-        raise NeecoError(f"{path}: not a readable neeco scene ({said}); train again") from None
+        reason = " ".join(str(error).split())
+        raise NeecoError(f"{path}: not a readable neeco scene ({reason}); train again") from None
     if not isinstance(header, dict):
         raise NeecoError(f"{path}: not a readable neeco scene (its header is no object); train again")
-    if header.get("schema") not in (SCHEMA, BEFORE_SHADOWS):
+    if header.get("schema") not in (SCHEMA, OLD_SCHEMA):
         raise NeecoError(f"{path}: schema {header.get('schema')!r}, this version reads {SCHEMA!r}; train again")
     try:
         return unpack_scene(tensors, header)
     except NeecoError as error:
         raise NeecoError(f"{path}: {error}; train again") from None
     except DAMAGED as error:
-        said = " ".join(str(error).split())[:MOST_SAID]
-        raise NeecoError(f"{path}: damaged scene ({said}); train again") from None
+        reason = " ".join(str(error).split())[:MAX_REASON]
+        raise NeecoError(f"{path}: damaged scene ({reason}); train again") from None
 
 
 def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -107,8 +101,7 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "method": scene.method,
         "diagnostics": scene.diagnostics,
         "instruments": [
-            {"name": instrument.name, "joints": {name: limits for name, limits in instrument.joints.items()}}
-            for instrument in scene.instruments
+            {"name": instrument.name, "joints": dict(instrument.joints)} for instrument in scene.instruments
         ],
         "recorded": [
             {
@@ -123,9 +116,9 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
             )
         ],
     }
+    header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
-    tensors |= own_tensors
-    header |= {"deformation": plain(scene.settings)} | own_fields
+    tensors, header = tensors | own_tensors, header | own_fields
     return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, header
 
 
@@ -133,15 +126,19 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     """The inverse of `pack_scene`; which kind of scene, the header's method says."""
     require_like(header, HEADER, "header", "it is damaged")
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
-        raise ValueError("its header holds half a character")
+        raise ValueError("its header holds an unpaired surrogate character")
     instruments, recorded = _recording(tensors, header)
     method = header["method"]
     settings = method_settings(method, header["deformation"])
-    scene = method_class(method).load(Stored(settings, instruments, recorded, tensors, header, Scene.load))
+    kind = method_class(method)
+    stored = Stored(settings, instruments, recorded, tensors, header)
+    scene: Learned = (
+        Scene.load(kind(instruments, settings), stored) if issubclass(kind, Deformation) else kind.load(stored)
+    )
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
-    if header.get("schema") == BEFORE_SHADOWS:
-        module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in SINCE} | module
+    if header.get("schema") == OLD_SCHEMA:
+        module = {n: t for n, t in scene.state_dict().items() if n.rsplit(".", 1)[-1] in ADDED} | module
     scene.load_state_dict(module)
     for name, parameter in scene.named_parameters():  # buffers may well be infinite: not every shaft has a known end
         if not torch.isfinite(parameter).all():
@@ -151,7 +148,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
 
 
 def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:
-    """The instruments, and what the scene was learned from. Raises ValueError for what cannot have been recorded."""
+    """The instruments and the training frames. Raises ValueError for what cannot have been recorded."""
     instruments = tuple(
         Instrument(entry["name"], {name: _limits(limits) for name, limits in entry["joints"].items()})
         for entry in header["instruments"]
@@ -168,18 +165,13 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         states.append(State(moved, _number(entry["time"])))
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, *map(_number, entry["intrinsics"])))
-    recorded = Recorded(
-        tuple(entry["name"] for entry in header["recorded"]),
-        tuple(entry["split"] for entry in header["recorded"]),
-        tuple(states),
-        tuple(cameras),
-    )
-    return instruments, recorded
+    names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
+    return instruments, Recorded(names, splits, tuple(states), tuple(cameras))
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FARTHEST:
-        raise ValueError(f"{value!r} is no number that can be recorded")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_NUMBER:
+        raise ValueError(f"{value!r} is not a number that can be recorded")
     return value
 
 
@@ -195,15 +187,15 @@ def _limits(pair: Any) -> tuple[float, float] | None:
 
 
 def _pose(pose: Tensor, what: str) -> Tensor:
-    """[4, 4], mm, which it returns."""
+    """`pose` [4, 4], mm. Raises ValueError when it is not a rigid transform."""
     if tuple(pose.shape) != (4, 4) or rigid_fault(pose.double().numpy()):
-        raise ValueError(f"the recorded pose of {what} is no rigid transform")
+        raise ValueError(f"the recorded pose of {what} is not a rigid transform")
     return pose
 
 
 def _camera(
     pose: Tensor, fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float
 ) -> Camera:
-    if min(fx, fy, near) <= 0 or min(width, height) < 1 or width * height > MOST_PIXELS:
-        raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px cannot be")
+    if min(fx, fy, near) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
+        raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px is not possible")
     return Camera(pose, fx, fy, cx, cy, int(width), int(height), near)

@@ -17,11 +17,8 @@ DEFAULT = "kinematic"
 
 
 def find_methods() -> dict[str, type[Method]]:
-    """Every class with a `method` name of its own that a public module of `deformations/` or `nerfies/` defines, by
-    that name.
-
-    DEFAULT comes first, the others in the order of their names. Raises NeecoError when two share one.
-    """
+    """Every class with its own `method` name that a public module of `deformations/` or `nerfies/` defines, by name:
+    DEFAULT first, the others sorted. Raises NeecoError when two share a name."""
     found = named_classes(Method, "method", deformations, nerfies)
     return dict(sorted(found.items(), key=lambda item: item[0] != DEFAULT))
 

@@ -22,7 +22,7 @@ from neeco.scene.drawable import Drawable, HingeMotion, Recorded
 from neeco.scene.method import Stored
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
-LAMPS = 3  # at most: what a laparoscope's light guides come to
+LAMPS = 3  # at most, as many as a laparoscope has light guides
 SHADOW_WIDTH = 0.01  # slope, at the start
 CANONICAL_SHAPES = {  # of one Gaussian
     "means": (3,),
@@ -35,7 +35,7 @@ CANONICAL_SHAPES = {  # of one Gaussian
 
 
 class Scene(nn.Module):
-    """`scene.at(state)` is the one way from canonical to posed Gaussians, for every method; `render` draws them.
+    """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
@@ -111,11 +111,11 @@ class Scene(nn.Module):
         )
         scene.sh_degree = int(header["sh_degree"])
         if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
-            raise ValueError(f"sh_degree is {scene.sh_degree}, which its harmonics are not of")
+            raise ValueError(f"sh_degree is {scene.sh_degree}, which does not fit its harmonics")
         # older scenes call it backdrop, or have none
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         if not 0 <= scene.background <= 1:
-            raise ValueError(f"its background is {scene.background}, which is no grey in [0, 1]")
+            raise ValueError(f"its background is {scene.background}, not a grey in [0, 1]")
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
@@ -181,14 +181,10 @@ class Scene(nn.Module):
             moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
         return dataclasses.replace(state, instruments=moved)
 
-    def camera(self, camera: Camera) -> Camera:
-        """The camera to draw with. The recorded one: the correction is carried by the instruments."""
-        return camera
-
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""
         channels = self.label_channels() if labels and self.label_names else None
-        return rasterize(self.at(state), self.camera(camera), channels=channels)
+        return rasterize(self.at(state), camera, channels=channels)
 
     def hinge_motion(self) -> HingeMotion | None:
         """How the Gaussians move, where hinges say all of it; None otherwise."""
@@ -230,7 +226,7 @@ def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:
 
 
 def _canonical(tensors: dict[str, Tensor], counts: tuple[int, ...]) -> CanonicalGaussians:
-    """The Gaussians, their shapes checked: what does not fit would only fail when it is drawn, or not at all."""
+    """The Gaussians. Raises ValueError for shapes, types and numbers that do not fit."""
     if missing := [name for name in CANONICAL_SHAPES if name not in tensors]:
         raise ValueError(f"{missing[0]} is missing")
     for name, tensor in tensors.items():

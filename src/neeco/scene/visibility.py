@@ -137,9 +137,9 @@ def extrapolate_tissue(canonical: CanonicalGaussians, cameras: Sequence[Camera])
     outside = outside_all_views(positions.reshape(-1, 3), cameras).reshape(positions.shape[:2]).cpu()
     distance = distance_transform_edt(outside.numpy()) * grid.cell
     chosen = outside & torch.from_numpy(distance < REACH * grid.camera.width)
-    points, look = positions[chosen], filled[chosen][:, 1:]
-    added = seed_gaussians(points, look, grid.spacing(points), opacity=OPACITY)
-    return _append_tissue(canonical, replace(added, sh_dc=look[:, None].clone()))
+    points, colors = positions[chosen], filled[chosen][:, 1:]
+    added = seed_gaussians(points, colors, grid.spacing(points), opacity=OPACITY)
+    return _append_tissue(canonical, replace(added, sh_dc=colors[:, None].clone()))
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,8 @@ def _middle_camera(cameras: Sequence[Camera]) -> Camera:
     places, directions = poses[:, :3, 3], poses[:, :3, 2]
     spread = places.std(0, correction=0).norm().clamp_min(1e-6)
     turned = directions.std(0, correction=0).norm().clamp_min(1e-6)
-    off = (places - places.mean(0)).norm(dim=1) / spread + (directions - directions.mean(0)).norm(dim=1) / turned
-    return cameras[int(off.argmin())]
+    deviation = (places - places.mean(0)).norm(dim=1) / spread + (directions - directions.mean(0)).norm(dim=1) / turned
+    return cameras[int(deviation.argmin())]
 
 
 def _filled(known: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Camera effects of a data set: the ranges they are drawn from, motion blur, and what lens, sensor and file do.
 
 Light is linear, an image is stored by the sRGB curve: "stored" images and "linear" light are [H, W, 3] float32, 1 is
-white. Motion while the shutter is open is that of a recorded moment that is much alike.
+white. Motion while the shutter is open is that of a recorded frame with a like state.
 """
 
 from __future__ import annotations

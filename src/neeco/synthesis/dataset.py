@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from neeco.training.run import Run
 
 SCHEMA = "neeco-dataset/1"
+SAME_IMAGES = ("0.1.0",)  # versions that draw the same images and labels as this one, so that their sets are continued
 INFO = "dataset.json"
 SCENE_FILE = "scene.safetensors"
 
@@ -193,6 +194,8 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = Settings.with_new_names(begun["settings"])
+    if begun.get("version") in SAME_IMAGES:
+        begun["version"] = description["version"]
     compared = [(key, begun.get(key), description[key]) for key in ("schema", "version", "scene_sha256")]
     # a version that wrote neither of these folders named neither: all its images are drawn anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]

@@ -244,7 +244,7 @@ def surface_centre(scene: Scene) -> np.ndarray:
     recorded = scene.recorded
     points = []
     for k in evenly_spaced(len(recorded.cameras), SURFACE_VIEWS, floor=True):
-        camera = scene.camera(recorded.cameras[k])
+        camera = recorded.cameras[k]
         points.append(surface_points(surface_depth(rasterize(scene.at(recorded.states[k]), camera)), camera))
     seen = np.concatenate(points)
     if len(seen) == 0:

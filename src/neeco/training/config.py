@@ -111,7 +111,7 @@ class TrainConfig:
     }
 
     method: str = DEFAULT
-    iterations: int = 6000  # frames drawn and learned from
+    iterations: int = 6000  # frames rendered and learned from
     batch_size: int = 1  # frames between two optimiser steps
     minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0
@@ -164,27 +164,23 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     return with_fields(config, {"deformation": settings})
 
 
-def variant_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
-    """`training_config` of a method or of a variant: METHOD+dta turns every part of the paper's dynamic training
-    adjustment on; `assignments` may turn single ones off again.
-
-    A part that does not apply to the method (noise, where nothing is encoded) has no effect. Raises NeecoError for an
-    unknown variant, and for one that is the method itself.
-    """
+def _variant_defaults(name: str) -> TrainConfig:
+    """The config that METHOD or METHOD+dta starts from: with +dta every part of the paper's dynamic training adjustment
+    is on. A part that does not apply to the method (noise, where nothing is encoded) has no effect."""
     method, plus, _ = name.partition("+")
+    base = method_defaults(method)
     if not plus:
-        return training_config(method, values, assignments)
+        return base
     if not name.endswith(ADJUSTED) or name.count("+") > 1:
         raise NeecoError(f"method: {name!r} is unknown; the one variant of a method is METHOD{ADJUSTED}")
     if not method_class(method).has_gaussians:
         raise NeecoError(
             f"method: {method} has no Gaussians for the dynamic adjustment to act on; leave out {ADJUSTED}"
         )
-    base, on = method_defaults(method), {f"schedule.{part}": "on" for part in schedule_parts()}
-    adjusted = with_fields(base, on)
+    adjusted: TrainConfig = with_fields(base, {f"schedule.{part}": "on" for part in schedule_parts()})
     if adjusted == base:
         raise NeecoError(f"method: {method} trains with the dynamic adjustment by itself; leave out {ADJUSTED}")
-    return _configured(adjusted, values, assignments)
+    return adjusted
 
 
 def schedule_parts() -> tuple[str, ...]:
@@ -192,17 +188,15 @@ def schedule_parts() -> tuple[str, ...]:
     return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
-def training_config(method: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
-    """The method's defaults with `values` that are not None, then NAME=VALUE `assignments` (dots reach nested fields).
+def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
+    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment), changed by
+    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
 
-    Raises NeecoError naming the option when a name is unknown or a value does not fit.
+    Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
+    variant, or one that is the method itself.
     """
-    return _configured(method_defaults(method), values, assignments)
-
-
-def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Sequence[str]) -> TrainConfig:
-    """`base` changed and checked as `training_config` says."""
-    config: TrainConfig = with_fields(base, {name: value for name, value in values.items() if value is not None})
+    given = {field: value for field, value in values.items() if value is not None}
+    config: TrainConfig = with_fields(_variant_defaults(name), given)
     _check_length(config)
     changed = config_to_dict(config)
     for assignment in assignments:
@@ -218,7 +212,14 @@ def _configured(base: TrainConfig, values: Mapping[str, Any], assignments: Seque
 def check_ranges(config: TrainConfig) -> None:
     """Raise NeecoError naming the option of a number that nothing can be trained with."""
     _check_length(config)
-    _check_published_steps(config)
+    schedule, density = config.schedule, config.density
+    if (steps := schedule.published_steps) is not None and steps < 1:
+        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
+    if steps is not None and config.minutes is not None:
+        raise NeecoError(
+            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
+            "open; give --iterations alone"
+        )
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
             f"--batch-size: method {config.method} draws rays of all frames in every step; "
@@ -228,7 +229,6 @@ def check_ranges(config: TrainConfig) -> None:
     for name, least in options.items():
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
-    schedule, density = config.schedule, config.density
     least_one: dict[str, int | None] = {
         name: getattr(config, name) for name in ("initial_points", "log_interval", "checkpoint_interval")
     }
@@ -250,20 +250,6 @@ def _check_length(config: TrainConfig) -> None:
         raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
-
-
-def _check_published_steps(config: TrainConfig) -> None:
-    """A schedule scales with the run's length, which has to be known."""
-    steps = config.schedule.published_steps
-    if steps is None:
-        return
-    if steps < 1:
-        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
-    if config.minutes is not None:
-        raise NeecoError(
-            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
-            "open; give --iterations alone"
-        )
 
 
 def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from neeco.training.config import DensityConfig
 
 
 class GradientStatistics:
-    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images in which it was drawn."""
+    """Mean norm of the projected centre's gradient per Gaussian (NDC units), over the images that show it."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self.total = torch.zeros(count, device=device)
@@ -33,45 +33,39 @@ class GradientStatistics:
         return self.total / self.seen.clamp_min(1)
 
 
-@dataclass(frozen=True)
-class BodyLimit:
-    """How many Gaussians one body may have, and the size (mm) below which they are cloned instead of split."""
-
-    max_gaussians: int
-    dense_size: float
-
-
 @torch.no_grad()
 def control_density(
     canonical: CanonicalGaussians,
     adam: Adam,
     statistics: GradientStatistics,
-    limits: list[BodyLimit],
+    max_gaussians: Sequence[int],
+    dense_size: float,
     threshold: float,
     generator: torch.Generator,
     config: DensityConfig,
     unsupported: Tensor | None = None,
 ) -> CanonicalGaussians:
     """Prune transparent and `unsupported` [N] bool Gaussians, clone small and split large ones whose gradient exceeds
-    `threshold`, strongest first.
+    `threshold`, strongest first. Each body has at most its `max_gaussians`.
 
-    `threshold` = inf only prunes. Adam's moments follow their rows; new rows start at zero.
+    Gaussians up to `dense_size` mm are cloned, larger ones split. `threshold` = inf only prunes. Adam's moments follow
+    their rows; new rows start at zero.
     """
     gradients, bodies = statistics.mean(), canonical.bodies
     size = canonical.log_scales.max(1).values.exp()
-    dense = size.new_tensor([limit.dense_size for limit in limits])[bodies]
+    small = size <= size.new_tensor(dense_size)
     keep = torch.sigmoid(canonical.opacity_logits) > config.min_opacity
     if unsupported is not None:
         keep &= ~unsupported
     grow = keep & (gradients > threshold)
-    for body, limit in enumerate(limits):
+    for body, limit in enumerate(max_gaussians):
         rows = bodies == body
-        room = max(0, limit.max_gaussians - int((keep & rows).sum()))
+        room = max(0, limit - int((keep & rows).sum()))
         wanted = torch.nonzero(grow & rows)[:, 0]
         if len(wanted) > room:
             strongest = gradients[wanted].argsort(descending=True, stable=True)
             grow[wanted[strongest[room:]]] = False
-    clone, split = grow & (size <= dense), grow & (size > dense)
+    clone, split = grow & small, grow & ~small
     kept, cloned, halves = (torch.nonzero(mask)[:, 0] for mask in (keep & ~split, clone, split))
     index = torch.cat([kept, cloned, halves, halves])
     fresh = torch.zeros(len(index), dtype=torch.bool, device=index.device)
@@ -80,7 +74,7 @@ def control_density(
     is_half[len(kept) + len(cloned) :] = True
     order = bodies[index].argsort(stable=True)  # bodies stay contiguous
     index, fresh, is_half = index[order], fresh[order], is_half[order]
-    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(limits)))
+    counts = tuple(int((bodies[index] == body).sum()) for body in range(len(max_gaussians)))
     adam.select_rows(list(canonical.tensors()), index, fresh)
     changed = canonical.map(lambda tensor: tensor[index].contiguous(), counts)
     _scatter_halves(changed, is_half, config.split_shrink, generator)

@@ -21,29 +21,21 @@ from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.shadow import find_shadow
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import new_session
 
 
 def begin_session(
     capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Learned | None = None
 ) -> Session:
-    """A session at iteration 0, of any method, on the device of the views: around a new scene, or around `scene`, which
-    a checkpoint held."""
-    method = method_class(config.method)
-    if method.has_gaussians:
-        assert scene is None or isinstance(scene, Scene)
-        return gaussian_session(capture, views, config, report, scene)
-    return method.session(capture, views, config.deformation, config.length, config.seed, scene)
-
-
-def gaussian_session(
-    capture: Capture, views: TrainingViews, config: TrainConfig, report: Report, scene: Scene | None = None
-) -> GaussianSession:
-    """A session at iteration 0 of any method that deforms Gaussians, on the device of the views: around `scene`, or
+    """A session at iteration 0, of any method, on the device of the views: around `scene`, which a checkpoint held, or
     around a new one, for which the method's `begin` is called."""
+    method = method_class(config.method)
+    if not method.has_gaussians:
+        return method.session(capture, views, config.deformation, config.length, config.seed, scene)
     is_new = scene is None
     if scene is None:
         scene = initial_scene(capture, views.frames, config, report)
+    assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.instruments = InstrumentSearch(
         find=partial(find_instruments, session),
@@ -61,8 +53,10 @@ def gaussian_session(
 
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
     """Seed the tissue's Gaussians and the deformation of the method from the sparse points and the training frames
-    alone. Raises NeecoError when a joint asked for is unknown."""
-    background = _background(frames)  # first: files may go once training has begun
+    alone. Raises NeecoError when `config.joints` has an unknown one, or an image cannot be read."""
+    # first, as files may be deleted once training has begun: the grey behind transparent images, which need not be
+    # learned then; black for opaque images
+    background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
         for i in capture.instruments
@@ -77,12 +71,6 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
     scene.background = background
     return scene
-
-
-def _background(frames: tuple[Frame, ...]) -> float:
-    """The grey [0, 1] behind transparent images, so that it need not be learned; black for opaque images. Raises
-    NeecoError when an image cannot be read."""
-    return next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
 
 
 def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +104,7 @@ def moving_joints(
     poses = np.stack([state.pose[:3].double().numpy().ravel() for state in states])
     distinct, first = np.unique(np.round(poses, 6), axis=0, return_index=True)
     design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
-    kept = []
+    moving = []
     for joint in instrument.joints:
         reading = np.array([states[i].joints[joint] for i in first])
         spread = reading.var()
@@ -125,5 +113,5 @@ def moving_joints(
         if explained > config.search.max_pose_explained:
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:
-            kept.append(joint)
-    return tuple(kept)
+            moving.append(joint)
+    return tuple(moving)

@@ -16,6 +16,8 @@ from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
 from neeco.training.config import RefineConfig
 
+STATE = ("poses", "cameras", "latency", "frame_steps")  # tensors of a checkpoint beside the moments
+
 
 class Refinement:
     """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
@@ -39,13 +41,13 @@ class Refinement:
             "latency": torch.tensor(config.latency_rate, device=device),
         }
         self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
-        self.moments = {name: torch.zeros_like(tensor) for name, tensor in self._moment_shapes().items()}
-        self.frame_steps = torch.zeros(len(frames))  # on the CPU: every step asks
+        self.moments = {
+            f"{order}.{name}": torch.zeros_like(getattr(self, name))
+            for order in ("first", "second")
+            for name in ("poses", "cameras", "latency")
+        }
+        self.frame_steps = torch.zeros(len(frames))  # on the CPU: read in every step
         self._leaves: dict[str, Tensor] = {}
-
-    def _moment_shapes(self) -> dict[str, Tensor]:
-        tensors = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency}
-        return {f"{order}.{name}": tensor for order in ("first", "second") for name, tensor in tensors.items()}
 
     def apply(self, index: int, state: State, camera: Camera, iteration: int) -> tuple[State, Camera, Tensor | None]:
         """The corrected state and camera of frame `index`, and the prior's penalty; leaves wait for `step`."""
@@ -84,15 +86,16 @@ class Refinement:
         if not self._leaves:
             return
         self.frame_steps[index] += 1
-        count = float(self.frame_steps[index])
         decay = log_linear(1.0, 0.1, progress)
         for name, leaf in self._leaves.items():
             if leaf.grad is None:
                 continue
-            row = slice(None) if name == "latency" else index
-            steps = float(self.frame_steps.sum()) if name == "latency" else count
+            # the latency is shared by all frames
+            row, steps = (
+                (slice(None), self.frame_steps.sum()) if name == "latency" else (index, self.frame_steps[index])
+            )
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
-            update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
+            update = adam_update(leaf.grad, first, second, float(steps), (0.9, 0.99), 1e-12)
             getattr(self, name)[row] -= decay * self.rates[name] * update
         self._leaves = {}
 
@@ -107,16 +110,14 @@ class Refinement:
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that changes, for a checkpoint."""
-        plain = {"poses": self.poses, "cameras": self.cameras, "latency": self.latency, "frame_steps": self.frame_steps}
-        return plain | self.moments
+        return {name: getattr(self, name) for name in STATE} | self.moments
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """The inverse of `tensors`. Raises ValueError for those of other shapes."""
-        own = self.tensors()
-        for name, tensor in own.items():
+        for name, tensor in self.tensors().items():
             if tensors[name].shape != tensor.shape:
                 raise ValueError(f"{name}: {list(tensors[name].shape)}, not {list(tensor.shape)}")
-        for name in ("poses", "cameras", "latency", "frame_steps"):
+        for name in STATE:
             setattr(self, name, tensors[name].cpu() if name == "frame_steps" else tensors[name])
         self.moments = {name: tensors[name] for name in self.moments}
 

@@ -59,7 +59,7 @@ class ScheduleConfig:
 
 
 class Schedule:
-    """What to do at each iteration of a run of `iterations` steps. `observe` after every step; everything else asks."""
+    """What to do at each iteration of a run of `iterations` steps. Call `observe` after every step."""
 
     def __init__(self, config: ScheduleConfig, iterations: int | None = None) -> None:
         if config.published_steps is not None and iterations is None:
@@ -96,7 +96,8 @@ class Schedule:
         return bool(values[window:, 1].mean() > self.config.psnr_threshold and loss_now < loss_before)
 
     def _acting_phase(self, part: Part) -> int:
-        return self.phase if part == "on" else 3 - self.phase
+        """The phase whose settings of `part` are in force; 0: off, as in 3DGS."""
+        return {"off": 0, "on": self.phase, "inverse": 3 - self.phase}[part]
 
     def density(self) -> DensityPhase:
         """The density settings in force, in iterations of this run."""
@@ -112,31 +113,28 @@ class Schedule:
         return max(self.scaled(published), min(published, MIN_RESET_INTERVAL))
 
     def _density_of(self, part: Part) -> DensityPhase:
-        if part == "off":
-            return self.config.plain_density
-        return self.config.phase_1 if self._acting_phase(part) == 1 else self.config.phase_2
+        return (self.config.plain_density, self.config.phase_1, self.config.phase_2)[self._acting_phase(part)]
 
     def sh_degree(self, iteration: int) -> int:
         """Order 0 in phase 1, then one more every `sh_interval`; off: one more every `sh_interval` from the start
         (3DGS)."""
-        config = self.config
-        if config.sh_order != "off" and self._acting_phase(config.sh_order) == 1:
+        config, acting = self.config, self._acting_phase(self.config.sh_order)
+        if acting == 1:
             return 0
-        since = 0 if config.sh_order == "off" else self.phase_started
+        since = self.phase_started if acting else 0
         return min(config.max_sh_degree, (iteration - since) // self.scaled(config.sh_interval))
 
     def state_noise(self, progress: float) -> float:
         """Standard deviation of the compensation Delta = N(0, sigma^2) * beta * t_phase, t_phase falling from 1 to 0 in
         its phase."""
         config = self.config
-        if config.compensation == "off" or self._acting_phase(config.compensation) == 2:
+        if self._acting_phase(config.compensation) != 1:
             return 0.0
         return config.sigma * config.beta * max(0.0, 1.0 - progress)
 
     def frames(self, pose_order: np.ndarray, rng: np.random.Generator) -> list[int]:
         """One epoch of frame indices: sorted by instrument pose (either way round), or at random."""
-        part = self.config.frame_order
-        if part != "off" and self._acting_phase(part) == 1:
+        if self._acting_phase(self.config.frame_order) == 1:
             return list(map(int, pose_order if rng.random() < 0.5 else pose_order[::-1]))
         return list(map(int, rng.permutation(len(pose_order))))
 

@@ -18,12 +18,12 @@ from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
-from neeco.scene.deformations.base import FINAL_RATE, UNPERTURBED, Perturbation, floored_decay, log_linear
+from neeco.scene.deformations.base import FINAL_RATE, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
-from neeco.training.density import BodyLimit, GradientStatistics, control_density, reset_opacity
+from neeco.training.density import GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
 from neeco.training.schedule import Schedule, due, order_by_pose
 
@@ -34,10 +34,10 @@ class GaussianSession(GaussianTraining):
 
     scene: Scene
     config: TrainConfig
-    pose_order: np.ndarray
     extent: float  # mm; positions' learning rates and the dense size scale with it
-    refinement: Refinement
-    rng: np.random.Generator
+    pose_order: np.ndarray = field(init=False)
+    refinement: Refinement = field(init=False)
+    rng: np.random.Generator = field(init=False)
     schedule: Schedule = field(init=False)
     given: list[tuple[State, Camera]] = field(init=False)  # of every frame, as recorded, on the views' device
     statistics: GradientStatistics = field(init=False)
@@ -45,10 +45,14 @@ class GaussianSession(GaussianTraining):
     queue_phase: int = 1
 
     def __post_init__(self) -> None:
+        config, frames, device = self.config, self.views.frames, self.views.device
+        names = tuple(instrument.name for instrument in self.scene.instruments)
         self.adam = Adam(self.batch_size)
-        self.schedule = Schedule(self.config.schedule, self.config.iterations)
-        device = self.views.device
-        self.given = [(frame.state.to(device), frame.camera.to(device)) for frame in self.views.frames]
+        self.pose_order = pose_order(frames, names)
+        self.refinement = Refinement(config.refine, frames, names, device)
+        self.rng = np.random.default_rng(config.seed)
+        self.schedule = Schedule(config.schedule, config.iterations)
+        self.given = [(frame.state.to(device), frame.camera.to(device)) for frame in frames]
 
     def start(self) -> None:
         """Make the scene's tensors leaves of autograd and clear the statistics; once the canonical Gaussians exist."""
@@ -77,12 +81,10 @@ class GaussianSession(GaussianTraining):
 
     @property
     def phase(self) -> int:
-        """1 or 2 of the dynamic training adjustment."""
         return self.schedule.phase
 
     @property
     def forced(self) -> bool:
-        """Whether phase 2 began because the run was late."""
         return self.schedule.forced
 
     def step(self) -> StepResult:
@@ -149,17 +151,16 @@ class GaussianSession(GaussianTraining):
         return self.queue.pop(0)
 
     def _perturbation(self, progress: float) -> Perturbation:
-        noise = self.schedule.state_noise(progress)
-        given = Perturbation(noise) if noise else UNPERTURBED
-        return self.scene.deformation.perturb(given, self.iteration, progress, self.rng)
+        noise = Perturbation(self.schedule.state_noise(progress))
+        return self.scene.deformation.perturb(noise, self.iteration, progress, self.rng)
 
     def _regularisation(self, rendering: Rendering, penalty: Tensor | None) -> Tensor | float:
         """The prior on corrected poses, and the method's own term."""
         deformation = self.scene.deformation
-        own = None
+        terms = [penalty]
         if not deformation.warming_up:
-            own = deformation.regularisation(self.scene.canonical, rendering, self.iteration)
-        return sum(term for term in (penalty, own) if term is not None)
+            terms.append(deformation.regularisation(self.scene.canonical, rendering, self.iteration))
+        return sum(term for term in terms if term is not None)
 
     def _update(self, progress: float) -> None:
         """One optimiser step on everything that has a gradient; shadows have none until one was found."""
@@ -211,11 +212,13 @@ class GaussianSession(GaussianTraining):
             return
         grows = self._due(settings.interval) and progress < config.density_stop
         if grows or (prunes and progress < config.density.prune_stop):
+            instruments = len(scene.canonical.counts) - 1
             scene.canonical = control_density(
                 scene.canonical,
                 self.adam,
                 self.statistics,
-                self._limits(),
+                [config.max_tissue_gaussians, *[config.max_instrument_gaussians] * instruments],
+                config.density.dense_size * self.extent,
                 settings.threshold if grows else math.inf,
                 self.generator,
                 config.density,
@@ -230,23 +233,15 @@ class GaussianSession(GaussianTraining):
         """Whether this step reached a multiple of `interval` iterations."""
         return due(interval, self.iteration - self.batch_size, self.iteration)
 
-    def _limits(self) -> list[BodyLimit]:
-        dense = self.config.density.dense_size * self.extent
-        instruments = [BodyLimit(self.config.max_instrument_gaussians, dense)] * (len(self.scene.canonical.counts) - 1)
-        return [BodyLimit(self.config.max_tissue_gaussians, dense), *instruments]
-
     def between_steps(self, before: float) -> None:
         """Run the method's own hook."""
         self.scene.deformation.between_steps(self, before)
 
     def pack(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """What a checkpoint needs beside scene, optimiser and random numbers."""
-        groups = {
-            "refinement": self.refinement.tensors(),
-            "statistics": {"total": self.statistics.total, "seen": self.statistics.seen},
-        }
-        tensors = {f"{group}/{name}": tensor for group, named in groups.items() for name, tensor in named.items()}
-        return tensors, {
+        statistics = {"statistics/total": self.statistics.total, "statistics/seen": self.statistics.seen}
+        refinement = {f"refinement/{name}": tensor for name, tensor in self.refinement.tensors().items()}
+        return refinement | statistics, {
             "schedule": self.schedule.state_dict(),
             "rng": self.rng.bit_generator.state,
             "queue": self.queue,
@@ -278,26 +273,11 @@ def new_session(
     scene: Scene, views: TrainingViews, config: TrainConfig, report: Report = lambda text: None
 ) -> GaussianSession:
     """A session at iteration 0, on the device of the views; `start` it before the first step."""
-    names = tuple(instrument.name for instrument in scene.instruments)
-    return GaussianSession(
-        scene,
-        config.length,
-        torch.Generator(views.device).manual_seed(config.seed),
-        views,
-        report,
-        config.batch_size,
-        config,
-        pose_order(views.frames, names),
-        scene_extent(views.frames, scene.center.cpu()),
-        Refinement(config.refine, views.frames, names, views.device),
-        np.random.default_rng(config.seed),
-    )
-
-
-def scene_extent(frames: tuple[Frame, ...], center: Tensor) -> float:
-    """Half the median distance from the cameras to the scene's middle, mm: scales the positions' learning rate."""
-    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in frames]
-    return 0.5 * float(np.median(distances))
+    generator = torch.Generator(views.device).manual_seed(config.seed)
+    center = scene.center.cpu()
+    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in views.frames]
+    extent = 0.5 * float(np.median(distances))
+    return GaussianSession(scene, config.length, generator, views, report, config.batch_size, config, extent)
 
 
 def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.ndarray:

@@ -23,7 +23,7 @@ from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.methods import method_class, unmet_need
-from neeco.scene.training_session import Session
+from neeco.scene.training_session import Session, StepResult
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.initial import begin_session
@@ -169,7 +169,7 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
     return capture.split("train")
 
 
-def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: StopRequest, go_on: str) -> None:
+def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: threading.Event, go_on: str) -> None:
     """Step until done; write rows and checkpoints at their intervals, and a checkpoint at the end."""
     phase = session.phase
     last = log.clock()
@@ -190,9 +190,9 @@ def _run(session: Session, output: Path, config: TrainConfig, log: _Log, stop: S
                 began = log.clock()
                 log.watch(session)
                 last += log.clock() - began
-            if stop.received or due(config.checkpoint_interval, iteration, session.iteration):
+            if stop.is_set() or due(config.checkpoint_interval, iteration, session.iteration):
                 save_checkpoint(session, output)
-            if stop.received:
+            if stop.is_set():
                 raise KeyboardInterrupt
         save_checkpoint(session, output)
     except KeyboardInterrupt:
@@ -211,36 +211,29 @@ def _check_finite(session: Session) -> None:
         )
 
 
-@dataclass
-class StopRequest:
-    """Whether the user asked the run to stop."""
-
-    received: bool = False
-
-    def handle(self, number: int, frame: object) -> None:
-        """A signal handler. Raises KeyboardInterrupt for the second signal."""
-        if self.received:
-            raise KeyboardInterrupt
-        self.received = True
-
-
 @contextmanager
-def deferred_interrupts() -> Iterator[StopRequest]:
-    """Until the end of the block, the first SIGINT or SIGTERM only sets `received`.
+def deferred_interrupts() -> Iterator[threading.Event]:
+    """Until the end of the block, the first SIGINT or SIGTERM only sets the event; a second raises KeyboardInterrupt.
 
     Signals that are ignored (a background job of a script) stay ignored. Outside the main thread, where Python allows
     no handlers, signals are not caught.
     """
-    request = StopRequest()
+    stop = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             handler = signal.getsignal(number)
             if handler not in (signal.SIG_IGN, None):
                 before[number] = handler
-                signal.signal(number, request.handle)
+                signal.signal(number, handle)
     try:
-        yield request
+        yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -258,13 +251,12 @@ class _Log:
 
     def row(self, session: Session) -> None:
         """Write the means over the session's window, and empty it."""
-        loss = sum(step.loss for step in session.window) / len(session.window)
-        psnr = sum(step.psnr for step in session.window) / len(session.window)
+        mean = StepResult.mean(session.window)
         session.window.clear()
         self.last = ProgressRow(
             session.iteration,
-            round(loss, 6),
-            round(psnr, 3),
+            round(mean.loss, 6),
+            round(mean.psnr, 3),
             session.scene.num_gaussians,
             session.phase,
             round(session.seconds, 2),

@@ -190,7 +190,7 @@ def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels:
     if view not in (*LABELLED, UNOBSERVED):
         return scene.render(state, camera)
     posing = gaussian_scene(scene, f"view: {view}")
-    gaussians, camera = posing.at(state), posing.camera(camera)
+    gaussians = posing.at(state)
     channels = labels if view in LABELLED else posing.unobserved(gaussians, camera)[:, None]
     return rasterize(gaussians, camera, channels=channels)
 

@@ -35,9 +35,7 @@ class DelimitedText(LogFormat):
         header = _unique(names)
         if all(not name or parse_number(name) is not None for name in header):
             found = printable(lines[0][1][:40])
-            raise NeecoError(
-                f"{path}: line {lines[0][0]}: no header (found {found}); add a first line naming the columns"
-            )
+            raise NeecoError(f"{path}: line {lines[0][0]}: no header (found {found}); add a line naming the columns")
         if not rows:
             raise NeecoError(f"{path}: has a header but no rows; record again or name another file")
         decimal_comma = delimiter == ";" and any("," in cell for row in rows[:49] for cell in row)

@@ -15,8 +15,8 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import HingeMotion, Learned
-from neeco.scene.method import Method, Stored
+from neeco.scene.drawable import HingeMotion
+from neeco.scene.method import Method
 from neeco.scene.training_session import GaussianTraining
 
 FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are shorter)
@@ -95,10 +95,6 @@ class Deformation(nn.Module, Method):
         super().__init_subclass__(**options)
         cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
 
-    @classmethod
-    def load(cls, stored: Stored) -> Learned:
-        return stored.gaussians(cls(stored.instruments, stored.settings), stored)
-
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""
         raise NotImplementedError
@@ -163,15 +159,15 @@ class Deformation(nn.Module, Method):
         return None
 
     def learning_rates(self, progress: float) -> dict[str, float]:
-        """Adam learning rate of each of this module's parameters, by name; 0 holds one still. `progress` in [0, 1]."""
+        """Adam learning rate of each of this module's parameters, by name; 0 freezes one. `progress` in [0, 1]."""
         return {}
 
     def between_steps(self, training: GaussianTraining, before: float) -> None:
-        """After every step; `before` is the progress before it: for what is due once a mark has been passed. A step may
-        be several iterations (`batch_size`)."""
+        """After every step; `before` is the progress before it: for what is due at a share of the run. A step may be
+        several iterations (`batch_size`)."""
 
     def finish(self, training: GaussianTraining) -> None:
-        """Find out what is found once learning has ended; may replace the canonical Gaussians."""
+        """After the last step; may replace the canonical Gaussians."""
 
 
 class LabelledByMotion(Deformation):

@@ -5,20 +5,18 @@ are, in each resolution, the product of what it meets in the six, and all resolu
 a head for each attribute makes (d_mu, d_r, d_s) of them, added before activation. L1 alone is the image loss; planes
 are kept smooth in space and time, and those with time near 1, where they change nothing.
 
-Where it departs from its source:
-- Static Gaussians alone for 3,000 of 17,000 iterations (the source's coarse stage) are a share of the run here, which
-  is shorter; so are the falling learning rates, 1.6e-3 to 1.6e-4 for planes and a tenth of both for the network.
-- The heads end in zeros, so that waking them changes nothing. The source starts them at random.
-- The planes span a cube about the sparse points that is a fifth wider than they are along their longest side: an
-  instrument moves before the tissue, where no points lie. The source takes the box of the points. Its scenes' half
-  extent is about 1; here the points' half extent is the unit of d_mu.
-- The source multiplies these rates by how far its cameras are spread, 4 to 5 in the units of D-NeRF's scenes. Here the
-  factor is `rate_scale`, 5, as Deformable-3DGS has it.
-- Time runs over the whole of its axis, from the first to the last training frame.
-- 16 channels, the smaller of the source's settings, for speed on a processor.
-- With the dynamic training adjustment, the compensation is added to what encodes the time here: the rows of the planes
-  xt yt zt at that time, one normal number per plane and channel.
-- The number of Gaussians has a ceiling (`max_tissue_gaussians`).
+Departures from the source:
+- The static stage (3,000 of 17,000 iterations) and the fall of the learning rates (1.6e-3 to 1.6e-4 for planes, a tenth
+  of both for the network) are shares of the run, which is shorter here.
+- The heads end in zeros, so that the end of the warm-up changes nothing. The source starts them at random.
+- The planes span a cube around the sparse points, a fifth wider than their longest side: instruments move in front of
+  the tissue, where no points lie. The source takes the box of the points. The unit of d_mu is the points' half extent.
+- `rate_scale`, 5 as in Deformable-3DGS, replaces the source's factor, the spread of its cameras (4 to 5 for D-NeRF).
+- Time runs over its whole axis, from the first to the last training frame.
+- 16 channels, the smaller of the source's settings, for speed on a CPU.
+- With the dynamic training adjustment, the compensation is added to the rows of the planes xt yt zt at the state's
+  time, one normal number per plane and channel.
+- The number of Gaussians is limited (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
@@ -91,14 +89,14 @@ class HexPlane(LabelledByMotion):
     def __init__(self, instruments: tuple[Instrument, ...], settings: HexPlaneSettings | None = None) -> None:
         super().__init__(instruments, settings)
         sizes: HexPlaneSettings = self.settings
-        channels, moments, width = sizes.channels, sizes.time_resolution, sizes.width
+        channels, steps, width = sizes.channels, sizes.time_resolution, sizes.width
         self.warm_up = sizes.warm_up
         self.times = RecordedTimes()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("half_extent", torch.ones(()))
         sides = [sizes.resolution * 2**level for level in range(sizes.levels)]
         self.space = nn.ParameterList(torch.empty(3, channels, side, side).uniform_(0.1, 0.5) for side in sides)
-        self.time = nn.ParameterList(torch.ones(3, channels, moments, side) for side in sides)
+        self.time = nn.ParameterList(torch.ones(3, channels, steps, side) for side in sides)
         self.trunk = nn.Linear(channels * sizes.levels, width)
         self.heads = nn.ModuleList(_head(width, size) for size in (3, 4, 3))
         nn.init.xavier_uniform_(self.trunk.weight)
@@ -111,10 +109,10 @@ class HexPlane(LabelledByMotion):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        places = (canonical.means - self.center) / (MARGIN * self.half_extent)
+        positions = (canonical.means - self.center) / (MARGIN * self.half_extent)
         rows = self.rows_at(self.times.share(state), perturbation.state_noise)
-        features = self.features(places, rows)
-        with tf32_products(places.device):
+        features = self.features(positions, rows)
+        with tf32_products(positions.device):
             hidden = self.trunk(features)
             d_means, d_quats, d_scales = (head(hidden) for head in self.heads)
         scales = (canonical.log_scales + d_scales).exp()
@@ -133,10 +131,10 @@ class HexPlane(LabelledByMotion):
             rows.append(row + noise * torch.randn(*row.shape[:2], 1, device=row.device) if noise > 0 else row)
         return rows
 
-    def features(self, places: Tensor, rows: list[Tensor]) -> Tensor:
-        """[N, levels * C] of places [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
-        pairs = torch.stack([places[:, [0, 1]], places[:, [0, 2]], places[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
-        across = places.T[:, None, :, None]
+    def features(self, positions: Tensor, rows: list[Tensor]) -> Tensor:
+        """[N, levels * C] of positions [N, 3] in [-1, 1] (beyond: as at the border) and the time's `rows`."""
+        pairs = torch.stack([positions[:, [0, 1]], positions[:, [0, 2]], positions[:, [1, 2]]])[:, None]  # [3, 1, N, 2]
+        across = positions.T[:, None, :, None]
         lines = torch.cat([across, torch.zeros_like(across)], -1)  # [3, 1, N, 2]
         found = []
         for plane, row in zip(self.space, rows, strict=True):
@@ -176,10 +174,10 @@ def _head(width: int, size: int) -> nn.Sequential:
     return nn.Sequential(nn.ReLU(), inner, nn.ReLU(), last)
 
 
-def _sample(planes: Tensor, places: Tensor) -> Tensor:
-    """Bilinear: planes [3, C, H, W] at places [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
+def _sample(planes: Tensor, positions: Tensor) -> Tensor:
+    """Bilinear: planes [3, C, H, W] at positions [3, 1, N, 2] (along W, along H; -1 and 1 at the outer centres) to
     [3, C, N]."""
-    return nn.functional.grid_sample(planes, places, align_corners=True, padding_mode="border")[:, :, 0]
+    return nn.functional.grid_sample(planes, positions, align_corners=True, padding_mode="border")[:, :, 0]
 
 
 def _curvature(planes: Tensor) -> Tensor:

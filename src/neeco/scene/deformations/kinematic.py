@@ -127,11 +127,10 @@ class Kinematic(HingedInstruments, Deformation):
         column = 0
         for index in range(len(self.instruments)):
             hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-            if not hinges.joint_names:
-                labels[rows, column] = 1.0
-                column += 1
-                continue
-            parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            if hinges.joint_names:
+                parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
+            else:
+                parts = labels.new_ones(canonical.counts[index + 1], 1)
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
         return labels
@@ -233,13 +232,13 @@ class Kinematic(HingedInstruments, Deformation):
             weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
             terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
         if settings.part_sharpness > 0 and iteration > self.start_iteration:
-            terms += [settings.part_sharpness * self._undecided(canonical, k) for k in range(len(self.instruments))]
+            terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
         if rendering.channels is not None and settings.label_sharpness > 0:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
         return sum(terms[1:], terms[0]) if terms else None
 
-    def _undecided(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+    def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """How mixed one instrument's Gaussians are of its parts, a scalar in [0, 1)."""
         weights = self.part_weights(canonical, index)
         opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()

@@ -1,10 +1,9 @@
 """Nothing moves: plain 3D Gaussian splatting (Kerbl et al. 2023), method `3dgs`.
 
-Learning rates, density control, opacity resets, SH orders and lambda = 0.2 are the source's. Where this departs from
-it, for every method alike: the positions' rate falls to 3 % rather than 1 % (runs here are shorter than 30,000 steps),
-and its unit is half the median distance of the cameras from the scene; the number of Gaussians has a ceiling
-(`max_tissue_gaussians`), given to the strongest gradients, and large ones are not pruned by their size on the screen or
-in the scene; the light may fall off with distance, as an endoscope's does.
+Learning rates, density control, opacity resets, SH orders and lambda = 0.2 are the source's. Departures, of every
+method: the positions' rate falls to 3 % rather than 1 % (runs are shorter than 30,000 steps), and its unit is half the
+median distance of the cameras from the scene; the number of Gaussians is limited (`max_tissue_gaussians`), strongest
+gradients first, and large ones are not pruned by their size; the light may fall off with distance, as an endoscope's.
 """
 
 from __future__ import annotations

@@ -6,14 +6,13 @@ and scale to the scale itself, that is after activation; normal noise on the tim
 tenth of the frame interval to none at half of the run. `synthetic` is the source's variant for D-NeRF: 6 octaves of
 time through a small network 13 -> 256 -> 30, and no noise.
 
-Where it departs from its source:
-- What the source counts in iterations of its 40,000 are shares of the run here, which is shorter: rest over the first
-  3,000, density control until 15,000, noise until 20,000, and the learning rate's whole fall from 8e-4 to 1.6e-6.
-- The head starts at zero, so that waking the network changes nothing. The source starts it at small random numbers.
-- The source computes in the units of its scenes, whose half extent is about 1. Here the points' half extent is the
-  unit, for what goes in and for the changes of mean and scale.
-- A scale that its change would make negative is taken as positive; in the source, too, the covariance squares it.
-- The number of Gaussians has a ceiling (`max_tissue_gaussians`).
+Departures from the source:
+- Its iterations, of 40,000, are shares of the run, which is shorter here: warm-up until 3,000, density control until
+  15,000, noise until 20,000, and the fall of the learning rate from 8e-4 to 1.6e-6.
+- The head starts at zero, so that the end of the warm-up changes nothing. The source starts it at random.
+- The points' half extent is the unit of the input and of the changes of mean and scale; it is about 1 in the source.
+- The absolute value is taken of negative scales; in the source, too, the covariance squares them.
+- The number of Gaussians is limited (`max_tissue_gaussians`).
 """
 
 from __future__ import annotations
@@ -125,8 +124,8 @@ class TimeMLP(LabelledByMotion):
         scales = canonical.log_scales.exp()
         if self.warming_up:
             return Posed(canonical.means, canonical.quats, scales)
-        places = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
-        change = self.network(places, self.encoded_time(state, perturbation))
+        positions = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
+        change = self.network(positions, self.encoded_time(state, perturbation))
         means = canonical.means + self.mean_halfwidth * change[:, :3]
         quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
         return Posed(means, quats, (scales + self.mean_halfwidth * change[:, 7:]).abs())
@@ -145,11 +144,11 @@ class TimeMLP(LabelledByMotion):
             encoded = encoded + perturbation.state_noise * torch.randn_like(encoded)
         return self.time_net(encoded) if self.settings.synthetic else encoded
 
-    def network(self, places: Tensor, encoded_time: Tensor) -> Tensor:
-        """F: places [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
-        encoded = octaves(places, self.settings.L_mean)
+    def network(self, positions: Tensor, encoded_time: Tensor) -> Tensor:
+        """F: positions [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
+        encoded = octaves(positions, self.settings.L_mean)
         features = encoded
-        with tf32_products(places.device):
+        with tf32_products(positions.device):
             for index, layer in enumerate(self.layers):
                 assert isinstance(layer, nn.Linear)
                 if index == SKIP + 1:

@@ -1,24 +1,22 @@
 """The radiance field of method `nerfies`: settings, SE(3) warp, template, volume rendering, and its scene.
 
-Nerfies (Park et al., ICCV 2021): a template NeRF, and for every moment a code from which an SE(3) field warps each
+Nerfies (Park et al., ICCV 2021): a template NeRF, and for every time a code from which an SE(3) field warps each
 sample of a ray into the template. Faithful to the source: SE(3) field with a skip at layer 4, heads drawn from
 U(1e-4), its frequencies opened from coarse to fine over the first 32 % of the run (80k of 250k), elastic and background
 loss, a rate that falls to a tenth along a line of its logarithms, a sample at infinity, codes of 8 numbers.
 
-Departures, all for a processor without a GPU or for states that were never trained:
+Departures, for a CPU or for states that were not trained:
 
-- sizes: the defaults are small; `PUBLISHED` are the source's. So is the first `rate`, 1e-3 there: in the few thousand
-  steps that a processor has time for, five times as much shows the tissue's marks; 900 steps at 1e-3 showed its mean
-  colour alone.
-- codes of moments that were not trained are interpolated linearly between the neighbouring training frames' codes by
-  time, and are the nearest one's outside; frames of one time share a code. The recorded instrument state is not used.
-- the elastic loss takes the Jacobian at the sample of median depth of `elastic_rays` rays (the source: of all samples,
+- The defaults are small; `PUBLISHED` are the source's. The first `rate` is five times the source's 1e-3: 900 steps at
+  1e-3, which a CPU has time for, learn the tissue's mean colour alone.
+- Codes of other times are interpolated linearly between the neighbouring training frames' codes; outside, the nearest
+  frame's code is used. Frames of one time share a code. The recorded instrument state is not used.
+- The elastic loss takes the Jacobian at the sample of median depth of `elastic_rays` rays (the source: of all samples,
   weighted; its code offers the median too).
-- the background loss takes the capture's sparse points: structure from motion keeps what stands still. A capture
+- The background loss takes the capture's sparse points, which structure from motion finds on static surfaces. A capture
   without measured points has no such loss.
-- rays start where nothing was seen (`NEAR_SHARE` of the nearest sparse point's depth), not at the points: instruments
-  stand before the tissue.
-- density is softplus(x - 1), as a ReLU of a small network may start dead and stay so.
+- Rays start at `NEAR_SHARE` of the nearest sparse point's depth, not at the points: instruments are before the tissue.
+- Density is softplus(x - 1), as a ReLU of a small network may start dead and stay so.
 """
 
 from __future__ import annotations
@@ -69,7 +67,7 @@ class NerfiesSettings:
     the warp's frequencies open; `elastic_weight` of the Jacobians at `elastic_rays` rays, `background_weight` of
     `background_points` sparse points, `robust_scale` c of both losses (log singular values, template units),
     `point_noise` added to the points (template units); learning `rate` at the start, of which `rate_decay` is left at
-    the end; `chunk`: rays drawn at once."""
+    the end; `chunk`: rays rendered at once."""
 
     rays: int = 128
     coarse_samples: int = 32
@@ -95,17 +93,11 @@ class NerfiesSettings:
     chunk: int = 512
 
     def __post_init__(self) -> None:
-        may_be_zero = {
-            "fine_samples",
-            "appearance",
-            "elastic_rays",
-            "elastic_weight",
-            "background_weight",
-            "point_noise",
-        }
+        may_be_zero = {"fine_samples", "appearance", "elastic_rays", "background_points", "window", "point_noise"}
+        may_be_zero |= {"elastic_weight", "background_weight"}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value < 0 or (value == 0 and field.name not in may_be_zero | {"background_points", "window"}):
+            if value < 0 or (value == 0 and field.name not in may_be_zero):
                 raise NeecoError(f"deformation.{field.name}: {value} is too small; give a larger number")
         if self.coarse_samples < 2:
             raise NeecoError("deformation.coarse_samples: a ray needs at least 2 samples")
@@ -181,7 +173,7 @@ class MLP(nn.Module):
 
 
 class WarpField(nn.Module):
-    """W: (point, code) to a screw (w, v), and by it to the point's place in the template (Nerfies eq. 7)."""
+    """W: (point, code) to a screw (w, v), which moves the point to its place in the template (Nerfies eq. 7)."""
 
     def __init__(self, frequencies: int, code: int, depth: int, width: int) -> None:
         super().__init__()
@@ -193,7 +185,7 @@ class WarpField(nn.Module):
             nn.init.zeros_(head.bias)
 
     def forward(self, points: Tensor, codes: Tensor, opened: Tensor) -> Tensor:
-        """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; places in the template [M, 3]."""
+        """points [M, 3] in template units, codes [M, C], `opened` [] frequencies; positions in the template [M, 3]."""
         encoded = encode_by_octave(points, self.frequencies, opened)
         with tf32_products(points.device):
             features = self.trunk(torch.cat([encoded, codes], -1))
@@ -225,13 +217,13 @@ class Template(nn.Module):
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, places: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
-        """places [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
-        conditions = conditions[:, None].expand(-1, places.shape[1], -1)
-        with tf32_products(places.device):
-            features = self.trunk(encode_by_octave(places, self.frequencies))
-            seen = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
-            density, color = self.density(features)[..., 0], self.color(seen)
+    def forward(self, positions: Tensor, conditions: Tensor) -> tuple[Tensor, Tensor]:
+        """positions [R, S, 3] and per-ray conditions [R, V] to densities [R, S] and colours [R, S, 3]."""
+        conditions = conditions[:, None].expand(-1, positions.shape[1], -1)
+        with tf32_products(positions.device):
+            features = self.trunk(encode_by_octave(positions, self.frequencies))
+            viewed = torch.relu(self.view(torch.cat([self.feature(features), conditions], -1)))
+            density, color = self.density(features)[..., 0], self.color(viewed)
         return nn.functional.softplus(density - 1), torch.sigmoid(color)
 
     def condition(self, directions: Tensor, appearance: Tensor) -> Tensor:
@@ -307,13 +299,13 @@ def importance_depths(depths: Tensor, weights: Tensor, count: int, generator: to
         reached = torch.cat([share.new_zeros(len(depths), 1), (share / share.sum(-1, keepdim=True)).cumsum(-1)], -1)
         even = (torch.arange(count, device=depths.device) + 0.5) / count
         if generator is None:
-            wanted = even.expand(len(depths), count)
+            quantiles = even.expand(len(depths), count)
         else:
-            wanted = torch.rand(len(depths), count, generator=generator, device=depths.device)
-        above = torch.searchsorted(reached, wanted.contiguous(), right=True).clamp(1, reached.shape[1] - 1)
+            quantiles = torch.rand(len(depths), count, generator=generator, device=depths.device)
+        above = torch.searchsorted(reached, quantiles.contiguous(), right=True).clamp(1, reached.shape[1] - 1)
         low, high = reached.gather(1, above - 1), reached.gather(1, above)
         start, end = middles.gather(1, above - 1), middles.gather(1, above)
-        between = ((wanted - low) / (high - low).clamp_min(1e-5)).clamp(0, 1)
+        between = ((quantiles - low) / (high - low).clamp_min(1e-5)).clamp(0, 1)
         return torch.cat([depths, start + between * (end - start)], -1).sort(-1).values
 
 
@@ -340,7 +332,7 @@ class RayRendering:
 
     coarse: Composite
     fine: Composite | None
-    places: Tensor  # [R, S, 3]
+    positions: Tensor  # [R, S, 3]
     codes: Tensor  # [R, C]
 
 
@@ -382,10 +374,6 @@ class NerfScene(nn.Module):
         self.coarse = Template(settings)
         self.fine = Template(settings) if settings.fine_samples else None
 
-    def camera(self, camera: Camera) -> Camera:
-        """The recorded one."""
-        return camera
-
     def hinge_motion(self) -> None:
         """A field has no Gaussians that could move."""
 
@@ -398,13 +386,13 @@ class NerfScene(nn.Module):
         return {}, {}
 
     def codes_at(self, codes: Tensor, times: Tensor) -> Tensor:
-        """Codes [R, C] at `times` [R] s: linear between the training moments' codes [T, C], the nearest outside."""
+        """Codes [R, C] at `times` [R] s: linear between the training frames' codes [T, C], the nearest outside."""
         after = torch.searchsorted(self.times, times.double()).clamp(1, len(self.times) - 1)
         start, end = self.times[after - 1], self.times[after]
         share = ((times.double() - start) / (end - start)).clamp(0, 1).to(codes.dtype)[:, None]
         return torch.lerp(codes[after - 1], codes[after], share)
 
-    def places(self, rays: Rays, depths: Tensor) -> Tensor:
+    def positions(self, rays: Rays, depths: Tensor) -> Tensor:
         """Positions [R, S, 3] of samples at `depths` [R, S] mm, in the scene's units, before the warp."""
         world = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]
         return (world - self.center) / self.scale
@@ -416,19 +404,19 @@ class NerfScene(nn.Module):
         unit = rays.directions.norm(dim=-1) / self.scale
         appearance = self.codes_at(self.appearances, rays.times)
 
-        def composed(template: Template, depths: Tensor, places: Tensor) -> Composite:
+        def composed(template: Template, depths: Tensor, positions: Tensor) -> Composite:
             along = codes[:, None].expand(-1, depths.shape[1], -1)
-            warped = self.warp(places.flatten(0, 1), along.flatten(0, 1), self.opened).view_as(places)
+            warped = self.warp(positions.flatten(0, 1), along.flatten(0, 1), self.opened).view_as(positions)
             densities, colors = template(warped, template.condition(rays.directions, appearance))
             return composite(densities, colors, depths, unit)
 
         depths = stratified_depths(settings.coarse_samples, self.bounds, len(rays), generator)
-        places = self.places(rays, depths)
-        coarse = composed(self.coarse, depths, places)
+        positions = self.positions(rays, depths)
+        coarse = composed(self.coarse, depths, positions)
         if self.fine is None:
-            return RayRendering(coarse, None, places, codes)
+            return RayRendering(coarse, None, positions, codes)
         finer = importance_depths(depths, coarse.weights, settings.fine_samples, generator)
-        return RayRendering(coarse, composed(self.fine, finer, self.places(rays, finer)), places, codes)
+        return RayRendering(coarse, composed(self.fine, finer, self.positions(rays, finer)), positions, codes)
 
     @torch.no_grad()
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
@@ -436,8 +424,8 @@ class NerfScene(nn.Module):
         rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []
         for start in range(0, len(rays), self.settings.chunk):
-            drawn = self.render_rays(rays.part(slice(start, start + self.settings.chunk)))
-            parts.append(drawn.coarse if drawn.fine is None else drawn.fine)
+            rendered = self.render_rays(rays.part(slice(start, start + self.settings.chunk)))
+            parts.append(rendered.coarse if rendered.fine is None else rendered.fine)
         shape = (camera.height, camera.width)
         return Rendering(
             color=torch.cat([part.color for part in parts]).view(*shape, 3),

@@ -31,13 +31,13 @@ class RayTable:
     def __init__(self, views: TrainingViews) -> None:
         device = views.device
         self.pixels = torch.cat([image.flatten(0, 1) for image in views.images]).to(device)  # [P, 3]
-        self.counted: Tensor | None = None  # [P], where the loss counts
+        self.valid: Tensor | None = None  # [P], where the loss counts
         if any(mask is not None for mask in views.masks):
             whole = [
                 torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
                 for image, mask in zip(views.images, views.masks, strict=True)
             ]
-            self.counted = torch.cat([mask.flatten() for mask in whole]).to(device)
+            self.valid = torch.cat([mask.flatten() for mask in whole]).to(device)
         cameras = [frame.camera for frame in views.frames]
         self.sizes = torch.tensor([[camera.width, camera.height] for camera in cameras], device=device)
         ends = self.sizes.prod(1).cumsum(0)
@@ -58,8 +58,8 @@ class RayTable:
         centres = place.float() + 0.5
         directions = ray_directions(centres[:, 0], centres[:, 1], self.intrinsics[frames], self.poses[frames, :3, :3])
         rays = Rays(self.poses[frames, :3, 3], directions, self.times[frames])
-        counted = None if self.counted is None else self.counted[index]
-        return rays, self.pixels[index].float() / 255, counted
+        valid = None if self.valid is None else self.valid[index]
+        return rays, self.pixels[index].float() / 255, valid
 
 
 def initial_field(method: str, capture: Capture, frames: tuple[Frame, ...], settings: NerfiesSettings) -> NerfScene:
@@ -138,45 +138,45 @@ class NerfiesSession(Session):
         progress, settings, scene = self.progress, self.settings, self.scene
         opened = min(1.0, progress / settings.window) if settings.window > 0 else 1.0
         scene.opened.fill_(settings.warp_frequencies * opened)
-        rays, colors, counted = self.table.sample(settings.rays, self.generator)
-        drawn = scene.render_rays(rays, self.generator)
-        coarse = _error(drawn.coarse.color, colors, counted)
-        error = coarse if drawn.fine is None else _error(drawn.fine.color, colors, counted)
-        loss = coarse if drawn.fine is None else coarse + error
-        total = loss + self._elastic(drawn) + self._background()
+        rays, colors, valid = self.table.sample(settings.rays, self.generator)
+        rendered = scene.render_rays(rays, self.generator)
+        coarse = _error(rendered.coarse.color, colors, valid)
+        error = coarse if rendered.fine is None else _error(rendered.fine.color, colors, valid)
+        loss = coarse if rendered.fine is None else coarse + error
+        total = loss + self._elastic(rendered) + self._background()
         with tf32_products(total.device):
             total.backward()
         rate = log_linear(settings.rate, settings.rate_decay * settings.rate, progress)
         self.adam.step((name, parameter, rate) for name, parameter in scene.named_parameters() if parameter.numel())
-        value, *seen = numbers(total, loss, error)
+        value, *measured = numbers(total, loss, error)
         check_finite(value, self.iteration)
-        return StepResult.of(*seen)
+        return StepResult.of(*measured)
 
-    def _elastic(self, drawn: RayRendering) -> Tensor:
+    def _elastic(self, rendered: RayRendering) -> Tensor:
         """Weighted elastic loss at the sample of median depth of the first rays, which are at random."""
         settings, scene = self.settings, self.scene
         count = min(settings.elastic_rays, settings.rays)
         if settings.elastic_weight == 0 or count == 0:
             return self.table.pixels.new_zeros((), dtype=torch.float32)
-        reached = drawn.coarse.weights[:count].detach().cumsum(-1)
+        reached = rendered.coarse.weights[:count].detach().cumsum(-1)
         median = (reached < 0.5).sum(-1).clamp_max(reached.shape[1] - 1)[:, None]
-        places, codes = drawn.places[:count], drawn.codes[:count]
-        chosen = places.gather(1, median[..., None].expand(-1, 1, 3))[:, 0]
+        positions, codes = rendered.positions[:count], rendered.codes[:count]
+        chosen = positions.gather(1, median[..., None].expand(-1, 1, 3))[:, 0]
         jacobians = scene.warp.jacobian(chosen, codes, scene.opened)
         return settings.elastic_weight * elastic_loss(jacobians, settings.robust_scale).mean()
 
     def _background(self) -> Tensor:
-        """Weighted loss of sparse points that the warp moves, each at a moment at random (Nerfies eq. 14)."""
+        """Weighted loss of sparse points that the warp moves, each at a random time (Nerfies eq. 14)."""
         settings, scene = self.settings, self.scene
         count = min(settings.background_points, len(self.points))
         if settings.background_weight == 0 or count == 0:
             return self.table.pixels.new_zeros((), dtype=torch.float32)
         chosen = torch.randint(len(self.points), (count,), generator=self.generator, device=self.points.device)
-        moments = torch.randint(len(scene.times), (count,), generator=self.generator, device=self.points.device)
-        places = (self.points[chosen] - scene.center) / scene.scale
-        noise = torch.randn(places.shape, generator=self.generator, device=places.device)
-        places = places + settings.point_noise * noise
-        moved = scene.warp(places, scene.codes[moments], scene.opened) - places
+        times = torch.randint(len(scene.times), (count,), generator=self.generator, device=self.points.device)
+        positions = (self.points[chosen] - scene.center) / scene.scale
+        noise = torch.randn(positions.shape, generator=self.generator, device=positions.device)
+        positions = positions + settings.point_noise * noise
+        moved = scene.warp(positions, scene.codes[times], scene.opened) - positions
         return settings.background_weight * geman_mcclure(moved.square().sum(-1), settings.robust_scale).mean()
 
     def finish(self) -> None:
@@ -186,10 +186,10 @@ class NerfiesSession(Session):
         self.scene.diagnostics["moments"] = len(self.scene.times)
 
 
-def _error(colors: Tensor, wanted: Tensor, counted: Tensor | None) -> Tensor:
+def _error(colors: Tensor, targets: Tensor, valid: Tensor | None) -> Tensor:
     """Mean squared error [] over the rays that count; zero when none does."""
-    squared = (colors - wanted).square().mean(-1)
-    return squared.mean() if counted is None else (squared * counted).sum() / counted.sum().clamp_min(1)
+    squared = (colors - targets).square().mean(-1)
+    return squared.mean() if valid is None else (squared * valid).sum() / valid.sum().clamp_min(1)
 
 
 class Nerfies(Method):

@@ -1,10 +1,4 @@
-"""Find each instrument and its joints from training frames alone, and seed its Gaussians (of a method with hinges).
-
-A joint's hinge comes from a grid search over stick figures against the evidence, before anything is trained. A joint
-moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the pivot, turned
-about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above all where the
-reading is large, and leaves tissue visible between them.
-"""
+"""Find each instrument and its joints from training frames alone, and seed its Gaussians (of a method with hinges)."""
 
 from __future__ import annotations
 
@@ -184,14 +178,14 @@ def start_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, n
     hinges.base.copy_(shape.instrument_from_shaft)
     hinges.extent.copy_(torch.tensor([shape.near, shape.tip]))
     for index, joint in enumerate(hinges.joint_names):
-        hypotheses = search_hinge(evidence, name, joint, shape, session.config.search)
-        if not hypotheses:
+        found = search_hinge(evidence, name, joint, shape, session.config.search)
+        if found is None:
             session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
             continue
         with torch.no_grad():
-            hinges.hinge_angle[index] = dominant_angle(hypotheses)
-            hinges.hinge_depth[index] = balanced_depth(hypotheses)
-            hinges.share[index] = 1.0 if hypotheses[0].gains[1] == 0 else 0.5
+            hinges.hinge_angle[index] = found.angle
+            hinges.hinge_depth[index] = found.depth
+            hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
             readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
             hinges.middle[index] = sum(readings) / len(readings)
             hinges.closed[index] = min(readings)
@@ -227,25 +221,51 @@ def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Ge
 
 
 @dataclass(frozen=True)
-class HingeHypothesis:
-    """One point of the grid: angle rad around and depth mm along the carved shaft, gains of the two parts."""
+class HingeScores:
+    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all GAINS."""
 
-    angle: float
-    depth: float
-    gains: tuple[float, float]
-    score: float  # mean evidence on the sticks, in [0, 1]
-    gain_over_rigid: float  # score over that of unturned sticks, times the share of the length they cover
+    angles: list[float]
+    depths: list[float]
+    score: np.ndarray  # [D, GAINS, A] mean evidence on the turned sticks, in [0, 1]
+    over_rigid: np.ndarray  # [D, GAINS, A] score less that of unturned sticks, times the share of the length they cover
+
+    @property
+    def depth(self) -> float:
+        """Half way between the best by score and the best over rigid sticks, mm.
+
+        The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
+        """
+        best = [np.unravel_index(score.argmax(), score.shape)[0] for score in (self.score, self.over_rigid)]
+        return (self.depths[best[0]] + self.depths[best[1]]) / 2
+
+    @property
+    def angle(self) -> float:
+        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its
+        peak alone."""
+        best = self.score.max((0, 1)).tolist()
+        wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
+        return (math.atan2(wave.imag, wave.real) / 2) % math.pi
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Those of the best score."""
+        return GAINS[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
 
 
 def search_hinge(
     evidence: Evidence, name: str, joint: str, shape: CarvedShape, search: SearchConfig
-) -> list[HingeHypothesis]:
-    """All hypotheses on the grid, best first. Empty when the reading hardly varies."""
+) -> HingeScores | None:
+    """Scores of all hinges on a grid, by a search over stick figures; None when the reading hardly varies.
+
+    A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
+    pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
+    all where the reading is large, and leaves tissue visible between them.
+    """
     recorded = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
     readings = torch.tensor(recorded, dtype=torch.float32, device=evidence.device)
     opening = readings - readings.min()
     if float(opening.max()) < MIN_READING_RANGE:
-        return []
+        return None
     closed = evidence.subset(torch.nonzero(readings <= readings.quantile(0.35))[:, 0])
     line = center_line(closed, name, shape, search)
     if len(line) < 2:
@@ -253,43 +273,18 @@ def search_hinge(
     camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
     angles = torch.arange(search.hinge_angles, device=evidence.device) * (math.pi / search.hinge_angles)
     length = shape.tip - shape.near
-    hypotheses = []
-    for depth in np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, search.hinge_depths):
-        stick = _stick(line, float(depth), shape.tip)
-        gains_tried = {gain for pair in GAINS for gain in pair} | {SMALL_GAIN, -SMALL_GAIN, 0.0}
+    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, search.hinge_depths).tolist()
+    score, over_rigid = [], []
+    for depth in depths:
+        stick = _stick(line, depth, shape.tip)
         scores = {
-            gain: _stick_scores(evidence, camera_from_shaft, stick, float(depth), angles, gain * opening, opening)
-            for gain in sorted(gains_tried)
+            gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, gain * opening, opening)
+            for gain in {0.0, SMALL_GAIN, -SMALL_GAIN, *GAINS[0], *GAINS[1]}
         }
-        share = (shape.tip - float(depth)) / length
-        small_turns = (scores[SMALL_GAIN] + scores[-SMALL_GAIN]) / 2
-        for gains in GAINS:
-            turned = (scores[gains[0]] + scores[gains[1]]) / 2
-            score, gain_over_rigid = torch.maximum(turned, small_turns), (turned - scores[0.0]) * share
-            hypotheses += [
-                HingeHypothesis(a, float(depth), gains, s, g)
-                for a, s, g in zip(angles.tolist(), score.tolist(), gain_over_rigid.tolist(), strict=True)
-            ]
-    return sorted(hypotheses, key=lambda hypothesis: -hypothesis.score)
-
-
-def balanced_depth(hypotheses: list[HingeHypothesis]) -> float:
-    """Pivot mm along the shaft: half way between the best by score and the best by gain over rigid sticks.
-
-    The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
-    """
-    best_gain = max(hypotheses, key=lambda hypothesis: hypothesis.gain_over_rigid)
-    return (hypotheses[0].depth + best_gain.depth) / 2
-
-
-def dominant_angle(hypotheses: list[HingeHypothesis]) -> float:
-    """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its peak
-    alone."""
-    best: dict[float, float] = {}
-    for hypothesis in hypotheses:
-        best[hypothesis.angle] = max(best.get(hypothesis.angle, -1.0), hypothesis.score)
-    wave = sum(score * complex(math.cos(2 * angle), math.sin(2 * angle)) for angle, score in best.items())
-    return (math.atan2(wave.imag, wave.real) / 2) % math.pi
+        turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in GAINS])
+        score.append(torch.maximum(turned, (scores[SMALL_GAIN] + scores[-SMALL_GAIN]) / 2))
+        over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
+    return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
 
 
 def _stick(line: Tensor, depth: float, tip: float) -> Tensor:

@@ -134,15 +134,15 @@ def drop_occluded(scene: Scene) -> CanonicalGaussians:
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
     for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
-        camera = scene.camera(recorded.cameras[index])
+        camera = recorded.cameras[index]
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         visible += visible_pixels(posed, camera)
         for own in instruments:
             alone[own] += visible_pixels(posed.select(own), camera)
-    kept = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
-    counts = tuple(int(kept[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
-    return canonical.map(lambda tensor: tensor[kept], counts)
+    stays = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
+    counts = tuple(int(stays[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
+    return canonical.map(lambda tensor: tensor[stays], counts)
 
 
 @torch.no_grad()
@@ -173,11 +173,11 @@ def extend_shaft(
     copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical
-    kept = torch.nonzero(along >= start)[:, 0]
+    seen_part = torch.nonzero(along >= start)[:, 0]
     repeats = math.ceil(length / slab)
-    index = torch.cat([kept, copied.repeat(repeats)]) + rows.start
+    index = torch.cat([seen_part, copied.repeat(repeats)]) + rows.start
     shift = torch.zeros(len(index), device=device)
-    shift[len(kept) :] = -slab * torch.arange(1, repeats + 1, device=device).repeat_interleave(len(copied)).float()
+    shift[len(seen_part) :] = -slab * torch.arange(1, repeats + 1, device=device).repeat_interleave(len(copied)).float()
     whole = torch.arange(len(canonical), device=device)
     whole = torch.cat([whole[: rows.start], index, whole[rows.stop :]])
     counts = list(canonical.counts)

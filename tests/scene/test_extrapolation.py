@@ -1,4 +1,4 @@
-"""Tissue that no frame saw is continued, and nothing else is touched."""
+"""Tissue is extrapolated beyond what frames observed, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def scene_of(canonical: CanonicalGaussians) -> Scene:
     return Scene("3dgs", canonical, deformation, (), Recorded(), torch.tensor([0.0, 0.0, DEPTH]))
 
 
-def test_a_view_beyond_the_rim_shows_the_continued_wall() -> None:
+def test_a_view_beyond_the_border_shows_the_extrapolated_wall() -> None:
     canonical = wall()
     beyond = moved(x=25.0)
     with torch.no_grad():
@@ -50,7 +50,7 @@ def test_a_view_beyond_the_rim_shows_the_continued_wall() -> None:
     assert float(after.depth[32, 75]) == pytest.approx(1.1 * DEPTH, rel=0.05)  # behind what was seen
 
 
-def test_what_was_seen_looks_as_before() -> None:
+def test_what_was_observed_looks_as_before() -> None:
     canonical = wall()
     cameras = [CAMERA, moved(x=3.0), moved(y=-2.0)]
     with torch.no_grad():
@@ -61,38 +61,38 @@ def test_what_was_seen_looks_as_before() -> None:
             assert torch.allclose(after.color[inner], before.color[inner], atol=0.02)
 
 
-def test_made_up_gaussians_are_tissue_and_marked_and_the_others_stay() -> None:
+def test_extrapolated_gaussians_are_tissue_and_marked_and_the_others_stay() -> None:
     body = seed_gaussians(torch.tensor([[0.0, 0.0, 50.0]]), torch.ones(1, 3), torch.ones(1))
     canonical = join_bodies([wall(), body]).with_extras(part_logits=torch.arange(2001.0)[:, None])
-    continued = extrapolate_tissue(canonical, [CAMERA])
-    added = continued.counts[0] - canonical.counts[0]
+    extrapolated = extrapolate_tissue(canonical, [CAMERA])
+    added = extrapolated.counts[0] - canonical.counts[0]
     assert added > 100
-    assert continued.counts[1] == 1
-    marks = continued.extras[EXTRAPOLATED]
+    assert extrapolated.counts[1] == 1
+    marks = extrapolated.extras[EXTRAPOLATED]
     assert int(marks.sum()) == added
-    assert bool((marks[canonical.counts[0] : continued.counts[0]] == 1).all())
+    assert bool((marks[canonical.counts[0] : extrapolated.counts[0]] == 1).all())
     kept = marks == 0
     for name, tensor in canonical.tensors().items():
-        assert torch.equal(continued.tensors()[name][kept], tensor), name
-    unobserved = continued.means[marks == 1]
-    assert not bool(count_views(unobserved, [CAMERA]).any())
+        assert torch.equal(extrapolated.tensors()[name][kept], tensor), name
+    added = extrapolated.means[marks == 1]
+    assert not bool(count_views(added, [CAMERA]).any())
 
 
-def test_the_look_is_taken_from_nearby() -> None:
+def test_the_colour_is_taken_from_nearby() -> None:
     canonical = wall()
     left = canonical.means[:, 0] < 0
     colors = torch.where(left[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9]))
     canonical = replace(canonical, sh_dc=((colors - 0.5) / SH_C0)[:, None])
-    continued = extrapolate_tissue(canonical, [CAMERA])
-    new = continued.extras[EXTRAPOLATED] == 1
-    color = continued.sh_dc[new][:, 0] * SH_C0 + 0.5
-    x = continued.means[new][:, 0]
+    extrapolated = extrapolate_tissue(canonical, [CAMERA])
+    new = extrapolated.extras[EXTRAPOLATED] == 1
+    color = extrapolated.sh_dc[new][:, 0] * SH_C0 + 0.5
+    x = extrapolated.means[new][:, 0]
     red, blue = color[x < -60], color[x > 60]
     assert float(red[:, 0].mean()) > 0.8 > 0.2 > float(red[:, 2].mean())
     assert float(blue[:, 2].mean()) > 0.8 > 0.2 > float(blue[:, 0].mean())
 
 
-def test_without_anything_well_seen_nothing_is_made_up() -> None:
+def test_without_anything_well_observed_nothing_is_extrapolated() -> None:
     canonical = wall()
     behind = replace(canonical, means=canonical.means * torch.tensor([1.0, 1.0, -1.0]))
     assert extrapolate_tissue(behind, [CAMERA]) is behind

@@ -1,4 +1,4 @@
-"""What frames saw of every Gaussian, and from where, decides what of a drawing is made up."""
+"""What frames observed of every Gaussian, and from where, decides what of a rendering is unobserved."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_directions_are_unit_and_spread_evenly() -> None:
     assert torch.allclose(cosines.max(1).values, torch.full((12,), 5**-0.5))
 
 
-def test_a_gaussian_is_seen_by_as_many_pixels_as_its_share_of_them_adds_up_to() -> None:
+def test_a_gaussian_is_observed_by_as_many_pixels_as_its_share_of_them_adds_up_to() -> None:
     pair = still(body(torch.tensor([[-10.0, 0.0, 50.0], [10.0, 0.0, 50.0]]), opacity=0.5))
     canonical = pair.canonical
     pair.canonical = replace(canonical, log_scales=canonical.log_scales + torch.tensor([[0.0], [0.5]]))
@@ -75,7 +75,7 @@ def test_a_gaussian_is_seen_by_as_many_pixels_as_its_share_of_them_adds_up_to() 
 
 
 @torch.no_grad()
-def test_the_other_side_of_a_ball_is_made_up() -> None:
+def test_the_other_side_of_a_ball_is_unobserved() -> None:
     scene = still(ball())
     behind = replace(CAMERA, world_from_camera=BACK)
     beside = replace(CAMERA, world_from_camera=pose_of(0, np.pi / 2, 0, -50, 0, 50))
@@ -100,7 +100,7 @@ def test_sides_of_an_instrument_turn_with_it() -> None:
 
 
 @torch.no_grad()
-def test_what_stands_behind_is_made_up_and_what_was_marked_stays_so() -> None:
+def test_what_stands_behind_is_unobserved_and_what_was_marked_stays_so() -> None:
     x, y = torch.meshgrid(torch.arange(-30.0, 31.0), torch.arange(-25.0, 26.0), indexing="ij")
     wall = torch.stack([x.flatten(), y.flatten(), torch.full((x.numel(),), 60.0)], 1)
     hidden = torch.tensor([[0.0, 0.0, 80.0]])
@@ -117,6 +117,6 @@ def test_what_stands_behind_is_made_up_and_what_was_marked_stays_so() -> None:
 
 
 @torch.no_grad()
-def test_without_recorded_frames_everything_is_made_up() -> None:
+def test_without_recorded_frames_everything_is_unobserved() -> None:
     scene = still(ball(), ())
     assert bool((scene.unobserved(scene.at(State()), CAMERA) == 1).all())
