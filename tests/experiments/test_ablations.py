@@ -53,11 +53,11 @@ def plan(capture: Path, tmp_path: Path) -> AblationPlan:
 
 
 def test_runs_that_tables_share_are_made_once_and_the_rest_differs_in_what_it_says(plan: AblationPlan) -> None:
-    told: set[str] = set()
-    ablation = run_ablations(plan, progress=lambda news: told.add(news.job.name))
+    reported: set[str] = set()
+    ablation = run_ablations(plan, progress=lambda event: reported.add(event.job.name))
     names = ["neeco-no-uniform-motion", "neeco", "neeco-no-density"]
     assert [run["name"] for run in ablation.runs] == names
-    assert told == set(names)
+    assert reported == set(names)
     configs = {name: read_config(plan.output / "runs" / name) for name in names}
     for config in configs.values():
         assert (config["schedule"]["published_steps"], config["schedule"]["earliest"]) == (20_000, 8_000)
@@ -181,11 +181,11 @@ def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_mea
 
 
 @pytest.mark.parametrize(
-    ("ours", "paper", "told"),
+    ("ours", "paper", "reported"),
     [(-3.0, -1.0, "yes"), (0.5, -1.0, "no"), (0.05, -1.0, "even"), (-0.09, -1.0, "even"), (None, -1.0, None)],
 )
-def test_directions_agree_when_the_signs_do(ours: float | None, paper: float, told: str | None) -> None:
-    assert direction(ours, paper) == told
+def test_directions_agree_when_the_signs_do(ours: float | None, paper: float, reported: str | None) -> None:
+    assert direction(ours, paper) == reported
 
 
 def test_phase_1_ends_at_two_fifths_of_the_run_and_its_last_quarter_counts(tmp_path: Path) -> None:

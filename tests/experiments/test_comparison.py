@@ -21,7 +21,13 @@ from neeco.capture import read_capture
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.experiments import training_job as jobs_module
-from neeco.experiments.comparison import ComparisonSpec, compare, distances_to_training, plan_comparison
+from neeco.experiments.comparison import (
+    ComparisonSpec,
+    compare,
+    distances_to_training,
+    plan_comparison,
+    read_comparison,
+)
 from neeco.experiments.training_job import Budget
 from neeco.scene.methods import method_settings
 from neeco.settings import plain
@@ -35,8 +41,8 @@ def spec(capture: Path, tmp_path: Path) -> ComparisonSpec:
     return ComparisonSpec(capture, tmp_path / "out", ("3dgs", "3dgs+dta"), Budget(None, 10), seeds=2, device="cpu")
 
 
-def compared(spec: ComparisonSpec, **told):
-    return plain(compare(plan_comparison(spec), **told))
+def compared(spec: ComparisonSpec, **reported):
+    return plain(compare(plan_comparison(spec), **reported))
 
 
 def without_times(value):
@@ -51,6 +57,7 @@ def test_a_comparison_holds_what_its_runs_hold(spec: ComparisonSpec) -> None:
     result = compared(spec, progress=lambda what, done, total: stages.add(what))
     output = spec.output
     assert result == json.loads((output / "comparison.json").read_text())
+    assert plain(read_comparison(output)) == result
     assert result["schema"] == "neeco-comparison/1"
     assert result["complete"]
     assert result["splits"] == ["test", "unseen"]
@@ -132,7 +139,7 @@ def test_more_seeds_and_methods_are_added_without_training_the_others_again(
     assert len(result["jobs"]) == 2
 
 
-def test_a_failed_run_is_told_in_its_place_and_ends_with_status_1(
+def test_a_failed_run_is_reported_in_its_place_and_ends_with_status_1(
     spec: ComparisonSpec, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     step = GaussianSession.step
@@ -145,9 +152,13 @@ def test_a_failed_run_is_told_in_its_place_and_ends_with_status_1(
     monkeypatch.setattr(GaussianSession, "step", diverging)
     words = ["compare", str(spec.capture), "--methods", "3dgs", "3dgs+dta", "--iterations", "10"]
     assert main([*words, "--output", str(spec.output)]) == 1
-    told = capsys.readouterr()
-    assert told.err.strip().splitlines()[-1].startswith("neeco: error: 1 of 2 runs failed: 3dgs+dta, seed 0: training:")
-    assert "failed" in told.out
+    reported = capsys.readouterr()
+    assert (
+        reported.err.strip()
+        .splitlines()[-1]
+        .startswith("neeco: error: 1 of 2 runs failed: 3dgs+dta, seed 0: training:")
+    )
+    assert "failed" in reported.out
     result = json.loads((spec.output / "comparison.json").read_text())
     assert "loss became nan" in result["jobs"][1]["error"]
     assert [row["psnr"]["n"] for row in result["summary"] if row["name"] == "3dgs+dta"] == [0, 0]
@@ -194,7 +205,7 @@ def test_distance_goes_by_time_without_instruments(capture: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["--methods", "4dgz", "--iterations", "5"], "4dgz"),
         (["--methods", "3dgs"], "no budget is given; .*try --minutes 5"),
@@ -210,18 +221,20 @@ def test_distance_goes_by_time_without_instruments(capture: Path) -> None:
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_one_line_before_any_work(
-    words: list[str], told: str, spec: ComparisonSpec, capsys: pytest.CaptureFixture[str]
+    words: list[str], reported: str, spec: ComparisonSpec, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["compare", str(spec.capture), *words, "--output", str(spec.output)]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
-    assert re.search(told, lines[0])
+    assert re.search(reported, lines[0])
     assert not spec.output.exists()
 
 
 def test_an_output_that_holds_something_else_is_refused(spec: ComparisonSpec, tmp_path: Path) -> None:
     short = replace(spec, methods=("3dgs",), seeds=1)
     compared(short)
+    with pytest.raises(NeecoError, match=r"comparison\.json: no such file"):
+        read_comparison(short.capture)
     with pytest.raises(NeecoError, match="budget: compares after 10 iterations, not 11 iterations; give another"):
         compared(replace(short, budget=Budget(None, 11)))
     other = shutil.copytree(spec.capture, tmp_path / "other")

@@ -43,8 +43,8 @@ def curve_of(job) -> list[dict]:
 
 def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     job = make_job()
-    told: list[tuple[str, float]] = []
-    result = job.run(lambda stage, share, text: told.append((stage, share)))
+    reported: list[tuple[str, float]] = []
+    result = job.run(lambda stage, share, text: reported.append((stage, share)))
     assert result == json.loads((job.folder / "job.json").read_text())
     assert result["schema"] == "neeco-job/1"
     assert (result["name"], result["method"], result["seed"], result["iterations"]) == ("3dgs", "3dgs", 0, 12)
@@ -56,7 +56,7 @@ def test_a_job_leaves_a_run_its_curve_and_its_numbers(make_job) -> None:
     assert result["splits"]["test"]["frames"] == 2
     assert 5 < result["splits"]["test"]["psnr"] < 60
     assert result["splits"]["test"]["lpips"] is None
-    assert {"training", "evaluating"} <= {stage for stage, _ in told}
+    assert {"training", "evaluating"} <= {stage for stage, _ in reported}
     assert {"config.yaml", "scene.safetensors", "evaluation.json"} <= {path.name for path in job.folder.iterdir()}
     rows = curve_of(job)
     assert {row["split"] for row in rows} == {"test", "unseen"}
@@ -112,7 +112,7 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "change", "reported"),
     [
         ("job.json", {"splits": {"test": {"psnr": "good"}}}, "splits: test: psnr: is not as neeco writes it"),
         ("job.json", {"budget": None}, "budget: is not as neeco writes it"),
@@ -121,18 +121,18 @@ def test_an_interrupted_job_goes_on_to_the_same_scene_and_numbers(
         ("begun.json", {"budget": {"minutes": None, "iterations": None, "clock": "wall"}}, "budget: give minutes or"),
     ],
 )
-def test_a_damaged_job_is_told_by_file_and_field(name: str, change: dict, told: str, make_job) -> None:
+def test_a_damaged_job_is_reported_by_file_and_field(name: str, change: dict, reported: str, make_job) -> None:
     job = make_job()
     job.run()
     file = job.folder / name
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     if name == "begun.json":
         (job.folder / "job.json").unlink()
-    with pytest.raises(NeecoError, match=f"{name}: {told}.*remove that run's folder"):
+    with pytest.raises(NeecoError, match=f"{name}: {reported}.*remove that run's folder"):
         job.run()
 
 
-def test_a_damaged_curve_is_told_by_its_line(make_job) -> None:
+def test_a_damaged_curve_is_reported_by_its_line(make_job) -> None:
     job = make_job()
     job.run()
     (job.folder / "job.json").unlink()
@@ -208,13 +208,13 @@ def test_one_failing_job_leaves_the_others_alone(make_job, monkeypatch: pytest.M
         return step(session)
 
     monkeypatch.setattr(GaussianSession, "step", diverging)
-    told: list[str] = []
-    results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda news: told.append(news.stage))
+    reported: list[str] = []
+    results = run_jobs([make_job(seed=seed) for seed in (0, 1, 2)], progress=lambda event: reported.append(event.stage))
     assert [("error" in result) for result in results] == [False, True, False]
     assert "loss became nan" in results[1]["error"]
     assert results[1]["splits"] == {}
     assert not (make_job(seed=1).folder / "job.json").exists()
-    assert [stage for stage in told if stage in ("done", "failed")] == ["done", "failed", "done"]
+    assert [stage for stage in reported if stage in ("done", "failed")] == ["done", "failed", "done"]
 
 
 def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,7 +231,7 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"budget": Budget(None, 13)}, "budget: this run has 12 iterations, not 13 iterations"),
         (
@@ -244,10 +244,10 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
         ),
     ],
 )
-def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, told, monkeypatch) -> None:
+def test_a_folder_of_another_job_is_refused_before_any_work(make_job, changes, reported, monkeypatch) -> None:
     make_job().run()
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained"))
-    with pytest.raises(NeecoError, match=f"{told}; give another --output"):
+    with pytest.raises(NeecoError, match=f"{reported}; give another --output"):
         run_jobs([make_job(seed=1), make_job(**changes)])
 
 
@@ -259,7 +259,7 @@ def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("budget", "told"),
+    ("budget", "reported"),
     [
         (Budget(None, None), "give minutes or iterations"),
         (Budget(1.0, 5), "one of them"),
@@ -269,8 +269,8 @@ def test_a_run_of_another_capture_is_refused(make_job, tmp_path) -> None:
         (Budget(1.0, None, "sun"), "clock 'sun' is unknown"),  # type: ignore[arg-type]
     ],
 )
-def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, told: str, make_job) -> None:
-    with pytest.raises(NeecoError, match=told):
+def test_budgets_that_cannot_be_spent_are_refused(budget: Budget, reported: str, make_job) -> None:
+    with pytest.raises(NeecoError, match=reported):
         run_jobs([make_job(budget=budget)])
 
 
@@ -280,7 +280,7 @@ def test_several_workers_without_ray_are_refused_with_the_remedy(make_job, monke
         run_jobs([make_job()], workers=2)
 
 
-def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -> None:
+def test_a_cluster_that_does_not_answer_is_reported_at_once(make_job, monkeypatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
     monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: object())
@@ -290,21 +290,21 @@ def test_a_cluster_that_does_not_answer_is_told_at_once(make_job, monkeypatch) -
 
 
 @pytest.mark.parametrize(
-    ("workers", "device", "told"),
+    ("workers", "device", "reported"),
     [
         (3, "cuda", r"--workers: 3 for 2 GPU\(s\); give at most 2"),
         (2, "cuda:1", "each has a GPU of its own"),
         (2, "cuda", ""),
     ],
 )
-def test_workers_have_a_gpu_each(workers: int, device: str, told: str, monkeypatch) -> None:
+def test_workers_have_a_gpu_each(workers: int, device: str, reported: str, monkeypatch) -> None:
     monkeypatch.setattr(study, "require_ray", lambda: None)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     check_workers(workers, torch.device("cpu"))
     check_workers(1, torch.device(device))
-    if told:
-        with pytest.raises(NeecoError, match=told):
+    if reported:
+        with pytest.raises(NeecoError, match=reported):
             check_workers(workers, torch.device(device))
     else:
         check_workers(workers, torch.device(device))

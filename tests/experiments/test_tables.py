@@ -73,7 +73,7 @@ def test_equal_means_are_both_best_and_lower_lpips_is_better(comparison) -> None
     assert own.rows[0].cells[1].text == "1.00"  # 60 s in minutes
 
 
-def test_markdown_escapes_names_and_tells_failures(comparison) -> None:
+def test_markdown_escapes_names_and_reports_failures(comparison) -> None:
     page = table_texts(comparison)["md"]
     assert "| a\\_b | **21.00** ± 1.41 | **0.100** ± 0.000 |" in page
     assert "| c\\|d | **21.00** ± 0.71 | 0.200 ± 0.000 |" in page

@@ -203,11 +203,11 @@ def test_sentences_call_first_only_what_is_clear_of_the_spread():
 
 
 def test_sentences_go_split_by_split(comparison):
-    told = findings(comparison)
-    assert [split for split, _ in told] == ["test", "unseen", "", ""]
-    assert told[0][1].startswith("kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
-    assert told[1][1].startswith("kinematic first")
-    assert "level in drawing speed" in told[2][1]
+    reported = findings(comparison)
+    assert [split for split, _ in reported] == ["test", "unseen", "", ""]
+    assert reported[0][1].startswith("kinematic first in PSNR, 24.20 dB, 4.15 dB before 3dgs")
+    assert reported[1][1].startswith("kinematic first")
+    assert "level in drawing speed" in reported[2][1]
 
 
 def test_one_seed_is_said_once(comparison):
@@ -216,9 +216,9 @@ def test_one_seed_is_said_once(comparison):
         for value in row.values():
             if isinstance(value, dict) and value.get("std") is not None:
                 value["std"] = None
-    told = findings(comparison)
-    assert sum("one seed" in sentence for _, sentence in told) == 1
-    assert "not known" not in told[0][1]
+    reported = findings(comparison)
+    assert sum("one seed" in sentence for _, sentence in reported) == 1
+    assert "not known" not in reported[0][1]
 
 
 def test_charts_tell_methods_apart_without_colour():

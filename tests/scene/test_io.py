@@ -93,11 +93,11 @@ def test_another_schema_is_refused_by_name(kinematic: Scene, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("grey", [1e300, -0.5, float("nan")])
-def test_a_background_that_is_no_grey_is_refused(kinematic: Scene, tmp_path: Path, grey: float) -> None:
+def test_a_background_that_is_not_grey_is_refused(kinematic: Scene, tmp_path: Path, grey: float) -> None:
     path = tmp_path / "scene.safetensors"
     save_scene(kinematic, path)
     rewrite(path, lambda header: header.update(background=grey))
-    with pytest.raises(NeecoError, match=r"scene.safetensors: .*its background is .*, which is no grey"):
+    with pytest.raises(NeecoError, match=r"scene.safetensors: .*its background is .*, not a grey"):
         load_scene(path)
 
 
@@ -172,9 +172,9 @@ def test_no_file_is_no_scene(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tensor", "value", "told"),
     [
-        ("recorded.cameras", 0.0, "the recorded pose of camera in frame 0 is no rigid transform"),
-        ("recorded.cameras", float("nan"), "the recorded pose of camera in frame 0 is no rigid transform"),
-        ("recorded.poses", 7.0, "the recorded pose of grasper in frame 0 is no rigid transform"),
+        ("recorded.cameras", 0.0, "the recorded pose of camera in frame 0 is not a rigid transform"),
+        ("recorded.cameras", float("nan"), "the recorded pose of camera in frame 0 is not a rigid transform"),
+        ("recorded.poses", 7.0, "the recorded pose of grasper in frame 0 is not a rigid transform"),
     ],
 )
 def test_recorded_poses_that_are_none_are_refused(
@@ -197,9 +197,9 @@ def test_a_header_built_otherwise_is_refused(change: dict[str, object], any_scen
         load_scene(tmp_path / "scene.safetensors")
 
 
-def test_half_a_character_is_refused(kinematic: Scene, tmp_path: Path) -> None:
+def test_an_unpaired_surrogate_is_refused(kinematic: Scene, tmp_path: Path) -> None:
     tensors, header = pack_scene(kinematic)
     header["diagnostics"] = {"note": "\ud800"}
     save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
-    with pytest.raises(NeecoError, match=r"damaged scene .*half a character"):
+    with pytest.raises(NeecoError, match=r"damaged scene .*unpaired surrogate"):
         load_scene(tmp_path / "scene.safetensors")

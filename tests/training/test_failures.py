@@ -44,7 +44,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
 ) -> None:
     whole = train(capture, tmp_path / "whole", CONFIG)
     words = ["train", str(capture), "--output", str(tmp_path / "cut"), "--method", "3dgs", "--iterations", "60"]
-    words += ["--set", "density_start=10", "--set", "density_stop=0.9"]
+    words += [word for setting in SHORT for word in ("--set", setting)]
     with monkeypatch.context() as patched:
         real, left = os.fsync, iter(range(whole_files))
 

@@ -60,6 +60,10 @@ def test_two_hundred_steps_agree(method: str, tmp_path: Path) -> None:
     native, plain = losses["native"], losses["torch"]
     assert sizes["native"] == sizes["torch"]
     if METHODS[method].has_gaussians:
-        assert float((plain - native).abs().max()) < 1e-4
+        apart = (plain - native).abs()
+        # a loss of order 1 is a sum and product of some hundred float32 numbers, each rounded to 2**-24
+        assert float(apart[:50].max()) < 256 * 2**-24
+        # steps amplify differences: 27 times, where the most was measured
+        assert float(apart.max()) < 256 * 2**-24 * 100
     assert float(plain[-20:].mean()) == pytest.approx(float(native[-20:].mean()), rel=5e-3)
     assert float(native[-20:].mean()) < 0.97 * float(native[:20].mean())  # and they learn

@@ -1,6 +1,6 @@
 """How well masks agree: intersection over union, Dice, and the same per part; contours; boxes.
 
-Boundary F and box AP are our own on purpose: DAVIS's contours to the pixel, and an AP of boxes without confidence.
+Boundary F is computed on the contours of DAVIS, to the pixel; box AP is that of boxes without confidence.
 """
 
 from __future__ import annotations

@@ -61,10 +61,10 @@ from neeco.training.schedule import MIN_RESET_INTERVAL
 
 SCHEMA = "neeco-ablation/1"
 LABELS_FILE = "label_ways.json"
-REST_STEPS = 100  # of the network, where its usual share of a short run is less: an empty image throws it out of sight
-LONGEST_REST = 0.25  # of the run
+MIN_WARM_UP_STEPS = 100  # with the network off: trained on a nearly empty image it moves Gaussians out of sight
+MAX_WARM_UP = 0.25  # share of the run
 INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
-KINEMATIC_LEAST = 1_000  # steps: the shaft starts to spin and hinges to learn after 600
+MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and hinges to learn after 600
 EVEN_DB = 0.1  # smaller differences do not count as a direction
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
 HEADINGS = {
@@ -207,7 +207,7 @@ def _steps(plan: AblationPlan, method: str) -> int:
     """Iterations of a run of `method`."""
     if method == "neeco":
         return plan.iterations
-    return plan.kinematic_iterations or max(KINEMATIC_LEAST, plan.iterations)
+    return plan.kinematic_iterations or max(MIN_KINEMATIC_STEPS, plan.iterations)
 
 
 def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
@@ -227,13 +227,13 @@ def _job(plan: AblationPlan, variant: Variant) -> TrainingJob:
 
 
 def _paper_settings(iterations: int) -> tuple[str, ...]:
-    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network rests for its usual
-    share of the run or REST_STEPS, whichever is longer."""
-    rest = max(method_settings("neeco", {}).warm_up, min(LONGEST_REST, REST_STEPS / iterations))
+    """The paper's schedule is stated for its own 20,000 steps and scaled to the run. The network is off for its
+    usual share of the run or MIN_WARM_UP_STEPS, whichever is longer."""
+    warm_up = max(method_settings("neeco", {}).warm_up, min(MAX_WARM_UP, MIN_WARM_UP_STEPS / iterations))
     return (
         f"schedule.published_steps={PUBLISHED_STEPS}",
         f"schedule.earliest={PHASE_1_STEPS}",
-        f"deformation.warm_up={round(rest, 4)}",
+        f"deformation.warm_up={round(warm_up, 4)}",
     )
 
 
@@ -257,10 +257,10 @@ def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
             f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
             "density control ends half-way), so P_oi changes nothing here"
         )
-    if method == "kinematic" and steps < KINEMATIC_LEAST:
+    if method == "kinematic" and steps < MIN_KINEMATIC_STEPS:
         notes.append(
             f"kinematic: {steps} steps are few: hinges begin to learn and the shaft to spin after 600, labels to "
-            f"sharpen after 1,000; give --kinematic-iterations {KINEMATIC_LEAST} or more"
+            f"sharpen after 1,000; give --kinematic-iterations {MIN_KINEMATIC_STEPS} or more"
         )
     return notes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -223,6 +223,15 @@ def compare(
         write_json(file, plain(result))
         write_files(spec.output, "comparison", table_texts(result), data_files(result))
     return result
+
+
+def read_comparison(folder: Path) -> ComparisonResult:
+    """What comparison.json in `folder` holds. Raises NeecoError when it is no comparison of this version."""
+    file, names = folder / COMPARISON_FILE, [field.name for field in fields(ComparisonResult)]
+    stored = read_json(file)
+    if not isinstance(stored, dict) or stored.get("schema") != COMPARISON_SCHEMA or not stored.keys() >= set(names):
+        raise NeecoError(f"{file}: is no {COMPARISON_SCHEMA}; compare again")
+    return ComparisonResult(**{name: stored[name] for name in names})
 
 
 def job_folder(output: Path, name: str, seed: int) -> Path:

@@ -24,7 +24,7 @@ from neeco.training.run import Run, open_run
 
 NAMED_SCORES = ("iou", "challenge_iou", "dice", "boundary_f", "box_ap")  # of the whole instrument
 Row = dict[str, Any]
-LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and split; None where it cannot be told
+LabelScores = dict[str, dict[str, float | None]]  # mask IoU by label way and split; None where it is not known
 
 
 def splits_with_truth(capture: Capture, splits: Sequence[str]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ A study is a list of jobs (`Job`), each with a folder of its own, and one JSON f
   the JSON file after each job. A job that fails does not stop the others: its result has an "error".
 - `spread` is mean, standard deviation and count over repetitions (seeds, folds).
 
-Results become tables in `neeco.experiments.tables` and a page in `neeco.report.study_page`.
+Results become tables in `neeco.experiments.tables` and a page in `neeco.report.study_pages`.
 """
 
 from __future__ import annotations

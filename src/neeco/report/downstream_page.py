@@ -1,342 +1,347 @@
-"""The one-page report of a downstream experiment: do drawn images teach what recorded frames ask?"""
+"""The one-page report of a downstream study: do synthetic images teach a model what recorded frames ask of it?"""
 
 from __future__ import annotations
 
 import json
-import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+
 from neeco.capture.model import Capture
-from neeco.evaluation.image_metrics import PART_COLORS
 from neeco.evaluation.mask_metrics import mean_of
-from neeco.experiments.downstream.job import default_conditions
+from neeco.experiments.downstream.job import AUGMENT, REAL
 from neeco.experiments.downstream.results import (
     CONFIDENCE,
-    KEYS,
+    HELPS,
+    HURTS,
     MAIN,
+    NONE_SHOWN,
+    TITLES,
     VERDICTS,
+    arms_of,
     budget_text,
     data_files,
-    equivalent,
+    differences_table,
     failed_jobs,
-    real_curve,
+    findings_of,
+    main_differences,
+    models_and_splits,
     scores_by_fold,
+    scores_table,
     summary_text,
-    tables_of,
+    title_of,
     verdict,
 )
-from neeco.experiments.machine import hardware_words
-from neeco.experiments.tables import Table, csv_text
+from neeco.experiments.machine import machine_words
 from neeco.files import write_text
-from neeco.report.downstream_figures import (
-    course_charts,
-    differences,
-    line_key,
-    question,
-    score_chart,
-    signed,
-    with_labelled,
-)
-from neeco.report.downstream_shots import Gallery, galleries
+from neeco.report.charts import PALETTE, Level, Series, inline_svg, legend, line_chart, new_axes, page_style
+from neeco.report.downstream_examples import example_sections
 from neeco.report.page import REPORT_FILE, split_counts, write_page
+from neeco.report.study_pages import Figure, Section
 
-FAILED = "failed: "  # how notes on failed trainings begin; they are listed by themselves
-CHANCE = round(1 / (1 - CONFIDENCE))  # of so many comparisons that differ in nothing, one is called a difference
+FALSE_POSITIVES = round(1 / (1 - CONFIDENCE))  # of so many comparisons without a difference, one shows one
+QUESTIONS = {  # what a paired difference answers, as `question` finds it
+    "beside": "synthetic images beside labelled frames, against these frames alone",
+    "augmented": "the same, against these frames with classical augmentation",
+    "alone": "synthetic images alone, against the most labelled frames alone",
+    "sets": "one set against another",
+    "use": "one way of using a set against the plain one",
+    "augmentation": "classical augmentation against none",
+}
+MAX_REACH = 3.0  # times the largest difference that an interval is shown to: those of two folds would hide the rest
 
 Experiment = Mapping[str, Any]
+Row = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Glance:
-    """Whether drawn images beside labelled frames help: a line per model, split and condition, a cell per count.
+def write_downstream_report(output: Path, experiment: Experiment, capture: Capture) -> Path:
+    """Write `report.html` and `data/*.csv` into `output`, the folder of a downstream study, and return the page's path.
 
-    A cell: difference, verdict, and as good as how many labelled frames alone that is. `judged`: any has a verdict.
+    experiment: what `run_downstream` returned; predictions are read from `output`. Raises NeecoError when a picture
+    cannot be read or the page not be written.
     """
-
-    counts: tuple[int, ...]
-    rows: tuple[tuple[str, str, str, tuple[tuple[str, str, str], ...]], ...]  # model, split, condition, cells
-    judged: bool
-
-
-def write_downstream_report(output: Path, experiment: dict[str, Any], capture: Capture) -> Path:
-    """Write `report.html` and `data/*.csv` into `output`, the folder of a downstream experiment; the page's path.
-
-    experiment: what `run_downstream` returned; what was answered is taken from `output`. Raises NeecoError when a
-    picture cannot be read or the page not be written.
-    """
-    shown = galleries(experiment, capture, output)
-    files = {"summary.csv": summary_text(experiment), "shots.csv": _shots_csv(shown), **data_files(experiment)}
+    images, examples = example_sections(experiment, capture, output)
+    files = {"summary.csv": summary_text(experiment), "examples.csv": examples, **data_files(experiment)}
     for name, text in files.items():
         write_text(output / "data" / name, text)
-    charts = [score_chart(experiment, model, split) for model, split in _models_and_splits(experiment)]
-    level, headline = _headline(experiment)
+    models = " and ".join(model["name"] for model in experiment["models"])
+    from_scratch = not any(model["weights"] for model in experiment["models"])
+    intro = (
+        f"{models} trained{' from scratch' if from_scratch else ''} on recorded frames that somebody labelled, on "
+        f"synthetic images, and on both, always in as many steps; tested on {_tested(experiment, capture)}, recorded, "
+        "which no training saw."
+    )
+    failed = failed_jobs(experiment)
+    notes = [note for note in experiment["notes"] if not note.startswith("failed: ")]  # which stand apart
+    lists = [Section(title=title, notes=lines) for title, lines in (("What failed", failed), ("Notes", notes)) if lines]
+    made = Section(title="How it was made", facts=_facts(experiment, capture), listings=_set_listings(experiment))
     return write_page(
         output / REPORT_FILE,
-        "downstream.html",
-        title=f"{capture.root.name}: what drawn images teach",
+        "study.html",
+        title=f"{capture.root.name}: what synthetic images are worth",
         name=capture.root.name,
-        subtitle="what drawn images teach",
+        subtitle="what synthetic images are worth",
         version=experiment["version"],
-        stamps=[machine_words(experiment)],
-        models=" and ".join(model["name"] for model in experiment["models"]),
-        scratch=not any(model["weights"] for model in experiment["models"]),
-        tested=_tested(experiment, capture),
-        complete=experiment["complete"],
-        level=level,
-        headline=headline,
-        glance=_glance(experiment),
-        answers=_answers(experiment),
-        chance=CHANCE,
-        charts=[chart for chart in charts if chart],
-        key=line_key(experiment),
-        course_key=line_key(experiment, alone=True),
-        differences=[
-            found for model, split in _models_and_splits(experiment) if (found := differences(experiment, model, split))
-        ],
-        tables=_tables(experiment),
-        galleries=shown,
-        tints=[(_color(k), name) for k, name in enumerate(experiment["classes"])],
-        courses=[chart for model in experiment["models"] for chart in course_charts(experiment, model)],
-        trainings=_trainings(experiment),
-        inputs=budget_text(experiment),
-        held_back=experiment["held_back_every"],
-        notes=[note for note in experiment["notes"] if not note.startswith(FAILED)],
-        failed=failed_jobs(experiment),
-        files=files,
-        facts=_facts(experiment, capture),
-        settings=_settings(experiment),
+        stamps=[machine_words(experiment["machine"], "torch_threads")],
+        intro=[intro],
+        findings=[*(("", line) for line in _headlines(experiment, failed)), *_findings(experiment)],
+        sections=[*_results(experiment, files), *images, *_trainings(experiment, files), *lists, made],
     )
 
 
-def _models_and_splits(experiment: Experiment) -> list[tuple[Mapping[str, Any], str]]:
-    return [(model, split) for model in experiment["models"] for split in experiment["splits"]]
+def question(row: Row, experiment: Experiment) -> str:
+    """Which of QUESTIONS a paired difference answers."""
+    names = {entry["name"] for entry in experiment["sets"]}
+    words, others = row["condition"].split("+"), row["against"].split("+")
+    synthetic, reference = ([word for word in some if word in names] for some in (words, others))
+    if not synthetic:
+        return "augmentation"
+    if reference:
+        return "use" if synthetic == reference else "sets"
+    if REAL not in words:
+        return "alone"
+    return "augmented" if AUGMENT in others else "beside"
 
 
-def _color(index: int) -> str:
-    red, green, blue = PART_COLORS[index % len(PART_COLORS)].astype(int)
-    return f"#{red:02x}{green:02x}{blue:02x}"
+def _headlines(experiment: Experiment, failed: Sequence[str]) -> list[str]:
+    """Whether synthetic images beside labelled frames help, over all differences to these alone; what is missing."""
+    sentences = [] if experiment["complete"] else ["Not all trainings are finished: these are the numbers so far."]
+    rows = [row for pair in models_and_splits(experiment) for row in main_differences(experiment, *pair)]
+    counts = Counter(verdict(row) for row in rows if question(row, experiment) == "beside")
+    if not counts:
+        sentences.append("No condition has synthetic images beside labelled frames to compare with these frames alone.")
+    elif set(counts) == {""}:
+        sentences.append("One fold: whether synthetic images help cannot be told from chance; give --folds 5.")
+    else:
+        verbs = {HELPS: "help", HURTS: "hurt", NONE_SHOWN: "show no difference"}
+        parts = [f"{verb} in {counts[word]}" for word, verb in verbs.items() if counts[word]]
+        kind = {(True, False): "yes", (False, True): "no"}.get((counts[HELPS] > 0, counts[HURTS] > 0), "")
+        sentence = "Beside the same labelled frames, synthetic images {} of {} comparisons."
+        text = Markup(f'<b class="{{}}">{sentence}</b>').format(kind, ", ".join(parts), sum(counts.values()))
+        sentences.append(text)
+    if failed:
+        sentences.append(f"{len(failed)} training{'s' if len(failed) > 1 else ''} failed; they are listed below.")
+    return sentences
 
 
-def _beside(experiment: Experiment) -> list[Mapping[str, Any]]:
-    """The differences that the experiment is about: drawn images beside labelled frames against these alone."""
-    metrics = {model["name"]: MAIN[model["answers"]] for model in experiment["models"]}
-    return [
-        row
-        for row in experiment["paired"]
-        if row["metric"] == metrics.get(row["model"]) and question(row, experiment) == "beside"
-    ]
+def _findings(experiment: Experiment) -> list[tuple[str, Markup]]:
+    """(model and split, sentence) of all that the numbers say, verdicts in their colours."""
+    found = []
+    for model, split in models_and_splits(experiment):
+        for sentence in findings_of(experiment, model, split):
+            text = escape(sentence)
+            for word in VERDICTS:
+                kind = {HELPS: "yes", HURTS: "no"}.get(word, "soft")
+                colored = Markup('; <b class="{}">{}</b> against').format(kind, word)
+                text = text.replace(Markup(f"; {word} against"), colored)
+            found.append((f"{model['name']}, {split}", text))
+    return found
 
 
-def _headline(experiment: Experiment) -> tuple[str, str]:
-    """(good, careful or bad; one sentence) of all differences together."""
-    rows = _beside(experiment)
-    if not rows:
-        return "careful", "No condition has drawn images beside labelled frames to hold against these frames alone."
-    found = [verdict(row) for row in rows]
-    helps, hurts, none_shown = (found.count(word) for word in VERDICTS)
-    if helps + hurts + none_shown == 0:
-        return "careful", "One fold: whether drawn images help cannot be told from chance; give --folds 5."
-    what = "Beside the same labelled frames"
-    if len(rows) == helps:
-        return "good", f"{what}, drawn images help in {_all(helps)}."
-    if len(rows) == hurts:
-        return "bad", f"{what}, drawn images hurt in {_all(hurts)}."
-    parts = [f"help in {helps}"] if helps else []
-    parts += [f"hurt in {hurts}"] if hurts else []
-    parts += [f"show no difference in {none_shown}"] if none_shown else []
-    told = f"{what}, drawn images {_listed(parts)} of {len(rows)} comparisons."
-    return ("good" if helps and not hurts else "bad" if hurts and not helps else "careful"), told
+def _family(condition: str) -> str:
+    """A set alone and beside labelled frames are of one family, and share a colour."""
+    return "+".join(sorted(word for word in condition.split("+") if word != REAL))
 
 
-def _all(count: int) -> str:
-    return "the only comparison" if count == 1 else f"all {count} comparisons"
+def families(experiment: Experiment) -> list[str]:
+    """A condition of each family, in their order: the one with labelled frames where there is one."""
+    found: dict[str, str] = {}
+    for condition in dict.fromkeys(job["condition"] for job in experiment["jobs"]):
+        key = _family(condition)
+        found[key] = condition if key not in found or REAL in condition.split("+") else found[key]
+    return list(found.values())
 
 
-def _listed(parts: Sequence[str]) -> str:
-    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)
+def _order(condition: str, experiment: Experiment) -> int:
+    return [_family(name) for name in families(experiment)].index(_family(condition))
 
 
-def _glance(experiment: Experiment) -> Glance:
-    rows = _beside(experiment)
-    counts = tuple(sorted({row["real"] for row in rows}))
-    lines: dict[tuple[str, str, str], dict[int, tuple[str, str, str]]] = {}
-    for row in rows:
-        key = row["model"], row["split"], row["condition"]
-        cell = signed(row["difference"]), verdict(row), _as_many(row, experiment)
-        lines.setdefault(key, {})[row["real"]] = cell
-    order = [(model["name"], split) for model, split in _models_and_splits(experiment)]
-    made = [
-        (*key, tuple(cells.get(count, ("–", "", "")) for count in counts))
-        for key, cells in sorted(lines.items(), key=lambda line: order.index(line[0][:2]))
-    ]
-    return Glance(counts, tuple(made), any(verdict(row) for row in rows))
+def _results(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
+    """For every model and split its scores, as a table and over labelled frames, and their differences."""
+    known = families(experiment)
+    key = legend(known, [name for name in known if REAL in name.split("+")])
+    sections = []
+    for model, split in models_and_splits(experiment):
+        scores, differences = scores_table(experiment, model, split), differences_table(experiment, model, split)
+        figures = [Figure(chart, key)] if (chart := score_chart(experiment, model, split)) else []
+        if differences.rows:
+            figures.append(Figure(difference_chart(experiment, model, split), []))
+        title = f"{model['name']}, {split}"
+        sections.append(Section(title=title, split=split, level=3, results=scores, figures=figures))
+        if differences.rows:
+            sections.append(Section(title=differences.title, level=3, results=differences))
+    text = (
+        "Scores: mean ± standard deviation over folds; the best is bold. Curves: bold the mean over folds, thin each "
+        "fold, dashed from side to side a set alone, without any labelled frame, in the colour it has beside labelled "
+        "frames. Differences are of the same folds, with the interval that holds their mean with 95 % confidence "
+        "(Student's t over folds): one that reaches 0 shows no difference, green is better than its reference, red is "
+        f"worse. Of {FALSE_POSITIVES} comparisons that differ in nothing about one is called a difference all the same."
+    )
+    listed = ("summary.csv", "scores.csv", "paired.csv", "frames.csv", "jobs.csv")
+    return [Section(title="Results", text=text, files={name: files[name] for name in listed}), *sections]
 
 
-def _as_many(row: Mapping[str, Any], experiment: Experiment) -> str:
-    """`as good as about 55`: how many labelled frames alone do as well as the first of a difference, over the folds
-    that all of these finished; "" where that cannot be read: of one number of frames only, or scores all 0."""
-    scores = scores_by_fold(experiment["jobs"], row["model"], row["split"], row["metric"])
-    key = row["condition"], row["real"]
-    curve = real_curve(scores, key)
-    if len(curve) < 2 or not any(score for _, score in curve):
-        return ""
-    return equivalent(curve, mean_of(list(scores[key].values())))
+def score_chart(experiment: Experiment, model: Row, split: str) -> str:
+    """The main score over the number of labelled frames; sets alone are levels."""
+    metric = MAIN[model["answers"]]
+    scores = scores_by_fold(experiment["jobs"], model["name"], split, metric)
+    series, levels = [], []
+    for condition in sorted(dict.fromkeys(name for name, _ in scores), key=lambda name: _order(name, experiment)):
+        counts = {float(real): folds for (name, real), folds in sorted(scores.items()) if name == condition}
+        means = tuple((count, mean_of(list(folds.values()))) for count, folds in counts.items())
+        order = _order(condition, experiment)
+        if REAL not in condition.split("+"):
+            levels.append(Level(condition, order, means[0][1]))
+            continue
+        numbers = sorted({fold for folds in counts.values() for fold in folds})
+        lines = [tuple((count, folds[fold]) for count, folds in counts.items() if fold in folds) for fold in numbers]
+        faint = tuple(line for line in lines if len(line) > 1) if len(lines) > 1 else ()
+        series.append(Series(condition, order, means, faint, means))
+    title = f"{TITLES[metric]}: {model['name']}, {split}"
+    return line_chart(title, "labelled frames", series, levels=levels, over_logarithmic=True)
 
 
-def _answers(experiment: Experiment) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
-    """(model, split, its sentences); a sentence as (before, the verdict in it or "", after)."""
-    left = list(experiment["answers"])
-    groups = []
-    for model, split in _models_and_splits(experiment):
-        prefix = f"{model['name']}, {split}: "
-        own = [sentence for sentence in left if sentence.startswith(prefix)]
-        left = [sentence for sentence in left if not sentence.startswith(prefix)]
-        if own:
-            groups.append((model["name"], split, [_cut(sentence.removeprefix(prefix)) for sentence in own]))
-    return [*groups, *([("", "", [_cut(sentence) for sentence in left])] if left else [])]
+@page_style()
+def difference_chart(experiment: Experiment, model: Row, split: str) -> Markup:
+    """Every paired difference with its interval, by the question it answers; arrows where an interval goes on."""
+    rows = main_differences(experiment, model, split)
+    ends = [abs(row[end]) for row in rows for end in ("difference", "low", "high") if row[end] is not None]
+    reach = min(max(ends), MAX_REACH * max(abs(row["difference"]) for row in rows)) or 1.0
+    groups = {key: [row for row in rows if question(row, experiment) == key] for key in QUESTIONS}
+    lines = [(key, row) for key, some in groups.items() if some for row in (None, *some)]
+    axes = new_axes((560, 45 + 20 * len(lines)), 300, 20, 5, 40)
+    axes.set(xlim=(-reach, reach), ylim=(len(lines) - 0.5, -0.5), yticks=[])
+    axes.set_xlabel(f"difference of {TITLES[MAIN[model['answers']]]}")
+    for y, (key, row) in enumerate(lines):
+        name, color = QUESTIONS[key], "accent"
+        if row is not None:
+            reference = f" − {row['against']}" if key in ("sets", "use") else ""
+            name = (title_of(row["condition"], row["real"]) + reference)[:45]
+            color = {HELPS: "good", HURTS: "bad"}.get(verdict(row), "soft")
+            _draw_interval(axes, y, row, reach, PALETTE[color])
+        place = axes.get_yaxis_transform()
+        axes.annotate(name, (0, y), (-290, 0), place, "offset points", va="center", color=PALETTE[color])
+    return inline_svg(axes, f"differences of {model['name']} on {split}")
 
 
-def _cut(sentence: str) -> tuple[str, str, str]:
-    """A sentence cut about its first verdict."""
-    places = {sentence.find(f"; {word} against "): word for word in VERDICTS}
-    found = min((place for place in places if place >= 0), default=None)
-    if found is None:
-        return sentence, "", ""
-    start = found + len("; ")
-    return sentence[:start], places[found], sentence[start + len(places[found]) :]
+def _draw_interval(axes: Axes, y: float, row: Row, reach: float, color: str) -> None:
+    axes.plot([0, 0], [y - 0.5, y + 0.5], color=PALETTE["edge"], linewidth=1)
+    if row["low"] is not None:
+        low, high = np.clip([row["low"], row["high"]], -reach, reach)
+        axes.plot([low, high], [y, y], color=color, linewidth=2)
+        axes.plot(low, y, color=color, marker="|" if low == row["low"] else "<", markersize=7)
+        axes.plot(high, y, color=color, marker="|" if high == row["high"] else ">", markersize=7)
+    axes.plot(row["difference"], y, color=color, marker="o", markersize=6)
 
 
-def _tables(experiment: Experiment) -> list[tuple[str, str, Table]]:
-    """(title, split, table) of the scores; differences have a figure of their own."""
-    splits = {f"{model['name']}, split {split}": split for model, split in _models_and_splits(experiment)}
-    return [(table.title, splits.get(table.title, ""), table) for table in tables_of(experiment) if table.keys == KEYS]
-
-
-def _trainings(experiment: Experiment) -> list[list[str]]:
-    """Rows of the table of trainings: a line per model, condition and count, means over folds."""
+def _trainings(experiment: Experiment, files: Mapping[str, str]) -> list[Section]:
+    """How trainings went: validation curves, and a line per arm, means over folds."""
     done = [job for job in experiment["jobs"] if "error" not in job]
     rows = []
-    for model, condition, real in dict.fromkeys((job["model"], job["condition"], job["real"]) for job in done):
-        same = [job for job in done if (job["model"], job["condition"], job["real"]) == (model, condition, real)]
+    for arm in arms_of(done):
+        same = [job for job in done if (job["model"], job["condition"], job["real"]) == arm]
         width, height = same[0]["input"]
-        learning = sum(job["still_learning"] for job in same)
         rows.append(
             [
-                f"{model}, {condition}",
-                f"{real:,}" if real else "none",
+                f"{arm.model}, {arm.condition}",
+                f"{arm.real:,}" if arm.real else "none",
                 f"{same[0]['iterations']:,}",
                 f"{width}x{height}",
                 str(same[0]["batch"]),
                 f"{mean_of([job['best_step'] for job in same]):,.0f}",
-                f"{learning} of {len(same)}",
-                f"{mean_of([job['seconds'] for job in same]):,.0f}",
-                f"{mean_of([job['processor_seconds'] for job in same]):,.0f}",
+                f"{sum(job['still_learning'] for job in same)} of {len(same)}",
+                *(f"{mean_of([job[key] for job in same]):,.0f}" for key in ("seconds", "processor_seconds")),
             ]
         )
-    return rows
+    if not rows:
+        return []
+    head = [
+        "model, trained on",
+        "labelled frames",
+        "steps",
+        "input",
+        "batch",
+        "best step",
+        "still rising",
+        "s",
+        "CPU s",
+    ]
+    charts = [chart for model in experiment["models"] for chart in validation_charts(experiment, model)]
+    text = (
+        f"{budget_text(experiment)}. Each keeps the weights that scored best on held-out images, one in "
+        f"{experiment['held_back_every']} of what it learns from; where none can be held out, the last."
+    )
+    if charts:
+        text += (
+            " The curves are scores on these images over steps, of the first fold. The images differ between "
+            "conditions: read a curve by its shape. A set alone has the colour that it has beside labelled frames."
+        )
+    key = legend(families(experiment), families(experiment))
+    figures = [Figure(chart, key) for chart in charts]
+    listed = {"validation.csv": files["validation.csv"]}
+    return [Section(title="Training", text=text, head=head, rows=rows, figures=figures, files=listed)]
+
+
+def validation_charts(experiment: Experiment, model: Row) -> list[str]:
+    """Validation score over steps, a chart per number of labelled frames; of the first fold that finished."""
+    done = [job for job in experiment["jobs"] if job["model"] == model["name"] and "error" not in job]
+    charts = []
+    for real in sorted({job["real"] for job in done}):
+        first: dict[str, Row] = {}
+        for job in sorted(done, key=lambda job: job["fold"]):
+            if job["real"] == real:
+                first.setdefault(job["condition"], job)
+        series = [
+            Series("", _order(name, experiment), tuple((float(step), score) for step, score in job["validation"]))
+            for name, job in sorted(first.items(), key=lambda entry: _order(entry[0], experiment))
+            if job["validation"]
+        ]
+        title = f"{model['name']}, {f'{real:,} labelled' if real else 'sets alone'}"
+        charts.append(line_chart(title, "steps", series, size=(340, 210)))
+    return [chart for chart in charts if chart]
 
 
 def _tested(experiment: Experiment, capture: Capture) -> str:
-    """`12 frames of test and 8 of unseen`."""
-    scored = {
-        split: numbers["frames"] for job in experiment["jobs"] for split, numbers in job["splits"].items() if numbers
-    }
-    parts = [(split, scored.get(split, len(capture.split(split)))) for split in experiment["splits"]]
-    return _listed([f"{count} {'of' if k else 'frames of'} {split}" for k, (split, count) in enumerate(parts)])
-
-
-def machine_words(experiment: Experiment) -> str:
-    """The machine that trained."""
-    machine = experiment["machine"]
-    threads = machine["threads_per_worker"] or machine["torch_threads"]
-    workers = f", {machine['workers']} trainings at once" if machine["workers"] > 1 else ""
-    told = f"{hardware_words(machine)}, {threads} thread{'s' if threads > 1 else ''}"
-    return f"{told}{workers}, torch {machine['torch']}"
-
-
-def command_of(experiment: Experiment) -> str:
-    """The command that makes this experiment."""
-    teaching, jobs = experiment["teaching"], experiment["jobs"]
-    words = ["neeco", "downstream", experiment["capture"]]
-    if teaching["sets"]:
-        counted = [f":{entry['count']}" if entry["count"] is not None else "" for entry in teaching["sets"]]
-        pairs = zip(teaching["sets"], counted, strict=True)
-        words += ["--sets", *(f"{entry['name']}={entry['path']}{count}" for entry, count in pairs)]
-    words += ["--models", *(model["name"] for model in experiment["models"])]
-    counts = sorted({job["real"] for job in jobs})
-    words += ["--num-real", *("all" if count and count == experiment["labelled"] else str(count) for count in counts)]
-    words += ["--folds", str(experiment["folds"])]
-    conditions = list(dict.fromkeys(job["condition"] for job in jobs))
-    defaults = default_conditions([entry["name"] for entry in teaching["sets"]])
-    if set(conditions) != {word for word in defaults if any(bool(count) == with_labelled(word) for count in counts)}:
-        words += ["--conditions", *conditions]
-    if teaching["labels"] is not None:
-        words += ["--labels", teaching["labels"]]
-    for option, key, usual in (("classes", "classes", "instrument"), ("frame-selection", "pick", "spread")):
-        words += [f"--{option}", teaching[key]] if teaching[key] != usual else []
-    words += ["--splits", *experiment["splits"]]
-    for option, key in (("steps", "steps"), ("size", "side"), ("batch", "batch")):
-        words += [f"--{option}", str(teaching[key])] if teaching[key] is not None else []
-    for model in experiment["models"]:
-        words += ["--weights", f"{model['name']}={model['weights']}"] if model["weights"] else []
-    if teaching["transforms"] != "transforms.json":
-        words += ["--transforms", teaching["transforms"]]
-    if teaching["device"] != "auto":
-        words += ["--device", teaching["device"]]
-    return shlex.join([*words, "--output", "DIR"])
+    """`12 frames of test and 8 frames of unseen`."""
+    scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
+    counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
+    return " and ".join(counts)
 
 
 def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
-    machine, teaching = experiment["machine"], experiment["teaching"]
-    labelled = experiment["labelled"]
-    labels = teaching["labels"] or "the capture's truth"
-    picked = "spread over the recording, others in every fold" if teaching["pick"] == "spread" else "the first of it"
-    told = f"of {labelled:,}, {picked}; labels: {labels}" if labelled else "none"
+    machine, given = experiment["machine"], experiment["teaching"]
+    labels = given["labels"] or "the capture's truth"
+    chosen = "spread over the recording, others in every fold" if given["pick"] == "spread" else "the first of it"
+    labelled = f"of {experiment['labelled']:,}, {chosen}; labels: {labels}" if experiment["labelled"] else "none"
     return [
-        ("command", command_of(experiment)),
+        ("command", experiment["command"]),
         ("capture", experiment["capture"]),
         ("frames", split_counts(capture)),
-        ("labelled frames", told),
+        ("labelled frames", labelled),
         *((f"set {entry['name']}", _set_words(entry)) for entry in experiment["sets"]),
         ("classes", ", ".join(experiment["classes"])),
-        ("budget", budget_text(experiment)),
-        ("machine", machine_words(experiment)),
+        ("machine", machine_words(machine, "torch_threads")),
         ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
     ]
 
 
-def _set_words(entry: Mapping[str, Any]) -> str:
-    """How many images of where, and how they were drawn."""
-    told = f"{entry['images']:,} images of {entry['path']}"
-    made = entry["made_by"]
+def _set_words(entry: Row) -> str:
+    """How many images of where, and how they were synthesized."""
+    images, made = f"{entry['images']:,} images of {entry['path']}", entry["made_by"]
     if made is None:
-        return f"{told}; how they were made is not known: it has no dataset.json"
-    scene = f", drawn from {made['scene']}" if made["scene"] else ""
-    settings = made["settings"] or {}
-    known = [f"{key} {settings[key]}" for key in ("states", "views", "labels", "seed") if settings.get(key) is not None]
-    how = f" ({', '.join(known)})" if known else ""
-    return f"{told}{scene}{how}; dataset.json sha256 {entry['sha256'][:12]}"
+        return f"{images}; how they were made is not known: it has no dataset.json"
+    scene = f", synthesized from {made['scene']}" if made["scene"] else ""
+    return f"{images}{scene}; dataset.json sha256 {entry['sha256'][:12]}"
 
 
-def _settings(experiment: Experiment) -> list[tuple[str, str]]:
-    """(set, all its settings) of sets that tell them."""
+def _set_listings(experiment: Experiment) -> list[tuple[str, str]]:
     return [
-        (entry["name"], json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
+        (f"set {entry['name']}: how it was made", json.dumps(entry["made_by"], indent=1, ensure_ascii=False))
         for entry in experiment["sets"]
         if entry["made_by"]
     ]
-
-
-def _shots_csv(shown: Sequence[Gallery]) -> str:
-    header = ["model", "split", "fold", "frame", "why", "condition", "real", "score"]
-    rows = [
-        {"model": gallery.model, "split": gallery.split, "fold": gallery.fold, "frame": row.frame, "why": row.why}
-        | {"condition": shot.condition, "real": shot.real, "score": shot.score}
-        for gallery in shown
-        for row in gallery.rows
-        for shot in row.shots
-    ]
-    return csv_text(header, rows)

@@ -80,7 +80,7 @@ class Section:
     """A part of a study's page, shown in the order of these fields; what is empty is left out."""
 
     title: str
-    split: str = ""  # what its usual name means is told beside the title
+    split: str = ""  # of usual names the meaning is shown beside the title
     level: int = 2  # of the heading
     anchor: str = ""
     text: str = ""

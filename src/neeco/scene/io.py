@@ -17,6 +17,7 @@ from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
+from neeco.scene.deformations.base import Deformation
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.method import Stored
 from neeco.scene.methods import method_class, method_settings
@@ -125,11 +126,15 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
     """The inverse of `pack_scene`; which kind of scene, the header's method says."""
     require_like(header, HEADER, "header", "it is damaged")
     if HALVES.search(json.dumps(header, ensure_ascii=False)):
-        raise ValueError("its header holds half a character")
+        raise ValueError("its header holds an unpaired surrogate character")
     instruments, recorded = _recording(tensors, header)
     method = header["method"]
     settings = method_settings(method, header["deformation"])
-    scene = method_class(method).load(Stored(settings, instruments, recorded, tensors, header, Scene.load))
+    kind = method_class(method)
+    stored = Stored(settings, instruments, recorded, tensors, header)
+    scene: Learned = (
+        Scene.load(kind(instruments, settings), stored) if issubclass(kind, Deformation) else kind.load(stored)
+    )
     scene.diagnostics = header["diagnostics"]
     module = {name.removeprefix("module."): t for name, t in tensors.items() if name.startswith("module.")}
     if header.get("schema") == OLD_SCHEMA:
@@ -166,7 +171,7 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
 
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_NUMBER:
-        raise ValueError(f"{value!r} is no number that can be recorded")
+        raise ValueError(f"{value!r} is not a number that can be recorded")
     return value
 
 
@@ -184,7 +189,7 @@ def _limits(pair: Any) -> tuple[float, float] | None:
 def _pose(pose: Tensor, what: str) -> Tensor:
     """`pose` [4, 4], mm. Raises ValueError when it is not a rigid transform."""
     if tuple(pose.shape) != (4, 4) or rigid_fault(pose.double().numpy()):
-        raise ValueError(f"the recorded pose of {what} is no rigid transform")
+        raise ValueError(f"the recorded pose of {what} is not a rigid transform")
     return pose
 
 
@@ -192,5 +197,5 @@ def _camera(
     pose: Tensor, fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float
 ) -> Camera:
     if min(fx, fy, near) <= 0 or min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px cannot be")
+        raise ValueError(f"a recorded camera of {width} x {height} px and focal lengths {fx}, {fy} px is not possible")
     return Camera(pose, fx, fy, cx, cy, int(width), int(height), near)

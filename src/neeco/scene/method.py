@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -33,14 +33,13 @@ class NoSettings:
 
 @dataclass(frozen=True)
 class Stored:
-    """A scene as its file holds it. `gaussians` makes the scene of any method that deforms Gaussians."""
+    """A scene as its file holds it."""
 
     settings: Any  # the method's own, an instance of its `Settings`
     instruments: tuple[Instrument, ...]
     recorded: Recorded
     tensors: Mapping[str, Tensor]  # by name
     header: Mapping[str, Any]
-    gaussians: Callable[[Any, Stored], Learned]  # of a deformation
 
 
 class Method:
@@ -78,7 +77,8 @@ class Method:
 
     @classmethod
     def load(cls, stored: Stored) -> Learned:
-        """The scene that a file holds, but for the state of its modules, which the reader of files loads into it.
+        """The scene of a method without Gaussians that a file holds, but for the state of its modules, which the reader
+        of files loads into it.
 
         Raises ValueError, LookupError or RuntimeError where the file does not fit.
         """

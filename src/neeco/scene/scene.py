@@ -35,7 +35,7 @@ CANONICAL_SHAPES = {  # of one Gaussian
 
 
 class Scene(nn.Module):
-    """`scene.at(state)` is the one way from canonical to posed Gaussians, for every method; `render` draws them.
+    """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
@@ -111,11 +111,11 @@ class Scene(nn.Module):
         )
         scene.sh_degree = int(header["sh_degree"])
         if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
-            raise ValueError(f"sh_degree is {scene.sh_degree}, which its harmonics are not of")
+            raise ValueError(f"sh_degree is {scene.sh_degree}, which does not fit its harmonics")
         # older scenes call it backdrop, or have none
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         if not 0 <= scene.background <= 1:
-            raise ValueError(f"its background is {scene.background}, which is no grey in [0, 1]")
+            raise ValueError(f"its background is {scene.background}, not a grey in [0, 1]")
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:

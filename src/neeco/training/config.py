@@ -212,7 +212,14 @@ def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[
 def check_ranges(config: TrainConfig) -> None:
     """Raise NeecoError naming the option of a number that nothing can be trained with."""
     _check_length(config)
-    _check_published_steps(config)
+    schedule, density = config.schedule, config.density
+    if (steps := schedule.published_steps) is not None and steps < 1:
+        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
+    if steps is not None and config.minutes is not None:
+        raise NeecoError(
+            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
+            "open; give --iterations alone"
+        )
     if config.batch_size > 1 and not method_class(config.method).has_gaussians:
         raise NeecoError(
             f"--batch-size: method {config.method} draws rays of all frames in every step; "
@@ -222,7 +229,6 @@ def check_ranges(config: TrainConfig) -> None:
     for name, least in options.items():
         if getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
-    schedule, density = config.schedule, config.density
     least_one: dict[str, int | None] = {
         name: getattr(config, name) for name in ("initial_points", "log_interval", "checkpoint_interval")
     }
@@ -244,20 +250,6 @@ def _check_length(config: TrainConfig) -> None:
         raise NeecoError(f"--iterations: {config.iterations} is not a positive number")
     if config.minutes is not None and not config.minutes > 0:
         raise NeecoError(f"--minutes: {config.minutes} is not a positive number")
-
-
-def _check_published_steps(config: TrainConfig) -> None:
-    """A schedule scales with the run's length, which has to be known."""
-    steps = config.schedule.published_steps
-    if steps is None:
-        return
-    if steps < 1:
-        raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
-    if config.minutes is not None:
-        raise NeecoError(
-            "--set schedule.published_steps: scales the schedule to a number of iterations, which --minutes leaves "
-            "open; give --iterations alone"
-        )
 
 
 def _assign(values: dict[str, Any], config: TrainConfig, assignment: str) -> None:

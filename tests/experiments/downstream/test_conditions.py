@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ from neeco.experiments.downstream.job import (
     labelled_frames,
     parse_condition,
 )
+from neeco.experiments.downstream.samples import DataSet
 
 SETS = ("kin", "other")
 SETTINGS = DownstreamSettings(Path("capture"), Path("out"))
@@ -118,3 +121,20 @@ def test_each_fold_holds_back_other_images() -> None:
     kept = [SETTINGS.hold_out(range(40), fold)[1] for fold in range(5)]
     assert sorted(frame for fold in kept for frame in fold) == list(range(40))
     assert SETTINGS.hold_out(range(40), 5) == SETTINGS.hold_out(range(40), 0)
+
+
+def test_the_command_makes_the_same_study() -> None:
+    assert SETTINGS.command() == f"neeco downstream {Path('capture').absolute()} --output DIR"
+    changed = replace(
+        SETTINGS,
+        sets=(DataSet("kin", Path("/sets/a b"), 5), DataSet("other", Path("/sets/c"))),
+        num_real=("5", "all"),
+        frame_selection="first",
+        weights={"unet": Path("/w.safetensors")},
+        labels=Path("/labels"),
+        min_validated=10,
+    )
+    words = shlex.split(changed.command())[5:]
+    sets = ["--sets", "kin=/sets/a b:5", "other=/sets/c"]
+    rest = ["--labels", "/labels", "--frame-selection", "first", "--weights", "unet=/w.safetensors"]
+    assert words == [*sets, "--num-real", "5", "all", *rest]

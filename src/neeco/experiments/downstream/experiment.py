@@ -228,6 +228,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
         "version": __version__,
         "complete": False,
         "capture": str(settings.capture.absolute()),
+        "command": settings.command(),
         "machine": machine(device_of(settings.device, drawing=False))
         | {"workers": settings.workers, "threads_per_worker": threads},
         "teaching": {

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -43,6 +44,8 @@ DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 PARTS_STEPS = 2.5  # times as many steps to learn parts as one class: more of them do not help
 JAW_DISTANCE = 4.0  # px about the true jaws in which `iou_jaws` is taken: they are thin, and small beside the shaft
+HELD_OUT = ("validation_every", "min_validated")  # settings that job.json has only where they are not the default
+PYTHON_ONLY = ("finetune_share", "finetune_epochs", *HELD_OUT)
 MIN_STORED_SCORE = 0.05  # boxes of a lower confidence are not stored
 
 FrameSelection = Literal["spread", "first"]
@@ -139,6 +142,21 @@ class DownstreamSettings:
     validation_every: int = 5  # one in so many images of each source is held out for validation
     min_validated: int = 40  # images: of fewer all are learned, the held-out ones would be too few to choose weights by
 
+    def command(self) -> str:
+        """The command that runs this study; settings that only Python has are not part of it."""
+        words = ["neeco", "downstream", str(self.capture.absolute()), "--output", "DIR"]
+        for entry in fields(self):
+            value, option = getattr(self, entry.name), f"--{entry.name.replace('_', '-')}"
+            if entry.name in ("capture", "output", *PYTHON_ONLY) or value == entry.default or not value:
+                continue
+            if entry.name == "weights":
+                words += [word for name, path in value.items() for word in (option, f"{name}={path.absolute()}")]
+            elif isinstance(value, Path):
+                words += [option, str(value.absolute())]
+            else:
+                words += [option, *map(str, value if isinstance(value, tuple) else (value,))]
+        return shlex.join(words)
+
     def steps_of(self, kind: type[Model]) -> int:
         """How many steps a model is trained."""
         return self.steps or round(kind.steps * (PARTS_STEPS if self.classes == "parts" else 1))
@@ -212,7 +230,7 @@ class DownstreamJob:
         """What a folder must agree with to be this job's. Its keys are those of job.json, for good."""
         settings, kind = self.settings, model_class(self.model)
         finish = f"{settings.finetune_share} of the steps, {settings.finetune_epochs} rounds at most"
-        held_out = {"validation_every": settings.validation_every, "min_validated": settings.min_validated}
+        held_out = {key: getattr(settings, key) for key in HELD_OUT}
         return {
             "model": self.model,
             "condition": self.condition.name,
@@ -240,7 +258,8 @@ class DownstreamJob:
         stored = read_json(file)
         if not isinstance(stored, dict) or stored.get("schema") != JOB_SCHEMA:
             raise NeecoError(f"{file}: schema: is not {JOB_SCHEMA}; give another --output")
-        for key, value in self.identity().items():
+        stored = {key: getattr(DownstreamSettings, key) for key in HELD_OUT} | stored
+        for key, value in ({key: getattr(self.settings, key) for key in HELD_OUT} | self.identity()).items():
             if stored.get(key) != value:
                 raise NeecoError(f"{file}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
 

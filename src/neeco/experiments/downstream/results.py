@@ -295,7 +295,7 @@ def equivalent(curve: Sequence[tuple[int, float]], value: float) -> str:
 def tables_of(experiment: Document) -> list[Table]:
     """For every model and split the scores of each condition, then the differences of its main score."""
     pairs = models_and_splits(experiment)
-    tables = [table(experiment, model, split) for model, split in pairs for table in (scores_table, _differences_table)]
+    tables = [table(experiment, model, split) for model, split in pairs for table in (scores_table, differences_table)]
     return [table for table in tables if table.rows]
 
 
@@ -314,7 +314,8 @@ def scores_table(experiment: Document, model: Document, split: str) -> Table:
     return summary_table(f"{name}, split {split}", KEYS, columns, entries)
 
 
-def _differences_table(experiment: Document, model: Document, split: str) -> Table:
+def differences_table(experiment: Document, model: Document, split: str) -> Table:
+    """The paired differences of the main score, with their intervals."""
     columns = (Column("difference", "difference"), Column("low", "95 % from"), Column("high", "to"))
     rows = []
     for row in main_differences(experiment, model, split):

@@ -141,6 +141,10 @@ class DataSet:
     path: Path
     count: int | None = None
 
+    def __str__(self) -> str:
+        """As the command line has it."""
+        return f"{self.name}={self.path.absolute()}" + ("" if self.count is None else f":{self.count}")
+
     def file(self, *names: str) -> Path:
         """A file or folder of it. Raises NeecoError where a link leads out of it."""
         return require_inside(self.path.joinpath(*names), self.path)

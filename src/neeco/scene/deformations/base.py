@@ -15,8 +15,8 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import HingeMotion, Learned
-from neeco.scene.method import Method, Stored
+from neeco.scene.drawable import HingeMotion
+from neeco.scene.method import Method
 from neeco.scene.training_session import GaussianTraining
 
 FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are shorter)
@@ -94,10 +94,6 @@ class Deformation(nn.Module, Method):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
-
-    @classmethod
-    def load(cls, stored: Stored) -> Learned:
-        return stored.gaussians(cls(stored.instruments, stored.settings), stored)
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
 
 from neeco.capture.model import Frame
 from neeco.raster import rasterize
@@ -94,7 +95,7 @@ def gather_evidence(scene: Scene, views: TrainingViews, search: SearchConfig) ->
         mask = views.mask(index)
         if mask is not None:
             residual = residual * mask
-        smooth = torch.nn.functional.avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
+        smooth = avg_pool2d(residual[None, None], 3, 1, 1)[0, 0]
         hits.append(((smooth - search.evidence_floor) / search.evidence_range).clamp(0, 1))
         depths.append(torch.where(rendering.alpha > 0.5, rendering.depth, torch.full_like(rendering.depth, torch.inf)))
     cameras, device = [frames[i].camera for i in picked], views.device
@@ -110,10 +111,8 @@ def gather_evidence(scene: Scene, views: TrainingViews, search: SearchConfig) ->
 def _pad_and_stack(images: list[Tensor], padding: float) -> Tensor:
     """Images [H_i, W_i] of any sizes as one [F, H, W], padded at the right and below."""
     height, width = max(image.shape[0] for image in images), max(image.shape[1] for image in images)
-    stacked = images[0].new_full((len(images), height, width), padding)
-    for place, image in zip(stacked, images, strict=True):
-        place[: image.shape[0], : image.shape[1]] = image
-    return stacked
+    margins = [(0, width - image.shape[1], 0, height - image.shape[0]) for image in images]
+    return torch.stack([pad(image, margin, value=padding) for image, margin in zip(images, margins, strict=True)])
 
 
 @dataclass(frozen=True)
