@@ -23,7 +23,7 @@ class Arguments:
     capture: Path | None = None
     """Another recording of the same instruments over the same tissue; the run's own when not given."""
     min_trust: float = MIN_TRUST
-    """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the recorded image speaks for."""
+    """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
     formats: tuple[Format, ...] = ("coco", "yolo")
     """Index files beside the plain images, masks, parts and depth."""
     resume: bool = False

@@ -14,7 +14,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.report.page import jpeg, to_bytes, write_page
 
 PAGE = "annotate.html"
-SHOWN = 60  # recorded images: the page has to stay a file one can mail
+SHOWN = 60  # frames: the page has to stay a file one can mail
 OUTLINES = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))  # of the instruments, in turn
 
 
@@ -60,7 +60,7 @@ def _by_split(records: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 def _figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """One frame: its recorded image with the outlines of its labels, and what is known of it."""
+    """One frame: its image with the outlines of its labels, and what is known of it."""
     trust, moved = record["trust"], record["moved"]
     return {
         "name": frame.name,
