@@ -1,10 +1,10 @@
-# make demo | test | lint | bench | viewer. Everything happens in .venv; nothing outside this folder is touched.
+# make demo | test | test-cpus | lint | docs | bench | viewer. Everything happens in .venv; nothing outside this folder is touched.
 
 PYTHON ?= python3
 BIN := .venv/bin
 NATIVE := $(shell find CMakeLists.txt native -type f 2>/dev/null)
 
-.PHONY: demo test lint bench viewer clean
+.PHONY: demo test test-cpus lint docs bench viewer clean
 
 demo: .venv/installed
 	rm -rf demo
@@ -12,6 +12,14 @@ demo: .venv/installed
 
 test: .venv/installed
 	$(BIN)/pytest -n 2
+
+# as other processors and Pythons run the suite; an hour
+test-cpus: .venv/installed
+	tools/test-cpus
+
+docs: .venv/installed
+	$(BIN)/zensical build --clean --strict
+	@echo "site/index.html"
 
 lint: .venv/installed
 	$(BIN)/ruff check .

@@ -18,7 +18,7 @@ from neeco.capture import Capture, Frame, Instrument, PointCloud, write_capture
 SAMPLE = Path(__file__).parents[1] / "samples" / "liver-mini"
 
 
-def main(output: Path, iterations: int) -> None:
+def main(output: Path, iterations: int, method: str = "kinematic") -> None:
     recorded = neeco.read_capture(SAMPLE)
     images = np.stack([frame.load_image().numpy() for frame in recorded.frames])  # [F, H, W, 3] in [0, 1]
     world_from_camera = np.stack([frame.camera.world_from_camera.numpy() for frame in recorded.frames])  # [F, 4, 4] mm
@@ -48,7 +48,7 @@ def main(output: Path, iterations: int) -> None:
     print(f"{output}: {len(frames)} frames, {len(problems)} problems")
     for problem in problems:
         print(problem.severity, problem)
-    run = neeco.train(output, output / "run", iterations=iterations)
+    run = neeco.train(output, output / "run", method, iterations=iterations)
     print(run.scene)
 
 

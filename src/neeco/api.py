@@ -32,7 +32,7 @@ PathLike = str | os.PathLike[str]
 class Scene:
     """A learned scene: draws instruments in any state from any view, with labels.
 
-        scene = neeco.Scene("runs/liver/scene.safetensors")        # or neeco.load("runs/liver").scene
+        scene = neeco.Scene("runs/sample/scene.safetensors")        # or neeco.load("runs/sample").scene
         state, camera = scene.recorded[0]
         image = scene.draw(state, camera).image                    # float32 [H, W, 3]
 
@@ -91,7 +91,7 @@ class Scene:
         `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint, and with `labels` where
         the method learns none.
 
-            drawn = scene.draw(state, camera)
+            drawn = neeco.load("runs/sample").scene.draw(state, camera)
             drawn.image, drawn.depth                      # float32 [H, W, 3] in [0, 1]; float32 [H, W] mm, 0 = none
             drawn.masks, drawn.parts                      # bool [I, H, W]; uint8 [H, W], 0 tissue
             drawn.boxes, drawn.keypoints                  # float32 [I, 4] px; float32 [I, K, 3]
@@ -132,7 +132,7 @@ class Run:
         total). Returns {"given": {split: numbers}, "aligned": ..., "notes": [...]}; docs/evaluation.md has every
         number. Raises NeecoError for a split that is not there.
 
-            neeco.load("runs/liver").evaluate(["test"])["given"]["test"]["psnr"]
+            neeco.load("runs/sample").evaluate(["test"])["given"]["test"]["psnr"]
         """
         run = runs.Run(self.path, self.scene.learned, dict(self.config))
         networks = find_lpips(None if lpips_weights is None else Path(lpips_weights))
@@ -146,7 +146,7 @@ def load(path: PathLike, device: str = "auto") -> Run:
 
     Raises NeecoError when it is no run folder, or its training has not finished.
 
-        run = neeco.load("runs/liver")
+        run = neeco.load("runs/sample")
         run.scene, run.capture, run.config["method"]
     """
     opened = runs.load_run(Path(path), device_of(device))

@@ -122,7 +122,7 @@ def error(actual: Tensor, expected: Tensor) -> float:
     return float((actual.detach().cpu().double() - expected).norm() / (scale if scale > 1e-9 else 1.0))
 
 
-def assert_same_as_reference(scene: Scene, backend: str = "cpu") -> None:
+def assert_same_as_reference(scene: Scene, backend: str = "cpu", tolerance: float = TOLERANCE) -> None:
     """Image, visibility and every gradient, where no cut-off leaves the choice to rounding."""
     decided = decided_pixels(scene)
     expected, expected_gradients = draw(scene, torch.float64, "reference", decided)
@@ -132,9 +132,9 @@ def assert_same_as_reference(scene: Scene, backend: str = "cpu") -> None:
         assert (image is None) == (wanted is None)
         if image is not None:
             pixels = decided.reshape(decided.shape + (1,) * (image.dim() - 2))
-            assert error(image * pixels, wanted * pixels) < TOLERANCE, name
+            assert error(image * pixels, wanted * pixels) < tolerance, name
     for name, wanted in expected_gradients.items():
-        assert error(gradients[name], wanted) < TOLERANCE, f"gradient of {name}"
+        assert error(gradients[name], wanted) < tolerance, f"gradient of {name}"
     assert bool((actual.visible | (expected.radii == 0)).all()), "a Gaussian that is drawn counts as visible"
     both = actual.visible & (expected.radii > 0)
-    assert error(actual.radii[both], expected.radii[both]) < TOLERANCE
+    assert error(actual.radii[both], expected.radii[both]) < tolerance

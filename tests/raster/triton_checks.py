@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent))
-from raster_scenes import Scene, assert_same_as_reference, decided_pixels, draw, error, leaves, make_scene
+from raster_scenes import TOLERANCE, Scene, assert_same_as_reference, decided_pixels, draw, error, leaves, make_scene
 
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
@@ -32,8 +32,8 @@ def scene_of(count: int = 40, sh_count: int = 4, channels: int = 1, seed: int = 
     return make_scene(count, sh_count, channels, seed, **{"width": 24, "height": 16} | more)  # type: ignore[arg-type]
 
 
-def same(scene: Scene) -> None:
-    assert_same_as_reference(scene, "triton")
+def same(scene: Scene, tolerance: float = TOLERANCE) -> None:
+    assert_same_as_reference(scene, "triton", tolerance)
 
 
 @pytest.fixture
@@ -103,15 +103,18 @@ def test_a_tile_is_listed_for_every_gaussian_that_shows_in_it() -> None:
     scene = scene_of(8, 1, 0, seed=3, width=96, height=48, frames=False, light=False, opacity=0.9)
     scene.tensors["scales"] = torch.tensor([0.2, 0.2, 60.0]).expand(8, 3).clone()
     lists: list[binning.Lists] = []
-    kept = binning.list_per_tile
+    list_per_tile = binning.list_per_tile
 
     def listen(*args: object) -> binning.Lists:
-        lists.append(kept(*args))  # type: ignore[arg-type]
+        lists.append(list_per_tile(*args))  # type: ignore[arg-type]
         return lists[-1]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(backend, "list_per_tile", listen)
-        same(scene)
+        # the inverse of a covariance of 36 px by .56 px (60 and .2 mm at 100 mm, with the low pass of .3 px^2) has a
+        # condition of 36^2 / .31 and enters a gradient twice: that many times float32's rounding (2^-24), through some
+        # 16 operations
+        same(scene, tolerance=2 * 16 * 2**-24 * 36**2 / 0.31)
     listed = lists[0]
     tiles = len(listed.starts) - 1
     assert tiles == 18

@@ -22,7 +22,6 @@ from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
 from neeco.report.annotated_page import write_annotated_page
 from neeco.scene import Scene
-from neeco.synthesis import annotated
 from neeco.synthesis.annotated import TypicalErrors, annotate_capture, estimate_trust, typical_errors_of
 
 USUAL = TypicalErrors(0.05, 0.05)
@@ -99,14 +98,13 @@ def test_what_something_hides_is_no_label(scene: Scene) -> None:
     assert judged.value < 1 - hidden + 0.1
 
 
-def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(annotated, "BESIDE", 0.2)  # of a very small image
+def test_a_label_too_small_misses_what_looks_like_no_tissue(scene: Scene) -> None:
     drawing = layers(scene, rod_state())
     label = drawing.parts.clone()
     half = torch.nonzero(label.sum(0))[:, 0].float().mean().round().long()
     label[:, half:] = 0
     cut = replace(drawing, parts=label, image=torch.where((label > 0)[..., None], drawing.image, drawing.tissue_image))
-    judged = estimate_trust(cut, drawing.image, None, USUAL)
+    judged = estimate_trust(cut, drawing.image, None, USUAL, beside=0.2)  # a very small image
     assert judged.missed > 0.2
     assert judged.value < 0.9
 

@@ -50,7 +50,7 @@ class State:
 
     An instrument's state may be given as (pose, joints), too: world_from_instrument [4, 4] in mm, and name -> rad.
 
-        State({"grasper": (world_from_grasper, {"jaw_angle": 0.4})}, time=1.2)
+        neeco.State({"maryland": (np.eye(4), {"jaw_angle": 0.4})}, time=1.2)
     """
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)

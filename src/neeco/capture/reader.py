@@ -22,6 +22,10 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
     path: the capture's folder, or a transforms file in it. transforms: which file of the folder to read.
     background: what shows through transparent pixels (0 black, 1 white). Image pixels are not read here.
     Raises NeecoError with the first problem found; `check_capture` finds all of them.
+
+        capture = neeco.read_capture("samples/liver-mini")
+        frame = capture.split("test")[0]
+        frame.load_image().shape, frame.camera.fx, frame.state.instruments["maryland"].pose
     """
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms, background)

@@ -129,13 +129,12 @@ class ThresholdLabels:
     """The paper's labeller: Gaussians whose deltas exceed thresholds are drawn alone on black; what is not black is the
     mask. The paper knows one instrument; of several, the nearest owns a moved Gaussian."""
 
-    def __init__(self, scene: Scene, thresholds: DeltaThresholds | None = None, black: float = BLACK) -> None:
+    def __init__(self, scene: Scene, thresholds: DeltaThresholds | None = None) -> None:
         instruments = tuple(instrument.name for instrument in scene.instruments)
         if not instruments:
             raise NeecoError("scene: --labels threshold needs a scene with instruments; this one was trained without")
         self.names = tuple((name, "instrument") for name in instruments)
         self.scene = scene
-        self.black = black
         self.thresholds = thresholds or find_thresholds(scene)
 
     def owners(self, state: State, posed: Gaussians) -> Tensor:
@@ -161,7 +160,7 @@ class ThresholdLabels:
         alone = rasterize(gaussians.select(moved), camera, channels=shares)
         assert alone.channels is not None
         ids = alone.channels.argmax(dim=2) + 1
-        lit = alone.color.norm(dim=2) > self.black
+        lit = alone.color.norm(dim=2) > BLACK
         rendering = rasterize(gaussians, camera, channels=None if unobserved is None else unobserved[:, None])
         return rendering, torch.where(lit, ids, 0).to(torch.uint8), alone.alpha
 

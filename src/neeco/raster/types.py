@@ -102,6 +102,8 @@ class Camera:
 
     The pose may also be given as an array or nested lists, which become float32 (`as_pose`). Raises NeecoError when it
     is not 4x4, or given so and no rotation and translation.
+
+        neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """
 
     world_from_camera: Tensor  # [4, 4] rigid, mm

@@ -307,7 +307,7 @@ def validation_charts(experiment: Experiment, model: Row) -> list[str]:
 
 
 def _tested(experiment: Experiment, capture: Capture) -> str:
-    """`12 frames of test and 8 of unseen`."""
+    """`12 frames of test and 8 frames of unseen`."""
     scored = {split: row["frames"] for job in experiment["jobs"] for split, row in job["splits"].items() if row}
     counts = [f"{scored.get(split, len(capture.split(split)))} frames of {split}" for split in experiment["splits"]]
     return " and ".join(counts)
@@ -325,7 +325,6 @@ def _facts(experiment: Experiment, capture: Capture) -> list[tuple[str, str]]:
         ("labelled frames", labelled),
         *((f"set {entry['name']}", _set_words(entry)) for entry in experiment["sets"]),
         ("classes", ", ".join(experiment["classes"])),
-        ("budget", budget_text(experiment)),
         ("machine", machine_words(machine, "torch_threads")),
         ("versions", f"neeco {experiment['version']}, Python {machine['python']}, torch {machine['torch']}"),
     ]

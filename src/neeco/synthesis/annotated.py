@@ -219,12 +219,15 @@ def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | 
     )
 
 
-def estimate_trust(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, typical: TypicalErrors) -> Trust:
+def estimate_trust(
+    drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, typical: TypicalErrors, beside: float = BESIDE
+) -> Trust:
     """How far the label of `drawing` can be trusted as that of `image` [H, W, 3]; 0 where there is no label.
 
-    Pixels that the frame's loss mask leaves out do not vote.
+    Pixels that the frame's loss mask leaves out do not vote; beside the label, those up to `beside` of the image's
+    diagonal away do.
     """
-    errors = _errors(drawing, image, mask)
+    errors = _errors(drawing, image, mask, beside)
     unexplained = (errors.drawn > typical.inside) & (errors.drawn > HALF * errors.tissue)
     against = errors.label & ((errors.drawn > errors.tissue) | unexplained)
     missed = errors.beside & (errors.drawn > typical.beside)
@@ -233,11 +236,11 @@ def estimate_trust(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, 
     return Trust((int(errors.label.sum()) - left_out) / (size + added), left_out / size, added / size)
 
 
-def _errors(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None) -> _Errors:
+def _errors(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, beside: float = BESIDE) -> _Errors:
     votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
     label = drawing.parts.numpy() > 0
     away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
-    near = ~label & (away <= BESIDE * float(np.hypot(*label.shape)))
+    near = ~label & (away <= beside * float(np.hypot(*label.shape)))
     assert drawing.tissue_image is not None
     drawn, tissue = (
         uniform_filter((rendered - image).abs().mean(2).numpy(), SMOOTH)

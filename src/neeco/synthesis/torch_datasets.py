@@ -21,7 +21,7 @@ Teach a segmenter on images that are drawn while it learns, nothing written:
     from torch.utils.data import DataLoader
 
     if __name__ == "__main__":
-        images = neeco.LabelledImages("runs/liver", 1000, states="extrapolate")
+        images = neeco.LabelledImages("runs/sample", 1000, states="extrapolate")
         for batch in DataLoader(images, batch_size=8, num_workers=2, collate_fn=images.collate):
             loss = segmenter_loss(batch["image"], batch["parts"], ~batch["ignore"])
 """
@@ -99,8 +99,8 @@ def sample_states(
     FILE.jsonl; views: recorded, perturbed or orbit (see `Settings`). Nothing is drawn, so none is refused for what the
     image shows. The same seed gives the same states. Raises NeecoError for settings or a scene that do not fit.
 
-        for state, camera in sample_states("runs/liver", 3, states="extrapolate"):
-            print(state.instruments["grasper"].joints, camera.width, camera.height)
+        for state, camera in neeco.sample_states("runs/sample", 3, states="extrapolate"):
+            print(state.instruments["maryland"].joints, camera.width, camera.height)
     """
     settings = Settings(count, seed, states, margin, views)
     settings.check()
@@ -168,7 +168,7 @@ class LabelledImages(_Generated, Dataset[Sample]):
     Raises NeecoError for a scene or settings that do not fit, and, when a sample is drawn, StatesRefused (a NeecoError)
     where no state is acceptable.
 
-        images = LabelledImages("runs/liver", 100, seed=1)
+        images = neeco.LabelledImages("runs/sample", 100, seed=1)
         sample = images[0]
         sample["image"].shape, [images.classes[k - 1] for k in sample["labels"]]
     """
@@ -209,9 +209,10 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
     same whoever draws it. Prescribed states that are refused are left out; path:FILE.jsonl, which has an end, is not
     for a stream.
 
-        stream = LabelledStream("runs/liver", seed=1)
-        for batch in DataLoader(stream, batch_size=8, num_workers=2, collate_fn=stream.collate):
-            ...
+        stream = neeco.LabelledStream("runs/sample", seed=1)
+        for batch in torch.utils.data.DataLoader(stream, batch_size=2, num_workers=2, collate_fn=stream.collate):
+            batch["image"].shape, batch["boxes"][0]
+            break
     """
 
     def __init__(
@@ -262,8 +263,8 @@ class StoredImages(Dataset[Sample]):
     Samples have the same keys as those of `LabelledImages`, and the pixels and numbers of the files. split: train, val,
     or None for both. Raises NeecoError for a folder that is no such data set, and for a file that is damaged.
 
-        images = StoredImages("dataset", split="train")
-        loader = DataLoader(images, batch_size=8, num_workers=2, collate_fn=images.collate)
+        images = neeco.StoredImages("dataset", split="train")
+        loader = torch.utils.data.DataLoader(images, batch_size=2, num_workers=2, collate_fn=images.collate)
     """
 
     collate = staticmethod(collate)

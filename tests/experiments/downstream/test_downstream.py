@@ -289,6 +289,8 @@ def test_a_failure_that_nobody_foresaw_leaves_its_traceback(spec: DownstreamSett
     ("change", "told"),
     [
         ({"steps": 7}, "steps: is 6, not 7"),
+        ({"min_validated": 40}, "min_validated: is 5, not 40"),
+        ({"validation_every": 4}, "validation_every: is 5, not 4"),
         ({"batch": 3}, "batch: is 2, not 3"),
         ({"size": 24}, "side: is 48, not 24"),
         ({"frame_selection": "first"}, "pick: is 'spread', not 'first'"),

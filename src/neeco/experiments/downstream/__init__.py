@@ -1,1 +1,1 @@
-"""Does it help? Models trained on recorded and on drawn images, tested on recorded frames."""
+"""Does it help? Models trained on recorded and on synthetic images, tested on recorded frames."""

@@ -44,7 +44,8 @@ DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 PARTS_STEPS = 2.5  # times as many steps to learn parts as one class: more of them do not help
 JAW_DISTANCE = 4.0  # px about the true jaws in which `iou_jaws` is taken: they are thin, and small beside the shaft
-PYTHON_ONLY = ("finetune_share", "finetune_epochs", "validation_every", "min_validated")
+HELD_OUT = ("validation_every", "min_validated")  # settings that job.json has only where they are not the default
+PYTHON_ONLY = ("finetune_share", "finetune_epochs", *HELD_OUT)
 MIN_STORED_SCORE = 0.05  # boxes of a lower confidence are not stored
 
 FrameSelection = Literal["spread", "first"]
@@ -229,7 +230,7 @@ class DownstreamJob:
         """What a folder must agree with to be this job's. Its keys are those of job.json, for good."""
         settings, kind = self.settings, model_class(self.model)
         finish = f"{settings.finetune_share} of the steps, {settings.finetune_epochs} rounds at most"
-        held_out = {"validation_every": settings.validation_every, "min_validated": settings.min_validated}
+        held_out = {key: getattr(settings, key) for key in HELD_OUT}
         return {
             "model": self.model,
             "condition": self.condition.name,
@@ -257,7 +258,8 @@ class DownstreamJob:
         stored = read_json(file)
         if not isinstance(stored, dict) or stored.get("schema") != JOB_SCHEMA:
             raise NeecoError(f"{file}: schema: is not {JOB_SCHEMA}; give another --output")
-        for key, value in self.identity().items():
+        stored = {key: getattr(DownstreamSettings, key) for key in HELD_OUT} | stored
+        for key, value in ({key: getattr(self.settings, key) for key in HELD_OUT} | self.identity()).items():
             if stored.get(key) != value:
                 raise NeecoError(f"{file}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
 

@@ -26,33 +26,65 @@ from neeco.files import write_atomically, write_text
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Record, link, public_record, stem
 
+IMAGEFOLDER, WEBDATASET = "imagefolder", "webdataset"
+SPLITS = {"train": "train", "val": "validation"}  # ours, and what the hub calls them
+SHARD_SIZE = 1000  # samples in a tar file
+SHARDED = {"images": "png", "masks": "mask.png", "parts": "parts.png", "ignore": "ignore.png", "depth": "depth.png"}
+
 CARD = "README.md"
 MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this line to keep your own text. -->"
 SIZES = {"n<1K": 10**3, "1K<n<10K": 10**4, "10K<n<100K": 10**5, "100K<n<1M": 10**6, "1M<n<10M": 10**7}
 TASKS = ["image-segmentation", "object-detection", "keypoint-detection", "depth-estimation"]
 TAGS = ["surgical-instruments", "endoscopy", "6d-pose-estimation", "gaussian-splatting"]
-IMAGEFOLDER, WEBDATASET = "imagefolder", "webdataset"
-SPLITS = {"train": "train", "val": "validation"}  # ours, and what the hub calls them
-SHARD_SIZE = 1000  # samples in a tar file
-SHARDED = {"images": "png", "masks": "mask.png", "parts": "parts.png", "ignore": "ignore.png", "depth": "depth.png"}
-LAYOUT = {
-    "images": "the images, RGB",
-    "masks": "instrument or not: 255 or 0",
-    "soft": "share of a pixel that is instrument, in counts of 1/255",
-    "ignore": "255 where a loss had better ignore the pixel: uncertain edges, and what no training frame saw",
-    "parts": "part ids, see above",
-    "depth": "16 bit, in counts of {mm_per_count} mm; 0 is none",
-    "silhouettes": "bit k is set where instrument k would be seen if nothing else were there",
-    "states.jsonl": "one line per image: instrument states (mm, rad), camera (OpenGL axes), intrinsics, labels",
-    "dataset.json": "how the set was made, in full",
-    "preview.png": "a look at the labels",
-}
-FORMAT_FOLDERS = {
-    "coco": "`coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`",
-    "yolo": "`yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`",
-    "webdataset": "`webdataset/{train,val}-*.tar`",
-    "bop": "`bop/{train,val}/`, for 6-DoF pose",
-    "imagefolder": "`imagefolder/{train,validation}/`, with metadata.jsonl",
+SYNTHETIC = """The images were drawn by a Gaussian-splatting model learned from a recording, in states of the
+instruments that were not recorded. Labels come from the same model: exact for what is drawn."""
+RECORDED = """The images were recorded. Their labels were drawn by a Gaussian-splatting model of the recording, at poses
+fitted to each image; images whose labels could not be trusted were left out."""
+TEXT = """---
+{front}---
+
+{mark}
+
+# {title}
+
+{how}
+
+{images} images ({splits}). The publisher of the set states its license.
+
+## Classes
+
+| part id | instrument | part |
+|---|---|---|
+{classes}
+
+Keypoints, where an instrument has them: {keypoints}.
+
+## Files
+
+- `images`: the images, RGB
+- `masks`: instrument or not: 255 or 0
+- `soft`: share of a pixel that is instrument, in counts of 1/255
+- `ignore`: 255 where a loss had better ignore the pixel: uncertain edges, and what no training frame saw
+- `parts`: part ids, see above
+- `depth`: 16 bit, in counts of {mm_per_count} mm; 0 is none
+- `silhouettes`: bit k is set where instrument k would be seen if nothing else were there
+- `states.jsonl`: one line per image: instrument states (mm, rad), camera (OpenGL axes), intrinsics, labels
+- `dataset.json`: how the set was made, in full
+- `preview.png`: a look at the labels
+{formats}
+
+## How it was made
+
+By neeco {version}, of a scene with SHA-256 `{scene}`:
+
+    {command}
+"""
+FORMATS = {
+    "coco": "- `coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`",
+    "yolo": "- `yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`",
+    "webdataset": "- `webdataset/{train,val}-*.tar`",
+    "bop": "- `bop/{train,val}/`, for 6-DoF pose",
+    "imagefolder": "- `imagefolder/{train,validation}/`, with metadata.jsonl",
 }
 
 
@@ -65,78 +97,55 @@ def write_card(root: Path, info: Mapping[str, Any]) -> None:
     if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
         return
     annotated = "annotates" in info["settings"]
-    title = "Recorded" if annotated else "Synthetic"
-    size = next((name for name, limit in SIZES.items() if info["images"] < limit), "n>10M")
+    title = f"{'Recorded' if annotated else 'Synthetic'} images of surgical instruments, labelled"
+    config: dict[str, Any] = {"config_name": "default", "data_files": "images/*.png"}  # what the hub's viewer shows
+    if IMAGEFOLDER in info["formats"]:
+        config = {"config_name": "default", "data_dir": IMAGEFOLDER}
+    elif WEBDATASET in info["formats"]:
+        config["data_files"] = [{"split": SPLITS[k], "path": f"{WEBDATASET}/{k}-*.tar"} for k in info["splits"]]
     front = {
         "license": "unknown",
-        "pretty_name": f"{title} images of surgical instruments, labelled",
+        "pretty_name": title,
         "task_categories": TASKS,
-        "tags": [*TAGS, *([] if annotated else ["synthetic"])],
-        "size_categories": [size],
-        "configs": [{"config_name": "default"} | _default_config(info)],
+        "tags": TAGS if annotated else [*TAGS, "synthetic"],
+        "size_categories": [next((name for name, limit in SIZES.items() if info["images"] < limit), "n>10M")],
+        "configs": [config],
     }
-    how = (
-        "The images were recorded. Their labels were drawn by a Gaussian-splatting model of the recording, at poses "
-        "fitted to each image; images whose labels could not be trusted were left out."
-        if annotated
-        else "The images were drawn by a Gaussian-splatting model learned from a recording, in states of the "
-        "instruments that were not recorded. Labels come from the same model: exact for what is drawn."
+    text = TEXT.format(
+        front=yaml.safe_dump(front, sort_keys=False),
+        mark=MARK,
+        title=title,
+        how=RECORDED if annotated else SYNTHETIC,
+        images=info["images"],
+        splits=", ".join(f"{count} {split}" for split, count in info["splits"].items()),
+        classes="\n".join(f"| {item['id']} | {item.get('instrument', '')} | {item['part']} |" for item in info["ids"]),
+        keypoints=", ".join(info["keypoints"]) or "none",
+        mm_per_count=info["depth"]["mm_per_count"],
+        formats="\n".join(FORMATS[name] for name in info["formats"]),
+        version=info["version"],
+        scene=info["scene_sha256"],
+        command=_command(info),
     )
-    splits = ", ".join(f"{count} {split}" for split, count in info["splits"].items())
-    lines = [
-        f"---\n{yaml.safe_dump(front, sort_keys=False)}---",
-        MARK,
-        f"# {front['pretty_name']}",
-        how,
-        f"{info['images']} images ({splits}). The license is for whoever publishes the set to state.",
-        "## Classes",
-        "\n".join(["| part id | instrument | part |", "|---|---|---|", *(_class_row(item) for item in info["ids"])]),
-        f"Keypoints, where an instrument has them: {', '.join(info['keypoints']) or 'none'}.",
-        "## Files",
-        "\n".join(f"- `{name}`: {text.format(**info['depth'])}" for name, text in LAYOUT.items()),
-        "\n".join(f"- {FORMAT_FOLDERS[name]}" for name in info["formats"]),
-        "## How it was made",
-        f"By neeco {info['version']}, of a scene with SHA-256 `{info['scene_sha256']}`:",
-        f"    {_command(info)}",
-    ]
-    write_text(path, "\n\n".join(line for line in lines if line) + "\n")
-
-
-def _class_row(item: Mapping[str, Any]) -> str:
-    return f"| {item['id']} | {item.get('instrument', '')} | {item['part']} |"
-
-
-def _default_config(info: Mapping[str, Any]) -> dict[str, Any]:
-    """What the hub's viewer and `load_dataset` take when nobody names anything else."""
-    if IMAGEFOLDER in info["formats"]:
-        return {"data_dir": IMAGEFOLDER}
-    if WEBDATASET in info["formats"]:
-        return {"data_files": [{"split": SPLITS[s], "path": f"{WEBDATASET}/{s}-*.tar"} for s in info["splits"]]}
-    return {"data_files": "images/*.png"}
+    write_text(path, text)
 
 
 def _command(info: Mapping[str, Any]) -> str:
     """The command that makes the set again."""
     settings = info["settings"]
-    formats = ["--formats", *info["formats"]] if info["formats"] else []
     if "annotates" in settings:
         words = ["annotate", info["scene"], "--capture", settings["annotates"], "--min-trust", settings["min_trust"]]
-        return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))
-    words = ["synthesize", info["scene"]]
-    if "instruments" in info:
+    elif "instruments" in info:
         words = ["synthesize", "--tissue", info["scene"], "--instruments", *info["instruments"]]
-    words += ["--count", info["images"] + len(info["skipped"]), "--seed", settings["seed"]]
-    for field in fields(Settings):
-        value = settings.get(field.name, field.default)
-        flag = f"--{field.name.replace('_', '-')}"
-        if value == field.default or field.name in ("count", "seed"):
-            continue
-        if field.name == "camera_effects":
-            words += [flag, "EFFECTS.yaml"]
-        elif isinstance(value, bool):
-            words += [flag if value else f"--no-{flag[2:]}"]
-        else:
-            words += [flag, *(value if isinstance(value, list) else [value])]
+    else:
+        words = ["synthesize", info["scene"]]
+    given = {"count": info["images"] + len(info["skipped"])} | settings
+    for field in fields(Settings) if "seed" in settings else ():
+        value, flag = given.get(field.name, field.default), f"--{field.name.replace('_', '-')}"
+        if value is False:
+            words.append(f"--no-{flag[2:]}")
+        elif value != field.default or field.name == "seed":
+            words += [flag, *(value if isinstance(value, list) else ["FILE"] if isinstance(value, dict) else [value])]
+    formats = ["--formats", *info["formats"]] if info["formats"] else []
     return shlex.join(map(str, ["neeco", *words, *formats, "--output", "DATASET"]))
 
 

@@ -1,0 +1,134 @@
+"""`import neeco`: few names, quick to import, documented, with examples that run; and the programs in examples/."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+
+import neeco
+from neeco.capture.model import InstrumentState
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.settings import Settings
+from neeco.training.run import load_run
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "samples" / "liver-mini"
+
+
+def example(name: str) -> ModuleType:
+    """A program of examples/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as the docstrings' examples expect it, with a run that the first program trained."""
+    folder = tmp_path_factory.mktemp("library")
+    (folder / "samples").mkdir()
+    (folder / "samples" / "liver-mini").symlink_to(SAMPLE)
+    (folder / "my-capture").symlink_to(SAMPLE)
+    example("01_train_and_draw").main(folder / "runs" / "sample", iterations=60)
+    synthesize(load_run(folder / "runs" / "sample"), folder / "dataset", Settings(count=4, min_share=0.0))
+    return folder
+
+
+def test_importing_neeco_takes_no_torch_and_little_time() -> None:
+    code = "import sys, time; start = time.perf_counter(); import neeco; took = time.perf_counter() - start; "
+    code += "print('torch' in sys.modules, took, len(neeco.__all__), sorted(set(neeco.__all__) - set(dir(neeco))))"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert printed[0] == "False"
+    assert float(printed[1]) < 1.0  # 0.02 s on a quiet machine
+    assert int(printed[2]) <= 12
+    assert printed[3] == "[]"
+
+
+def test_a_name_that_is_not_there_is_told_so() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'photograph'"):
+        neeco.photograph  # noqa: B018
+
+
+def test_the_page_of_the_api_documents_every_name_and_no_other() -> None:
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^::: neeco\.(\w+)$", page, re.MULTILINE)) == set(neeco.__all__)
+
+
+def examples_of(name: str) -> str:
+    """The indented code of a name's docstrings: its own, and those of its public methods."""
+    value = getattr(neeco, name)
+    texts = [inspect.getdoc(value) or ""]
+    if inspect.isclass(value):
+        texts += [inspect.getdoc(member) or "" for key, member in vars(value).items() if not key.startswith("_")]
+    blocks = [re.findall(r"(?:^    .*\n?|^\n(?=    ))+", text + "\n", re.MULTILINE) for text in texts]
+    return "\n".join(textwrap.dedent(block) for found in blocks for block in found)
+
+
+@pytest.mark.parametrize("name", neeco.__all__)
+def test_the_example_of_every_name_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = examples_of(name)
+    assert code.strip(), f"{name} has no example"
+    monkeypatch.chdir(folder)
+    if name == "train":
+        code = code.replace("minutes=2", 'iterations=5, method="3dgs"').replace("runs/sample", "runs/again")
+    code = code.replace("num_workers=2", "num_workers=0").replace('"samples/liver-mini"', f'"{SAMPLE}"')
+    exec(compile(code, f"<example of {name}>", "exec"), {"neeco": neeco, "np": np, "torch": torch})
+
+
+def test_a_scene_draws_states_given_as_arrays_tensors_and_lists_alike(folder: Path) -> None:
+    scene = neeco.load(folder / "runs" / "sample").scene
+    state, camera = scene.recorded[3]
+    (name, given), *_ = state.instruments.items()
+    convert: tuple[Callable, ...] = (np.asarray, torch.as_tensor, lambda pose: pose.tolist())
+    drawn = [scene.draw(neeco.State({name: (to(given.pose), given.joints)}, state.time), camera) for to in convert]
+    assert isinstance(neeco.State({name: (given.pose, {})}).instruments[name], InstrumentState)
+    height, width = camera.height, camera.width
+    assert drawn[0].image.shape == (height, width, 3)
+    assert drawn[0].depth.shape == drawn[0].parts.shape == (height, width)
+    assert drawn[0].masks.shape[1:] == (height, width)
+    assert len(drawn[0].instruments) == len(drawn[0].boxes) == len(drawn[0].keypoints)
+    for other in drawn[1:]:
+        assert torch.equal(other.image, drawn[0].image)
+        assert torch.equal(other.parts, drawn[0].parts)
+    plain = scene.draw(state, camera, labels=False)
+    assert torch.equal(plain.image, drawn[0].image)
+    assert not hasattr(plain, "masks")
+
+
+def test_a_run_evaluates_as_the_command_does(folder: Path) -> None:
+    scores = neeco.load(folder / "runs" / "sample").evaluate(["test"])
+    assert scores["given"]["test"]["frames"] == 12
+    with pytest.raises(neeco.NeecoError, match="nowhere"):
+        neeco.load(folder / "runs" / "sample").evaluate(["nowhere"])
+
+
+def test_a_setting_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(neeco.NeecoError, match="deformation"):
+        neeco.train(SAMPLE, tmp_path / "run", deformation__nothing=3)
+
+
+def test_the_programs_in_examples_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = folder / "runs" / "sample"
+    example("02_train_on_the_fly").main(run, steps=2, workers=0)
+    example("03_own_states").main(run, size=2)
+    assert (run / "states.png").exists()
+    example("04_own_method").main(tmp_path / "sway", iterations=5)
+    example("05_own_capture").main(tmp_path / "capture", iterations=5, method="3dgs")
+    example("06_other_formats").main(run, tmp_path / "dataset", count=2)
+    printed = capsys.readouterr().out
+    assert "0 problems" in printed
+    assert "COCO: 2 images" in printed
