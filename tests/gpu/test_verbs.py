@@ -144,7 +144,7 @@ def test_the_viewer_draws_every_view(run: str, device: torch.device) -> None:
         drawn, expected = (render_run(runs, 0, controls, camera, 2, view) for runs in (there, here))
         difference = np.abs(drawn.picture.pixels.astype(float) - expected.picture.pixels)
         assert (difference > 2).mean() < 0.01, view
-    score = scored(there, 0, drawn).score
+    score = scored(drawn).score
     assert score is not None
     assert score.psnr > 20
 

@@ -11,7 +11,7 @@ from PIL import Image
 from neeco.errors import NeecoError
 from neeco.ingest.columns import Units
 from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recording import Splits, read_recording, recording_from_flags
+from neeco.ingest.recording import IngestSettings, Splits, read_recording, recording_from_flags
 from neeco.ingest.template import write_template
 
 HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
@@ -118,6 +118,7 @@ laparoscope: logs/camera.csv
 sync: {em: 0.04, jaw: -1}
 frames: 100
 splits: {test_every: 0, unseen_fraction: 0.1, unseen_by: jaw, unseen: [3, 10-12]}
+settings: {shape_frames: 20, tracker_noise_mm: 1}
 """
 
 
@@ -132,6 +133,13 @@ def test_everything_at_once(world, folder):
     assert recording.clocks == ("em", "jaw")
     assert recording.sync == {"em": 0.04, "jaw": -1.0}
     assert recording.splits == Splits(0, 0.1, "jaw", (), ((3, 3), (10, 12)))
+    assert recording.settings == IngestSettings(shape_frames=20, tracker_noise_mm=1)
+
+
+def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder):
+    recording = read_recording(world.text("video: video.mp4\nsplits: {test: [3]}\n", "recording.yaml"))
+    assert recording.settings == IngestSettings()
+    assert recording.splits == Splits(8, 0.15, None, ((3, 3),))
 
 
 @pytest.mark.parametrize(
@@ -167,6 +175,17 @@ def test_everything_at_once(world, folder):
         ("video: {file: video.mp4, fps: 50}", "images: {folder: logs}", r"images\.fps: when were the images taken\?"),
         ("instruments:\n", "instruments: 3\nx:\n", r"unknown key"),
         ("frames: 100", "frames: [100", r"line \d+: not valid YAML"),
+        ("shape_frames: 20", "shape_frame: 20", r"settings\.shape_frame: unknown key; did you mean shape_frames\?"),
+        (
+            "shape_frames: 20",
+            "shape_frames: 0",
+            r"settings\.shape_frames: 0 is out of range; give a whole number, 1 or",
+        ),
+        (
+            "tracker_noise_mm: 1",
+            "tracker_noise_mm: 0",
+            r"settings\.tracker_noise_mm: 0 is out of range; give a number above",
+        ),
     ],
 )
 def test_mistakes_are_told_with_their_key(world, folder, old, new, message):

@@ -1,10 +1,10 @@
-"""Which rows of a log are in use, and what is said of the others."""
+"""Log files become tables, whatever their suffix; which rows are in use, and what the notes say of the others."""
 
 import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.formats import read_table
+from neeco.ingest.formats import log_formats, read_table
 from neeco.ingest.logs import Rows
 
 
@@ -30,3 +30,16 @@ def test_a_few_wrong_rows_are_dropped_and_many_refuse_the_file(rows):
     assert rows.notes() == ("log.csv: 2 rows dropped: is wrong (lines 2, 3)",)
     with pytest.raises(NeecoError, match=r"lines 4, 5, 6, \.\.\. \(18 of 38 rows\): is wrong; mend it"):
         rows.drop_wrong(np.arange(40) < 20, "is wrong; mend it")
+
+
+@pytest.mark.parametrize("name", ["log.csv", "LOG.TSV", "log.dat", "log"])
+def test_a_file_that_no_other_format_claims_is_delimited_text(tmp_path, name):
+    (tmp_path / name).write_text("# a comment\nt_s\tx\n0\t1\n1\t2\n")
+    table = read_table(tmp_path / name)
+    assert table.header == ("t_s", "x")
+    assert table.lines.tolist() == [3, 4]
+
+
+def test_every_format_says_which_suffixes_it_reads():
+    assert {".csv", ".tsv", ".txt"} <= set(log_formats())
+    assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in log_formats())

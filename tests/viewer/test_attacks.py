@@ -183,22 +183,55 @@ def test_what_is_not_understood_ends_that_connection_alone(
     assert "Traceback" not in capfd.readouterr().err
 
 
+def press(connection: ClientConnection, client: Any, label: str, value: Any = 1) -> None:
+    """Say that the user set the control of that name."""
+    handles = {handle._impl.props.label: handle for handle in client.gui._gui_input_handle_from_uuid.values()}
+    update = {"type": "GuiUpdateMessage", "uuid": handles[label]._impl.uuid, "updates": {"value": value}}
+    connection.send(msgspec.msgpack.encode(update))
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    until = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_the_buttons_of_a_page_save_states_and_images(made_run: Path, serve: Serve, tmp_path: Path, caplog) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(made_run, run)
+    viewer = serve(run)
+    with opened(port_of(viewer)) as connection:
+        looks(connection)
+        client = client_of(viewer)
+        (session,) = viewer.render_thread.sessions
+        press(connection, client, "along shaft (mm)", 5.0)
+        press(connection, client, "drag it in the scene", True)
+        wait_until(lambda: session.overlays.gizmo_pose("grasper") is not None)
+        for _ in range(2):
+            press(connection, client, "keep this state")
+        wait_until(lambda: "kept: 2 in" in session._panel.saved.content)
+        press(connection, client, "forget the last kept")
+        wait_until(lambda: "kept: 1 in" in session._panel.saved.content)
+        press(connection, client, "save labelled image")
+        wait_until(lambda: "written:" in session._panel.saved.content)
+        press(connection, client, "show", "unobserved")
+        wait_until(lambda: "magenta: unobserved" in session._panel.status.content)
+        press(connection, client, "back to the recording")
+        wait_until(lambda: session.overlays.gizmo_pose("grasper") is None)
+    assert len((run / "kept" / "states.jsonl").read_text().splitlines()) == 1
+    assert not [record for record in caplog.records if record.exc_info]
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e300, 1e9])
 def test_a_place_that_is_none_does_not_end_the_others_pictures(made_run: Path, serve: Serve, value: float) -> None:
     viewer = serve(made_run)
     with opened(port_of(viewer)) as connection:
         looks(connection)
-        panel = client_of(viewer).gui
-        handles = {handle._impl.props.label: handle for handle in panel._gui_input_handle_from_uuid.values()}
-        for label, said in (("frame", value), ("along shaft (mm)", value), ("play", True)):
-            update = {"type": "GuiUpdateMessage", "uuid": handles[label]._impl.uuid, "updates": {"value": said}}
-            connection.send(msgspec.msgpack.encode(update))
-        go = {
-            "type": "GuiUpdateMessage",
-            "uuid": handles["go to this frame's camera"]._impl.uuid,
-            "updates": {"value": 1},
-        }
-        connection.send(msgspec.msgpack.encode(go))
+        client = client_of(viewer)
+        for label, number in (("frame", value), ("along shaft (mm)", value), ("play", True)):
+            press(connection, client, label, number)
+        press(connection, client, "go to this frame's camera")
         time.sleep(0.5)
         assert viewer.render_thread._thread.is_alive()
         assert is_served(viewer)

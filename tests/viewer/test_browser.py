@@ -215,9 +215,9 @@ def test_an_arrow_of_the_gizmo_drags_the_instrument_and_turns_nothing(page: View
     x, y = page.pixel_like(60, 140, 240, 90)
     after = page.after(lambda: page.drag(x, y, x + 40, y + 25))
     assert alike(after, scene) < ALIKE_DB  # the instrument is small in the picture
-    (visitor,) = page.server.render_thread.session
+    (session,) = page.server.render_thread.sessions
     start = to_numpy(scene.recorded.states[0].instruments["grasper"].pose)
-    end = visitor.overlays.pose("grasper")
+    end = session.overlays.gizmo_pose("grasper")
     assert end[:3, :3] == pytest.approx(start[:3, :3], abs=1e-3)
     assert np.linalg.norm(end[:3, 3] - start[:3, 3]) > 1.0
     assert alike(after, scene, pose=end) > ALIKE_DB

@@ -17,7 +17,7 @@ from neeco.scene.io import save_scene
 from neeco.training.config import TrainConfig
 from neeco.training.run import checkpoint_path
 from neeco.training.train import train
-from neeco.viewer.runs import SCENE_FILE, ViewedRuns, WatchedRun
+from neeco.viewer.runs import SCENE_FILE, ViewedRuns, WatchedRun, score_frame
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_it_is_read_again_only_when_it_has_changed(run: Path) -> None:
     save_scene(brighter(grasper_scene()), run / SCENE_FILE)
     later(run / SCENE_FILE)
     assert source.refresh()
-    assert source.loaded.serial != first.serial
+    assert source.loaded is not first
     assert (source.loaded.scene.canonical.sh_dc > first.scene.canonical.sh_dc).all()
     assert source.loaded.signature == first.signature
 
@@ -149,10 +149,10 @@ def test_every_method_can_be_looked_at(method: str, tmp_path: Path) -> None:
 
 def test_what_is_known_of_frames_is_found_out_anew_for_a_changed_run(run: Path) -> None:
     runs = ViewedRuns([run])
-    before = runs.score(0, runs.loaded[0], 2)
-    assert before is runs.score(0, runs.loaded[0], 2)
+    before = score_frame(runs.loaded[0], 2)
+    assert before is score_frame(runs.loaded[0], 2)
     save_scene(brighter(grasper_scene()), run / SCENE_FILE)
     later(run / SCENE_FILE)
     assert runs.refresh()
-    assert runs.score(0, runs.loaded[0], 2).psnr < before.psnr - 10
+    assert score_frame(runs.loaded[0], 2).psnr < before.psnr - 10
     assert runs.timelines[0].known()[0].size == 0

@@ -125,9 +125,9 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     else:
         hint = " Counts need a calibration table, `calibration`."
         values = values * named.scale_of(table.path, (value,), "angle", source.units.angle, None, hint)
-        wild = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
+        impossible = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
-        rows.drop_wrong(wild, reason)
+        rows.drop_wrong(impossible, reason)
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
     return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))

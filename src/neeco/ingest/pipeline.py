@@ -236,7 +236,7 @@ class _Ingest:
         return ResidualFlow(load, sfm, pinhole)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
-        """Clocks that neither `sync` nor the scope told: from how the instruments move in the images."""
+        """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
         unknown = {log.clock: log for log in self.data.poses.values() if log.clock not in self.data.clocks}
         if not unknown:
             return

@@ -136,7 +136,7 @@ class SynchronizedRecording:
         self.notes.append(f"{why} and is taken to be the video's{cost}")
 
     def _offset(self, log: PoseLog | ReadingLog) -> float:
-        """Seconds the log's clock is ahead; the video's own clock when motion did not tell it."""
+        """Seconds the log's clock is ahead; the video's own clock when motion did not give it."""
         if log.clock not in self.clocks:
             self._assume(log, f"the clock {log.clock!r} was not given and could not be found,")
         return self.clocks[log.clock].seconds

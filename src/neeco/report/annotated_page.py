@@ -1,4 +1,4 @@
-"""The page of `neeco annotate`: outlines over photographs, the least trusted first."""
+"""The page of `neeco annotate`: outlines over recorded images, the least trusted first."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.report.page import jpeg, to_bytes, write_page
 
 PAGE = "annotate.html"
-SHOWN = 60  # photographs: the page has to stay a file one can mail
+SHOWN = 60  # frames: the page has to stay a file one can mail
 OUTLINES = ((255, 230, 0), (0, 230, 255), (255, 90, 200), (120, 255, 80))  # of the instruments, in turn
 
 
@@ -22,7 +22,7 @@ def write_annotated_page(output: Path, records: Sequence[dict[str, Any]], captur
     """Write annotate.html into `output` and return its path. One file: its pictures are inside it.
 
     `records`: of every frame of `capture`, in its order, as `annotate_capture` returns them. Raises NeecoError when a
-    photograph cannot be read or the page cannot be written.
+    recorded image cannot be read or the page cannot be written.
     """
     ranked = sorted(range(len(records)), key=lambda k: records[k]["trust"]["value"])
     written = sum(not record.get("skipped") for record in records)
@@ -60,7 +60,7 @@ def _by_split(records: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 def _figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """One frame: its photograph with the outlines of its labels, and what is known of it."""
+    """One frame: its image with the outlines of its labels, and what is known of it."""
     trust, moved = record["trust"], record["moved"]
     return {
         "name": frame.name,
@@ -74,7 +74,7 @@ def _figure(record: dict[str, Any], frame: Frame) -> dict[str, Any]:
 
 
 def _outlined(frame: Frame, labels: Sequence[dict[str, Any]]) -> np.ndarray:
-    """The photograph uint8 [H, W, 3] with the contours of its labels."""
+    """The recorded image uint8 [H, W, 3] with the contours of its labels."""
     picture = Image.fromarray(to_bytes(frame.load_image().numpy()))
     pen = ImageDraw.Draw(picture)
     for k, label in enumerate(labels):

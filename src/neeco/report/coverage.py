@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.model import Capture
@@ -130,40 +129,35 @@ def _named(degrees: Sequence[Degree]) -> list[tuple[str, Degree]]:
 
 @page_style()
 def histogram(degree: Degree) -> str:
-    """Stacked bars of a degree of freedom, coloured by split, as inline SVG; ground outside the trained range is
-    shaded."""
+    """Stacked bars of a degree of freedom, coloured by split, as inline SVG; what training lacks is shaded."""
     low, high = float(degree.values.min()), float(degree.values.max())
     trained = degree.trained
     said = "never trained" if trained is None else f"trained {_number(trained[0])} … {_number(trained[1])}"
+    label = f"frames over {degree.name}, {degree.unit}; {said}"
     axes = new_axes((340, 150), 12, 12, 28, 22)
     axes.set_title(f"{degree.name}, {degree.unit}")
     axes.set_yticks([])
     if high - low < CONSTANT:
         axes.text(0, 0.5, f"always {_number(low)}", transform=axes.transAxes)
         axes.set_xticks([])
-        return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
+        return inline_svg(axes, label)
     axes.set_title(said, loc="right", fontsize=11, color=PALETTE["soft"])
-    axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
-    left, right = axes.get_xlim()
+    left, right = low - 0.02 * (high - low), high + 0.02 * (high - low)
+    axes.set_xlim(left, right)
     for start, end in [(left, right)] if trained is None else [(left, trained[0]), (trained[1], right)]:
         if end - start > 0.0125 * (right - left):  # a thinner one would be a stroke
             axes.axvspan(start, end, color=PALETTE["phase"], alpha=0.13, linewidth=0, gid="beyond")
-    _draw_bars(axes, degree, np.linspace(low, high, BINS + 1))
-    axes.axhline(0, color=PALETTE["edge"], linewidth=1)
-    round_ticks(axes.xaxis, 4, _number)
-    return inline_svg(axes, f"frames over {degree.name}, {degree.unit}; {said}")
-
-
-def _draw_bars(axes: Axes, degree: Degree, edges: np.ndarray) -> None:
-    names = sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name))
-    floor = np.zeros(BINS)
-    for name in names:
-        count = np.histogram(degree.of(name), edges)[0]
-        kept, color = count > 0, PALETTE[SPLIT_COLORS.get(name, "soft")]
-        middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
-        axes.bar(middles[kept], count[kept], 0.92 * width, floor[kept], color=color)
+    edges, floor = np.linspace(low, high, BINS + 1), np.zeros(BINS)
+    middles, width = (edges[:-1] + edges[1:]) / 2, edges[1] - edges[0]
+    for name in sorted(set(degree.splits), key=lambda name: [*SPLIT_COLORS, name].index(name)):
+        count, color = np.histogram(degree.of(name), edges)[0], PALETTE[SPLIT_COLORS.get(name, "soft")]
+        filled = count > 0
+        axes.bar(middles[filled], count[filled], 0.92 * width, floor[filled], color=color)
         floor += count
     axes.set_ylim(0, max(1.0, floor.max()))
+    axes.axhline(0, color=PALETTE["edge"], linewidth=1)
+    round_ticks(axes.xaxis, 4, _number)
+    return inline_svg(axes, label)
 
 
 def _number(value: float) -> str:

@@ -21,7 +21,7 @@ from neeco.evaluation.image_metrics import difference_map
 from neeco.files import write_text
 
 REPORT_FILE = "report.html"
-MAX_WIDTH = 480  # px of a picture; the page has to stay a file one can mail
+MAX_WIDTH, PREVIEW_WIDTH = 480, 1400  # px of a picture; the page has to stay a file one can mail
 SPLITS = {  # what the usual names of splits mean
     "test": "states inside the recorded range",
     "unseen": "states outside the recorded range",
@@ -51,37 +51,33 @@ def now() -> datetime:
     return datetime.now().astimezone()
 
 
-def difference(image: np.ndarray, photograph: np.ndarray, counted: Tensor | None) -> str:
-    """The difference map of two images [H, W, 3] as a data URI; black also where `counted` [H, W] is False."""
-    compared = image if counted is None else np.where(counted.numpy()[..., None], image, photograph)
-    return png(difference_map(compared, photograph))
+def difference(image: np.ndarray, recorded: np.ndarray, counted: Tensor | None) -> str:
+    """The difference map of two images [H, W, 3] as a data URI, without loss: its colours mean numbers. It is black
+    also where `counted` [H, W] is False."""
+    compared = image if counted is None else np.where(counted.numpy()[..., None], image, recorded)
+    return _data_uri(Image.fromarray(difference_map(compared, recorded)), "PNG", optimize=True)
 
 
 def jpeg(pixels: np.ndarray) -> str:
     """A data URI of uint8 [H, W, 3], shrunk to at most MAX_WIDTH px wide."""
-    return _uri(Image.fromarray(pixels), "JPEG", "image/jpeg", quality=88)
+    return _data_uri(Image.fromarray(pixels), "JPEG", quality=88)
 
 
-def png(pixels: np.ndarray) -> str:
-    """The same without loss, for maps whose colours mean numbers."""
-    return _uri(Image.fromarray(pixels), "PNG", "image/png", optimize=True)
-
-
-def file_uri(path: Path, max_width: int = 1400) -> str:
-    """An image file as a data URI. Raises NeecoError when it cannot be read."""
+def preview_uri(path: Path) -> str:
+    """The file of a preview of synthesised images as a data URI. Raises NeecoError when it cannot be read."""
     try:
         with Image.open(path) as image:
-            return _uri(image.convert("RGB"), "JPEG", "image/jpeg", max_width=max_width, quality=86)
+            return _data_uri(image.convert("RGB"), "JPEG", PREVIEW_WIDTH, quality=86)
     except (OSError, SyntaxError, ValueError) as error:
         raise NeecoError(f"{path}: synthesis preview: cannot be read: {error}") from error
 
 
-def _uri(image: Image.Image, form: str, mime: str, max_width: int = MAX_WIDTH, **options: Any) -> str:
+def _data_uri(image: Image.Image, form: str, max_width: int = MAX_WIDTH, **options: Any) -> str:
     if image.width > max_width:
         image = image.resize((max_width, round(image.height * max_width / image.width)), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     image.save(stream, form, **options)
-    return f"data:{mime};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
+    return f"data:image/{form.lower()};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.report.charts import SMALL, Series, line_chart, short
-from neeco.report.page import REPORT_FILE, difference, file_uri, jpeg, split_counts, to_bytes, write_page
+from neeco.report.page import REPORT_FILE, difference, jpeg, preview_uri, split_counts, to_bytes, write_page
 from neeco.scene import Drawable
 
 MAX_POINTS = 300  # of a training curve
@@ -34,7 +34,7 @@ class Score(NamedTuple):
 
 
 SCORES = (
-    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the photograph's; 30 is close, 20 is rough."),
+    Score("psnr", "PSNR dB", "{:.2f}", "How close the drawn pixels are to the recorded; 30 is close, 20 is rough."),
     Score("ssim", "SSIM", "{:.3f}", "Structural similarity, 1 is equal (11x11 Gaussian window, as 3DGS scores it)."),
     Score("lpips", "LPIPS", "{:.3f}", "Perceptual distance by AlexNet features (Zhang et al. 2018); 0 is equal."),
     Score("lpips_vgg", "LPIPS VGG", "{:.3f}", "The same by VGG16 features."),
@@ -42,13 +42,13 @@ SCORES = (
     Score("mask_iou", "mask IoU", "{:.3f}", "Label mask against true mask: shared area over joint area; 1 is perfect."),
     Score("psnr_covered", "PSNR covered", "{:.2f}", "PSNR without the tissue that no training frame saw."),
     Score("covered_fraction", "covered", "{:.1%}", "How much of the visible tissue at least one training frame saw."),
-    Score("fps", "FPS", "{:.1f}", "Posed drawings per second on the machine that evaluated."),
+    Score("fps", "FPS", "{:.1f}", "Posed images rendered per second on the machine that evaluated."),
     Score("num_gaussians", "Gaussians", "{:,}", "How many Gaussians one drawing uses."),
     Score("frames", "frames", "{}", "How many frames were scored."),
 )  # fmt: skip
 KINDS = {
     "given": "As given: drawn at the poses the capture states, tracker errors included",
-    "aligned": "Aligned: instrument and camera pose fitted to each photograph first, the scene unchanged",
+    "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
 }
 KIND_NAMES = {"given": "as given", "aligned": "aligned"}
 PARTS = ("shaft", "wrist", "jaws", "jaw_left", "jaw_right")
@@ -71,7 +71,11 @@ def write_report(
     """
     rows = read_metrics(run_path / "metrics.jsonl")
     kind = "aligned" if "aligned" in evaluation else "given"
-    figures = frame_figures(evaluation, capture, scene, kind)
+    curves = [
+        curve(rows, "psnr", "PSNR of training frames, dB"),
+        curve(rows, "loss", "loss (log scale)", logarithmic=True),
+        curve(rows, "num_gaussians", "Gaussians"),
+    ]
     config = run_path / "config.yaml"
     return write_page(
         run_path / REPORT_FILE,
@@ -89,32 +93,24 @@ def write_report(
         notes=evaluation.get("notes", ()),
         part_head=["split", *(part.replace("_", " ") for part in PARTS), "jaws matched"],
         parts=_parts(evaluation),
-        figures=figures,
+        figures=frame_figures(evaluation, capture, scene, kind),
         drawn=KIND_NAMES[kind],
         full_scale=FULL_SCALE,
         tints=_tints(scene),
-        curves=_curves(rows),
+        curves=[chart for chart in curves if chart],
         **_diagnostics(getattr(scene, "diagnostics", {})),
-        preview=synthesis_preview and file_uri(synthesis_preview),
+        preview=synthesis_preview and preview_uri(synthesis_preview),
         playable=playable,
         facts=_facts(capture, scene, rows),
         config=config.read_text(encoding="utf-8", errors="replace") if config.is_file() else "",
     )
 
 
-@dataclass(frozen=True)
-class FrameFigure:
-    """One frame's row of pictures and what the caption says of it."""
+def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[dict[str, Any]]:
+    """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`.
 
-    split: str
-    name: str
-    why: str  # best, median, worst
-    scores: tuple[str, ...]
-    pictures: tuple[tuple[str, str], ...]  # (what it is, data URI)
-
-
-def frame_figures(evaluation: dict[str, Any], capture: Capture, scene: Drawable, kind: str) -> list[FrameFigure]:
-    """For every evaluated split the best, the median and the worst frame by PSNR, drawn at the poses of `kind`."""
+    Each has `split`, `name`, `why` (best, median, worst), `scores` (words) and `pictures`: (what it is, data URI).
+    """
     figures = []
     for split, rows in evaluation.get("per_frame", {}).get(kind, {}).items():
         frames = {frame.name: frame for frame in capture.split(split)}
@@ -135,48 +131,42 @@ def chosen_rows(rows: Sequence[dict[str, Any]]) -> list[tuple[str, dict[str, Any
     return [(why, ranked[place]) for place, why in sorted(chosen.items())]
 
 
-def _figure(capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]) -> FrameFigure:
-    state, camera = _poses(frame, row)
-    drawing = draw(scene, state, camera)
-    photograph, image = frame.load_image().numpy(), drawing.image.numpy()
-    reference = load_reference(capture, frame)
+def _figure(
+    capture: Capture, scene: Drawable, split: str, frame: Frame, why: str, row: dict[str, Any]
+) -> dict[str, Any]:
+    drawing = draw(scene, *_poses(frame, row))
+    recorded, image = frame.load_image().numpy(), drawing.image.numpy()
     pictures = [
-        ("photograph", jpeg(to_bytes(photograph))),
+        ("recorded image", jpeg(to_bytes(recorded))),
         ("drawn", jpeg(to_bytes(image))),
-        ("difference", difference(image, photograph, frame.load_mask())),
+        ("difference", difference(image, recorded, frame.load_mask())),
     ]
     if drawing.parts is not None:
-        overlay = overlay_parts(photograph, drawing.parts.numpy())
+        overlay = overlay_parts(recorded, drawing.parts.numpy())
+        reference = load_reference(capture, frame)
         if reference is not None:
             overlay = overlay_outline(overlay, reference.mask.numpy())
-        pictures.append(("label mask over photograph", jpeg(overlay)))
-    return FrameFigure(split, frame.name, why, tuple(_scores(row)), tuple(pictures))
-
-
-def _scores(row: dict[str, Any]) -> list[str]:
-    """What evaluation found of a frame, in words."""
+        pictures.append(("label mask over recorded image", jpeg(overlay)))
     scores = [f"{row['psnr']:.2f} dB"]
     if row.get("mask_iou") is not None:
         scores.append(f"IoU {row['mask_iou']:.3f}")
-    moves = row.get("moved", {}).items()
-    return [*scores, *(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°" for body, moved in moves)]
+    for body, moved in row.get("moved", {}).items():
+        scores.append(f"{body} moved {moved['mm']:.2f} mm, {moved['deg']:.2f}°")
+    return {"split": split, "name": frame.name, "why": why, "scores": scores, "pictures": pictures}
 
 
 def _poses(frame: Frame, row: dict[str, Any]) -> tuple[State, Camera]:
     """The fitted poses that evaluation recorded in the row, or the frame's own."""
     state, camera = frame.state, frame.camera
-    if "world_from_camera" in row:
-        pose = camera.world_from_camera
-        camera = replace(camera, world_from_camera=torch.tensor(row["world_from_camera"], dtype=pose.dtype))
-        fitted = row["world_from_instrument"]
-        state = replace(
-            state,
-            instruments={
-                name: replace(given, pose=torch.tensor(fitted[name], dtype=torch.float64)) if name in fitted else given
-                for name, given in state.instruments.items()
-            },
-        )
-    return state, camera
+    if "world_from_camera" not in row:
+        return state, camera
+    pose = torch.tensor(row["world_from_camera"], dtype=camera.world_from_camera.dtype)
+    fitted = {name: torch.tensor(matrix, dtype=torch.float64) for name, matrix in row["world_from_instrument"].items()}
+    instruments = {
+        name: replace(given, pose=fitted[name]) if name in fitted else given
+        for name, given in state.instruments.items()
+    }
+    return replace(state, instruments=instruments), replace(camera, world_from_camera=pose)
 
 
 def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
@@ -190,7 +180,7 @@ def _tiles(evaluation: dict[str, Any], labelled: str) -> list[tuple[str, str]]:
             tiles.append((f"{numbers['mask_iou']:.3f}", f"mask IoU, {split}, {KIND_NAMES[labelled]}"))
     first = next(iter(evaluation["given"].values()), None)
     if first is not None:
-        tiles.append((f"{first['fps']:.1f}", "posed drawings per second"))
+        tiles.append((f"{first['fps']:.1f}", "posed images rendered per second"))
         if first["num_gaussians"] is not None:
             tiles.append((f"{first['num_gaussians']:,}", "Gaussians"))
     return tiles
@@ -235,22 +225,12 @@ def _tints(scene: Drawable) -> list[tuple[str, str]]:
     return tints
 
 
-def _curves(rows: list[dict[str, Any]]) -> list[str]:
-    charts = [
-        curve(rows, "psnr", "PSNR of training frames, dB"),
-        curve(rows, "loss", "loss (log scale)", logarithmic=True),
-        curve(rows, "num_gaussians", "Gaussians"),
-    ]
-    return [chart for chart in charts if chart]
-
-
 def _diagnostics(diagnostics: Mapping[str, Any]) -> dict[str, Any]:
     """What the scene says about its own joints, from training data alone."""
-    told = _flat(diagnostics)
-    judged = [key.split(" · ")[-1] == "verdict" for key, _ in told]
+    items = [(name, value, name.split(" · ")[-1] == "verdict") for name, value in _flat(diagnostics)]
     return {
-        "diagnostics": [(key, _plain(value)) for (key, value), judges in zip(told, judged, strict=True) if not judges],
-        "verdicts": [value for (_, value), judges in zip(told, judged, strict=True) if judges],
+        "diagnostics": [(name, _plain(value)) for name, value, is_verdict in items if not is_verdict],
+        "verdicts": [value for _, value, is_verdict in items if is_verdict],
     }
 
 
@@ -311,7 +291,7 @@ def phase_starts(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
 def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: bool = False) -> str:
     """A chart of `key` over iterations, dashed lines where a phase begins; "" when fewer than two rows have numbers."""
     points = [(float(row["iteration"]), float(row[key])) for row in rows if _is_number(row.get(key))]
-    points = _thinned([(x, y) for x, y in points if y > 0 or not logarithmic])
+    points = _averaged([(x, y) for x, y in points if y > 0 or not logarithmic])
     if len(points) < 2:
         return ""
     series = [Series("", 0, tuple(points))]
@@ -319,8 +299,8 @@ def curve(rows: Sequence[dict[str, Any]], key: str, title: str, *, logarithmic: 
     return line_chart(title, "iterations", series, starts=starts, note=note, logarithmic=logarithmic, size=SMALL)
 
 
-def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """At most MAX_POINTS points: means of equal runs, so that a noisy curve reads as its trend."""
+def _averaged(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """At most MAX_POINTS points: means of equally many, so that a noisy curve reads as its trend."""
     if len(points) <= MAX_POINTS:
         return points
     run = -(-len(points) // MAX_POINTS)

@@ -52,7 +52,7 @@ class Panel:
     def __init__(self, client: viser.ClientHandle, runs: Sequence[LoadedRun], actions: Actions) -> None:
         self._gui, self._runs, self._actions = client.gui, tuple(runs), actions
         self._worst: list[int] = []
-        self._plotted: tuple[tuple[int, int], ...] = ()  # what is known of the frames, as it was shown last
+        self._plotted: tuple[tuple[Timeline, int], ...] = ()  # and how many frames were known when they were shown
         self._plotted_at = 0.0
         self._gui.main_panel.dock_right()  # or it would hide a part of the picture
         self.status = self._gui.add_html("")
@@ -81,7 +81,7 @@ class Panel:
 
     def show_timelines(self, timelines: Sequence[Timeline]) -> None:
         """Draw what is known of the frames' PSNR, and list the worst."""
-        so_far = tuple((timeline.loaded.serial, timeline.count) for timeline in timelines)
+        so_far = tuple((timeline, timeline.count) for timeline in timelines)
         now = time.perf_counter()
         grows = any(not timeline.done for timeline in timelines)
         if so_far == self._plotted or (grows and now - self._plotted_at < PLOTS_EVERY_S):

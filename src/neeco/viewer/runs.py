@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,15 +36,17 @@ SCENE_FILE = "scene.safetensors"
 ASSUMED_MM = 100.0  # from a camera to what it looks at, where no camera looks at the scene's centre
 DISTANCE_UNITS = 10.0  # viser's units of length, from a recorded camera to what it looks at
 WATCH_S = 2.0  # between two looks at the run folders
-MAX_SCORES = 4096  # remembered
 TIMELINE_WIDTH = 320  # px at most of the images that a timeline compares
 FIELD_WIDTH = 48  # px, of a radiance field's, which take a hundred times as long
 WORST = 8  # frames that a timeline lists
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoadedRun:
-    """What a run folder held when it was read. Frames are in the order they were recorded in, all splits together."""
+    """What a run folder held when it was read; another reading is another object.
+
+    Frames are in the order they were recorded in, all splits together.
+    """
 
     name: str
     world: str  # the capture's folder: runs of one capture share their world frame
@@ -56,7 +57,6 @@ class LoadedRun:
     shafts: dict[str, Shaft]
     iteration: int | None  # that training had reached; None: it has finished
     trouble: str = ""  # why the capture is not at hand
-    serial: int = field(default_factory=itertools.count().__next__)  # tells one reading from another
 
     @cached_property
     def labels(self) -> Tensor | None:
@@ -176,6 +176,7 @@ class FrameScore:
     iou: float | None  # of all instruments together; None: nobody drew a true mask, or the scene has no labels
 
 
+@lru_cache(maxsize=4096)
 @torch.no_grad()
 def score_frame(loaded: LoadedRun, index: int) -> FrameScore:
     """What `neeco evaluate` would say of one frame of `loaded.frames`. Raises NeecoError for unreadable files."""
@@ -272,8 +273,6 @@ class ViewedRuns:
         self.distance = self.loaded[0].distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
         self.timelines = [Timeline(loaded) for loaded in self.loaded]
-        self._scores: dict[tuple[int, int, int], FrameScore] = {}
-        self._images: dict[int, tuple[tuple[int, int], np.ndarray]] = {}
         self._ended = threading.Event()
 
     @property
@@ -281,33 +280,13 @@ class ViewedRuns:
         """What the runs held when they were read last."""
         return [run.loaded for run in self.watched]
 
-    def score(self, number: int, loaded: LoadedRun, frame: int) -> FrameScore | None:
-        """How well run `number` draws a recorded frame; None where its capture is not at hand. Raises NeecoError."""
-        if not loaded.frames:
-            return None
-        key = number, loaded.serial, frame
-        if key not in self._scores:
-            if len(self._scores) >= MAX_SCORES:
-                self._scores.clear()
-            self._scores[key] = score_frame(loaded, frame)
-        return self._scores[key]
-
-    def recorded_image(self, number: int, loaded: LoadedRun, frame: int) -> np.ndarray:
-        """A frame's recorded image [H, W, 3] in [0, 1]; the last one is remembered. Raises NeecoError."""
-        key = loaded.serial, frame
-        known = self._images.get(number)
-        if known is None or known[0] != key:
-            known = key, loaded.frames[frame].load_image().numpy()
-            self._images[number] = known
-        return known[1]
-
     def refresh(self) -> bool:
         """Read what has changed; whether anything was. Its frames are scored anew."""
         changed = [run.refresh() for run in self.watched]
         for number, loaded in enumerate(self.loaded):
             if changed[number]:
                 self.timelines[number] = Timeline(loaded)
-                self._scores.clear()
+                score_frame.cache_clear()  # or it would hold the scenes of before
         return any(changed)
 
     def watch(self, changed: Callable[[], None]) -> None:

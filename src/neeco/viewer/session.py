@@ -379,7 +379,7 @@ class ClientSession:
         notes = list(dict.fromkeys(part.note for part in parts if part.note))
         if sharp:  # else things move on before the numbers are read
             try:
-                parts = [scored(self._runs, part) for part in parts]
+                parts = [scored(part) for part in parts]
             except NeecoError as error:
                 notes.append(str(error))
         size = whole.pixels.shape[1], whole.pixels.shape[0]

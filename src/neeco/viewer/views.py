@@ -18,7 +18,7 @@ from neeco.raster.devices import readable_failures
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.scene import gaussian_scene
 from neeco.viewer.controls import Controls, controlled_state, corresponding_frame
-from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns
+from neeco.viewer.runs import FrameScore, LoadedRun, ViewedRuns, score_frame
 from neeco.viewer.viser_scene import carried_over, stands_at
 
 if TYPE_CHECKING:
@@ -48,7 +48,6 @@ class Picture:
 class RunPicture:
     """A run's part of the window, and what the status says of it."""
 
-    number: int  # of the run
     loaded: LoadedRun
     picture: Picture
     frame: float  # where in the recording
@@ -149,7 +148,7 @@ def render_run(
     note = ""
     with scene.torch_threads(), readable_failures():
         if view == DIFFERENCE and frame is not None and as_recorded and loaded.frames:
-            image = runs.recorded_image(number, loaded, frame)
+            image = loaded.frames[frame].load_image().numpy()
             shown = difference(scene, state, loaded.recorded.cameras[frame], image, camera)
         elif view in views_of(scene, False):
             shown = picture(scene, state, camera, view, loaded.labels)
@@ -157,9 +156,7 @@ def render_run(
             shown = dimmed(picture(scene, state, camera, IMAGE))
             note = ONLY_RECORDED if view == DIFFERENCE else f"{view}: a scene of method {scene.method} has none"
     trouble = runs.watched[number].trouble or loaded.trouble
-    return RunPicture(
-        number, loaded, shown, controls.frame, frame is not None, as_recorded, note or shown.note, trouble
-    )
+    return RunPicture(loaded, shown, controls.frame, frame is not None, as_recorded, note or shown.note, trouble)
 
 
 def _in_world_of(
@@ -179,12 +176,12 @@ def _in_world_of(
     )
 
 
-def scored(runs: ViewedRuns, shown: RunPicture) -> RunPicture:
-    """The same with its score, where the frame is seen as recorded. Raises NeecoError."""
-    if not shown.seen_as_recorded:
+def scored(shown: RunPicture) -> RunPicture:
+    """The same with its score, where the frame is seen as recorded and its capture at hand. Raises NeecoError."""
+    if not shown.seen_as_recorded or not shown.loaded.frames:
         return shown
     with shown.loaded.scene.torch_threads():
-        return replace(shown, score=runs.score(shown.number, shown.loaded, int(shown.frame)))
+        return replace(shown, score=score_frame(shown.loaded, int(shown.frame)))
 
 
 def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
