@@ -3,48 +3,34 @@
 from __future__ import annotations
 
 import io
-from typing import Any
 
 import pytest
 from rich.console import Console
 
 from neeco.cli.ablate import _print_tables
+from neeco.experiments.ablation_study import AblationResult, AblationRow, AblationTable
 
 MEASURES = ["psnr.test", "psnr.unseen", "mask_iou.test", "mask_iou.unseen"]
 
 
-def _row(label: str, reference: bool, psnr: float | None, **more: Any) -> dict[str, Any]:
+def _row(label: str, reference: bool, psnr: float | None, agrees: dict[str, str | None] | None = None) -> AblationRow:
     values = {} if psnr is None else dict(zip(MEASURES, (psnr, psnr - 2, 0.7, 0.5), strict=True))
-    difference = {} if reference else {key: 0.25 for key in values}
-    return {
-        "comparison": "c",
-        "label": label,
-        "reference": reference,
-        "values": values,
-        "difference": difference,
-    } | more
+    difference = {} if reference else dict.fromkeys(values, 0.25)
+    return AblationRow("c", label, reference, "run", values, {}, "", difference, agrees or {})
+
+
+def _table(title: str, judged: list[str], rows: list[AblationRow]) -> AblationTable:
+    return AblationTable("name", "group", title, "", judged, [] if judged else MEASURES, rows, [])
 
 
 @pytest.mark.parametrize("width", [50, 160])
 def test_own_tables_are_printed_whole_and_the_papers_as_their_verdict(width: int) -> None:
-    judged = {"paper": {}, "paper_direction": "", "agrees": {"psnr.test": "yes"}}
-    ablation = {
-        "tables": [
-            {
-                "title": "The paper's",
-                "judged": ["psnr.test"],
-                "measures": [],
-                "rows": [_row("x", False, 1.0, **judged)],
-            },
-            {
-                "title": "Joints, taken away one after another from a hand",
-                "judged": [],
-                "measures": MEASURES,
-                "rows": [_row("[off]", False, 21.25), _row("on", True, 22.5), _row("lost", False, None)],
-            },
-        ],
-        "notes": ["[few] steps"],
-    }
+    rows = [_row("[off]", False, 21.25), _row("on", True, 22.5), _row("lost", False, None)]
+    tables = [
+        _table("The paper's", ["psnr.test"], [_row("x", False, 1.0, {"psnr.test": "yes"})]),
+        _table("Joints, taken away one after another from a hand", [], rows),
+    ]
+    ablation = AblationResult("", "", "", 0, {}, {}, [], [], tables, [], [], ["[few] steps"])
     console = Console(width=width, record=True, file=io.StringIO())
     _print_tables(console, ablation)
     shown = console.export_text()
