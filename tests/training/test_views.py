@@ -78,9 +78,9 @@ def test_pixels_stay_in_the_hosts_memory_where_the_device_is_too_small(
 def test_a_fields_rays_are_all_on_the_device(views: TrainingViews) -> None:
     table = RayTable(views.prefetched_to(torch.device("meta")))
     assert table.pixels.is_meta
-    assert table.counted is not None
-    assert table.counted.is_meta
-    assert len(table.pixels) == len(table.counted) == sum(image[..., 0].numel() for image in views.images)
+    assert table.valid is not None
+    assert table.valid.is_meta
+    assert len(table.pixels) == len(table.valid) == sum(image[..., 0].numel() for image in views.images)
 
 
 def test_a_run_learns_the_same_from_frames_that_are_copied(capture: Path, views: TrainingViews) -> None:
