@@ -240,15 +240,15 @@ def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) 
                 place = {"split": frame.split, "frame": frame.name, "name": name, "seed": seed}
                 scores[index].append(place | {"psnr": score})
     sections = []
-    for frame, pictures in zip(chosen, images, strict=True):
+    for frame, by_method in zip(chosen, images, strict=True):
         recorded_image, reference = to_bytes(frame.load_image().numpy()), load_reference(capture, frame)
         shown = [jpeg(recorded_image)]
         if reference is not None:
             shown.append(jpeg(overlay_outline(recorded_image, reference.mask.numpy())))
         recording = Images("recorded image", tuple(shown), f"recorded image, frame {frame.name}")
-        if pictures:
+        if by_method:
             title = f"{frame.split}, frame {frame.name}"
-            sections.append(Section(title=title, level=3, images=[recording, *pictures]))
+            sections.append(Section(title=title, level=3, images=[recording, *by_method]))
     return sections, csv_text(["split", "frame", "name", "seed", "psnr"], [row for rows in scores for row in rows])
 
 
