@@ -42,7 +42,7 @@ def prepare() -> None:
         "neeco.experiments.downstream.experiment",
         "neeco.ingest.pipeline",
         "neeco.ingest.convert",
-        "neeco.report.annotated_page",
+        "neeco.report.run_page",
         "neeco.report.study_pages",
         "neeco.report.downstream_page",
         "neeco.report.ingest_page",

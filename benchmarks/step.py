@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from neeco.capture.check import read_checked
-from neeco.raster import cpu, losses, posing, shadow
+from neeco.raster import losses, native, posing, shadow
 from neeco.raster.native import keep_freed_memory, set_threads
 from neeco.raster.optimizer import Adam
 from neeco.scene.training_views import TrainingViews
@@ -31,8 +31,8 @@ from neeco.training.run import read_checkpoint, read_config, restore_session, st
 
 PARTS: list[tuple[Any, str, str]] = [
     (steps.Scene, "at", "Scene.at beside posing"),
-    (cpu._Rasterize, "forward", "drawing, shadow maps too"),
-    (cpu._Rasterize, "backward", "drawing, backward"),
+    (native._Rasterize, "forward", "drawing, shadow maps too"),
+    (native._Rasterize, "backward", "drawing, backward"),
     (shadow, "blocked", "shadows"),
     (shadow._Blocked, "backward", "shadows, backward"),
     (posing._Pose, "backward", "posing, backward"),

@@ -17,7 +17,7 @@ from neeco.capture import Camera, Capture, Problem, State, check_capture, read_c
 from neeco.capture.model import Instrument
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
-from neeco.labels.labelled_image import LabelledImage, RGBDImage, draw_labelled
+from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
 from neeco.raster.devices import device_of
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene

@@ -16,9 +16,9 @@ from neeco.raster.reference import (
     camera_from_world,
     depth_keys,
     project,
+    rotation_matrices,
     usable_gaussians,
 )
-from neeco.raster.sh import rotation_matrices
 
 TOLERANCE = 1e-3
 

@@ -148,8 +148,7 @@ def test_the_kernels_of_a_training_step_compile_without_a_gpu(
 ) -> None:
     import triton
 
-    from neeco.raster.triton.adam import step_together
-    from neeco.raster.triton.photometric import photometric
+    from neeco.raster.triton.photometric import photometric, step_together
 
     triton.runtime.driver.set_active(NoDevice(capability))
     image, target = torch.rand(2, 20, 30, 3)

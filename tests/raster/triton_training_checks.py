@@ -15,7 +15,7 @@ from neeco.errors import NeecoError
 from neeco.raster import losses, optimizer
 from neeco.raster.losses import photometric_loss, photometric_loss_reference
 from neeco.raster.optimizer import Adam, Update, adam_step, adam_steps
-from neeco.raster.triton import adam
+from neeco.raster.triton import photometric
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of the interpreter
 
@@ -117,8 +117,8 @@ def test_a_step_of_many_tensors_is_each_ones_own(sizes: list[int], betas: tuple[
 
 def test_one_launch_steps_all_tensors_that_have_a_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
     launches: list[int] = []
-    real = adam.step_together
-    monkeypatch.setattr(adam, "step_together", lambda *args: launches.append(len(args[0])) or real(*args))
+    real = photometric.step_together
+    monkeypatch.setattr(photometric, "step_together", lambda *args: launches.append(len(args[0])) or real(*args))
     learned = {name: torch.ones(5, 3, requires_grad=True) for name in "abc"}
     (learned["a"].sum() - 2 * learned["c"].sum()).backward()
     optimiser = Adam()

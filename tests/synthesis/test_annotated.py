@@ -20,7 +20,7 @@ from neeco.errors import NeecoError
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.rotations import rigid_from_vector
-from neeco.report.annotated_page import write_annotated_page
+from neeco.report.run_page import write_annotated_page
 from neeco.scene import Scene
 from neeco.synthesis.annotated import TypicalErrors, annotate_capture, estimate_trust, typical_errors_of
 

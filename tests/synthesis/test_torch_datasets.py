@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.labels.labelled_image import MIN_COMPONENT, LabelledImage, draw_labelled
+from neeco.labels.annotation import MIN_COMPONENT, LabelledImage, draw_labelled
 from neeco.raster.native import torch_threads
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import StatesRefused

@@ -36,7 +36,7 @@ def run(arguments: Arguments) -> int:
     from neeco.capture.check import read_checked
     from neeco.cli._progress import counting, resumable
     from neeco.raster.devices import device_of
-    from neeco.report.annotated_page import write_annotated_page
+    from neeco.report.run_page import write_annotated_page
     from neeco.synthesis.annotated import annotate_capture
     from neeco.training.run import open_run
 

@@ -66,7 +66,7 @@ def rasterize(
 
         return rasterize_reference(gaussians, camera, channels, background)
     if backend == "cpu":
-        from neeco.raster.cpu import rasterize_cpu
+        from neeco.raster.native import rasterize_cpu
 
         return rasterize_cpu(gaussians, camera, channels, background)
     if backend == "cuda":

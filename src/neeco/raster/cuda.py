@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from neeco.raster.devices import constant
-from neeco.raster.reference import camera_from_world, usable_gaussians
-from neeco.raster.sh import headlight_factor, sh_colors
+from neeco.raster.reference import camera_from_world, headlight_factor, sh_colors, usable_gaussians
 from neeco.raster.types import Camera, Gaussians, Headlight, Rendering
 
 

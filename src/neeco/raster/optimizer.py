@@ -74,7 +74,7 @@ def adam_steps(updates: Sequence[Update], betas: tuple[float, float] = BETAS, ep
         else:
             _step_native(update, betas, eps)
     if together:
-        from neeco.raster.triton.adam import step_together
+        from neeco.raster.triton.photometric import step_together
 
         tensors = [(u.parameter, u.gradient.contiguous(), u.exp_avg, u.exp_avg_sq) for u in together]
         step_together(tensors, [(u.lr, u.step) for u in together], betas, eps)

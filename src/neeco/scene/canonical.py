@@ -13,7 +13,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neeco.raster.sh import SH_C0
+from neeco.raster.reference import SH_C0
 
 SH_COEFFICIENTS = 16  # degree 3
 

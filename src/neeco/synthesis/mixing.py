@@ -23,7 +23,7 @@ from neeco.labels.annotation import working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project
-from neeco.raster.sh import SH_C0, brightened
+from neeco.raster.reference import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformations.base import Deformation

@@ -42,8 +42,7 @@ from neeco.capture.images import open_image, read_image, read_labels
 from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, require_like
-from neeco.labels.annotation import keypoint_names
-from neeco.labels.labelled_image import LabelledImage
+from neeco.labels.annotation import LabelledImage, keypoint_names
 from neeco.labels.labellers import instruments_of
 from neeco.raster.native import torch_threads
 from neeco.raster.types import Camera

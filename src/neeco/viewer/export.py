@@ -29,7 +29,7 @@ from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import EVALUATION_FILE
 from neeco.files import read_json, write_text
 from neeco.labels.labellers import threshold_of
-from neeco.raster.sh import SH_C0
+from neeco.raster.reference import SH_C0
 from neeco.scene import Drawable, Scene
 from neeco.scene.drawable import HingeMotion
 from neeco.scene.scene import gaussian_scene

@@ -22,8 +22,8 @@ from neeco.capture.statefile import read_states
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
 from neeco.raster import rasterize
+from neeco.raster.reference import brightened, headlight_factor, sh_basis
 from neeco.raster.rotations import quat_to_matrix
-from neeco.raster.sh import brightened, headlight_factor, sh_basis
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
