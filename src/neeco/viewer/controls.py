@@ -142,7 +142,8 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
     offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
     pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
     joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
-    return InstrumentState(torch.from_numpy(pose @ offset), joints)
+    with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be drawn there
+        return InstrumentState(torch.from_numpy(pose @ offset), joints)
 
 
 def perpendicular_axes(along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
