@@ -186,9 +186,8 @@ class LabelledImages(_Generated, Dataset[Sample]):
         transform: Transform | None = None,
         **settings: Any,
     ) -> None:
-        effects = None if camera_effects is None else str(camera_effects)
-        given = {"states": states, "views": views, "labels": labels, "camera_effects": effects} | settings
-        super().__init__(scene, instruments, with_fields(Settings(count, seed), given), transform)
+        chosen = _settings(count, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        super().__init__(scene, instruments, chosen, transform)
         self.count = count
 
     def __len__(self) -> int:
@@ -235,9 +234,8 @@ class LabelledStream(_Generated, IterableDataset[Sample]):
             raise NeecoError(
                 f"start, shard: {start}, {shard}: give start >= 0 and shard (rank, size), 0 <= rank < size"
             )
-        effects = None if camera_effects is None else str(camera_effects)
-        given = {"states": states, "views": views, "labels": labels, "camera_effects": effects} | settings
-        super().__init__(scene, instruments, with_fields(Settings(1, seed), given), transform)
+        chosen = _settings(1, seed, camera_effects, states=states, views=views, labels=labels, **settings)
+        super().__init__(scene, instruments, chosen, transform)
         self.start, self.shard = start, shard
 
     def __iter__(self) -> Iterator[Sample]:
@@ -319,6 +317,12 @@ def _opened(given: SceneLike) -> tuple[Scene, Path | None]:
     drawable: Any = getattr(given, "scene", given)
     scene = gaussian_scene(getattr(drawable, "learned", drawable), ASKED_BY)  # neeco.Scene holds what was learned
     return scene, None if folder is None else Path(folder) / SCENE_FILE
+
+
+def _settings(count: int, seed: int, camera_effects: str | Path | None, **given: Any) -> Settings:
+    """The settings of a data set, `given` by the names of their fields."""
+    effects = None if camera_effects is None else str(camera_effects)
+    return with_fields(Settings(count, seed), {"camera_effects": effects} | given)
 
 
 def _spec(opened: Sequence[tuple[Scene, Path | None]], settings: Settings) -> GeneratorSpec | PackedSpec:
