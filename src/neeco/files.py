@@ -89,17 +89,23 @@ def own_folder(path: Path, named: Path | None = None) -> Iterator[None]:
     path = Path(path)
     lock = contextlib.nullcontext() if fcntl is None else _locked(path, path if named is None else named)
     with new_folder(path), lock:
-        halves = []
-        for entry in path.rglob("*"):  # which follows no link
-            if entry.is_symlink():
-                require_inside(entry, path)
-            if fcntl is not None and entry.name.startswith(TEMPORARY):
-                halves.append(entry)
-        for entry in halves:
-            inside = entry.relative_to(path).parts[:-1]
-            if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):  # folders have owners
-                entry.unlink()
+        sweep_unfinished(path)
         yield
+
+
+def sweep_unfinished(folder: Path) -> None:
+    """Remove what killed processes left half-written in a folder that this process owns; folders have owners of their
+    own. Raises NeecoError where the folder holds a link out of it. On Windows nothing is removed (see `own_folder`)."""
+    halves = []
+    for entry in folder.rglob("*"):  # which follows no link
+        if entry.is_symlink():
+            require_inside(entry, folder)
+        if fcntl is not None and entry.name.startswith(TEMPORARY):
+            halves.append(entry)
+    for entry in halves:
+        inside = entry.relative_to(folder).parts[:-1]
+        if not entry.is_dir() and not any(part.startswith(TEMPORARY) for part in inside):
+            entry.unlink()
 
 
 def is_vacant(path: Path) -> bool:

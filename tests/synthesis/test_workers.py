@@ -47,6 +47,7 @@ def test_a_killed_worker_costs_only_its_images(ball_run, alone: Path, tmp_path: 
     def kill_the_first(done: int) -> None:
         if done == 2:
             os.kill(started[0].process.pid, signal.SIGKILL)
+            (tmp_path / "set/images/.unfinished-killed.png").write_bytes(b"half")  # as a killed worker may leave it
 
     monkeypatch.setattr(workers._Pool, "start_worker", start)
     with torch_threads(1):

@@ -24,7 +24,7 @@ from typing import Any
 
 from neeco.cluster import joined
 from neeco.errors import NeecoError
-from neeco.files import read_bytes, write_atomically
+from neeco.files import read_bytes, sweep_unfinished, write_atomically
 from neeco.raster.devices import readable_failures
 from neeco.synthesis.generator import GeneratorSpec, SampleGenerator, draw_to_folder, limit_threads
 from neeco.synthesis.samplers import states_file
@@ -97,12 +97,13 @@ class _Pool:
         self.start_worker()
 
     def stop(self) -> None:
-        """Stop all workers; what one has half written is removed on resuming."""
+        """Stop all workers and remove what one of them had half written."""
         for worker in self.workers:
             worker.process.terminate()
         for worker in self.workers:
             worker.process.join(STOP_TIMEOUT_S)
             worker.connection.close()
+        sweep_unfinished(self.output)
 
 
 def draw_in_processes(
