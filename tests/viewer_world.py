@@ -1,4 +1,4 @@
-"""A grasper before a wall, and runs of it: folders whose photographs are what the scene itself draws."""
+"""A grasper before a wall, and runs of it: folders whose recorded images are what the scene itself draws."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def grasper_scene(name: str = "grasper", joint: str = "jaw_angle", frame_name: s
     return scene.requires_grad_(False)
 
 
-def write_photographs(scene: Learned, root: Path, masks: bool = True) -> Path:
-    """The capture whose photographs the scene draws, with true masks where it has labels. Times are the frames'."""
+def write_recorded_images(scene: Learned, root: Path, masks: bool = True) -> Path:
+    """The capture whose recorded images the scene draws, with true masks where it has labels. Times are the frames'."""
     frames = []
     for name, split, state, taken_by in zip(
         scene.recorded.names, scene.recorded.splits, scene.recorded.states, scene.recorded.cameras, strict=True

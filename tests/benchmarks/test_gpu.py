@@ -15,7 +15,7 @@ from typing import ClassVar
 import pytest
 import torch
 from device_params import DEVICES, SLOW_ON_CPU
-from viewer_world import grasper_scene, write_photographs, write_run
+from viewer_world import grasper_scene, write_recorded_images, write_run
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 KINDS = ("draw", "frame", "draw+backward", "step")
@@ -116,7 +116,7 @@ def test_a_tile_is_walked_until_its_last_pixel_is_full(script: ModuleType) -> No
 @pytest.mark.parametrize("device", SLOW_ON_CPU)
 def test_training_and_synthesis_are_timed_too(device: str, quick: ModuleType, tmp_path: Path, capsys) -> None:
     scene = grasper_scene()
-    capture = write_photographs(scene, tmp_path / "capture")
+    capture = write_recorded_images(scene, tmp_path / "capture")
     run = write_run(scene, tmp_path / "run", capture)
     words = [
         "--train",

@@ -9,7 +9,8 @@ from typing import ClassVar
 import pytest
 
 from neeco.cli import RENAMED, main
-from neeco.settings import new_name, structure, with_fields
+from neeco.experiments.ablation_study import chosen_ablations
+from neeco.settings import RenamedWarning, new_name, structure, with_fields
 
 
 @dataclass(frozen=True)
@@ -46,3 +47,9 @@ def test_the_new_flag_is_one_that_the_verb_has(verb, old, capsys):
     told = capsys.readouterr().out
     assert RENAMED[verb, old] in told
     assert f"{old} " not in told
+
+
+def test_an_ablation_is_found_under_its_old_name():
+    with pytest.warns(RenamedWarning, match="--tables rim is called --tables extrapolation now"):
+        (table,) = chosen_ablations(["rim"])
+    assert table.name == "extrapolation"

@@ -13,7 +13,7 @@ from capture_files import write_grasper
 from device_params import SLOW_ON_CPU
 from scene_worlds import CAMERA, make_nerf, make_scene
 from torch import Tensor
-from viewer_world import grasper_scene, write_photographs
+from viewer_world import grasper_scene, write_recorded_images
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
@@ -55,7 +55,7 @@ USUALLY_DB = 1.0
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_photographs(grasper_scene(), tmp_path_factory.mktemp("gpu") / "capture")
+    return write_recorded_images(grasper_scene(), tmp_path_factory.mktemp("gpu") / "capture")
 
 
 def close(there: Tensor, here: Tensor, tolerance: float = 1e-3) -> bool:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from device_params import SLOW_ON_CPU
 from PIL import Image
-from viewer_world import grasper_scene, write_photographs, write_run
+from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -28,7 +28,7 @@ Call = Callable[..., None]
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> str:
     torch.set_num_threads(1)
-    return str(write_photographs(grasper_scene(), tmp_path_factory.mktemp("verbs") / "capture"))
+    return str(write_recorded_images(grasper_scene(), tmp_path_factory.mktemp("verbs") / "capture"))
 
 
 @pytest.fixture

@@ -105,7 +105,9 @@ def test_the_page_is_whole_and_fetches_nothing(tmp_path, comparison, capture):
     text, page = page_of(tmp_path / "out", comparison, capture)
     assert all(reference.startswith(("data:image/", "data:text/csv")) for reference in page.references)
     images = [reference for reference in page.references if reference.startswith("data:image/")]
-    assert len(images) == 2 * (2 + 2 * 2)  # a frame per split: the photograph plain and outlined, two pictures a method
+    assert len(images) == 2 * (
+        2 + 2 * 2
+    )  # a frame per split: the recorded image plain and outlined, two pictures a method
     assert "http" not in text
     assert "url(" not in text
     assert "prefers-color-scheme: dark" in text
@@ -124,7 +126,7 @@ def test_every_figures_data_is_in_the_page_and_beside_it(tmp_path, comparison, c
     assert [(row["split"], row["name"], row["seed"]) for row in frames] == [
         (split, name, "0") for split in ("test", "unseen") for name in ("kinematic", "3dgs")
     ]
-    assert float(frames[0]["psnr"]) > 40  # the scene drew the photographs itself
+    assert float(frames[0]["psnr"]) > 40  # the scene drew the recorded images itself
     assert len(list(csv.DictReader(io.StringIO(beside["curves.csv"])))) == len(comparison.curves)
 
 

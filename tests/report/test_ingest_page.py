@@ -132,8 +132,8 @@ def test_the_tracked_frame_is_drawn_where_the_instrument_is(tmp_path):
     scale = drawn.shape[1] / camera.width
     column, row = round((camera.fx * x / z + camera.cx) * scale), round((camera.fy * y / z + camera.cy) * scale)
     assert drawn[row, column].min() > 200  # the white dot at the frame's origin
-    photograph = np.asarray(Image.open(frame.image_path).convert("RGB").resize(drawn.shape[1::-1])).astype(int)
-    changed = np.abs(without_shape - photograph).max(axis=2) > 120
+    recorded = np.asarray(Image.open(frame.image_path).convert("RGB").resize(drawn.shape[1::-1])).astype(int)
+    changed = np.abs(without_shape - recorded).max(axis=2) > 120
     assert changed.any()
     assert np.hypot(*(np.argwhere(changed) - [row, column]).T).max() < 0.3 * drawn.shape[1]
     assert (np.abs(drawn - without_shape).max(axis=2) > 120).sum() > 200  # outline and long axis

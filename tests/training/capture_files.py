@@ -53,7 +53,7 @@ def write_capture(root: Path, *, instruments: bool = True) -> Path:
 
 
 def write_grasper(root: Path, *, frames: int = 24, sizes: tuple[tuple[int, int], ...] = ((80, 64),)) -> Path:
-    """A two-jawed grasper that moves and opens before a wall, photographed in images of `sizes` in turn."""
+    """A two-jawed grasper that moves and opens before a wall, recorded in images of `sizes` in turn."""
     rng = np.random.default_rng(5)
     wall = torch.from_numpy(rng.uniform([-75, -60, 98], [75, 60, 102], (900, 3))).float()
     wall_colors = torch.from_numpy(rng.uniform(0.3, 0.7, (900, 3)) * [1.2, 0.6, 0.6]).float()

@@ -1,4 +1,4 @@
-"""Method `kinematic` from photographs to a run folder: any image sizes, the same bytes, interrupted or not."""
+"""Method `kinematic` from recorded images to a run folder: any image sizes, the same bytes, interrupted or not."""
 
 from __future__ import annotations
 

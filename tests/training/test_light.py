@@ -17,7 +17,7 @@ from neeco.training.config import training_config
 from neeco.training.instruments.shadow import find_shadow
 from neeco.training.session import GaussianSession, new_session
 
-OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the photographs
+OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the recorded images
 OTHER = (-7.0, -7.0, 0.0)
 
 
@@ -33,7 +33,7 @@ def lit(scene: Scene, offsets: Sequence[tuple[float, float, float]], strength: f
 def session(
     strength: float, blank: slice | None = None, offsets: Sequence[tuple[float, float, float]] = (OFFSET,)
 ) -> GaussianSession:
-    """About a scene without a shadow, learning from photographs taken under lamps of `strength` each."""
+    """About a scene without a shadow, learning from recorded images taken under lamps of `strength` each."""
     world = lit(make_scene(), offsets, strength)
     states = world.recorded.states
     with torch.no_grad():

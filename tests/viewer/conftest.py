@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from viewer_page import CHROMIUM, SOFTWARE
-from viewer_world import grasper_scene, write_photographs, write_run
+from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.viewer.server import ViewerServer
 
@@ -25,7 +25,7 @@ def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.set_num_threads(1)
     root = tmp_path_factory.mktemp("viewer")
     scene = grasper_scene()
-    return write_run(scene, root / "run", write_photographs(scene, root / "capture"))
+    return write_run(scene, root / "run", write_recorded_images(scene, root / "capture"))
 
 
 @pytest.fixture

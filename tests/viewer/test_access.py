@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_world import grasper_scene, write_photographs, write_run
+from viewer_world import grasper_scene, write_recorded_images, write_run
 
 from neeco.errors import NeecoError
 from neeco.viewer.access import AccessControl, content_security_policy, free_port, is_loopback, url_of
@@ -131,7 +131,7 @@ def test_a_host_or_port_that_cannot_be_is_named(host: str, port: int, named: str
 
 def test_names_of_a_run_stay_text(tmp_path: Path) -> None:
     scene = grasper_scene(frame_name="<b>{:06d}")
-    run = write_run(scene, tmp_path / "<script>run", write_photographs(scene, tmp_path / "capture"))
+    run = write_run(scene, tmp_path / "<script>run", write_recorded_images(scene, tmp_path / "capture"))
     picture = Picture(np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6)))
     part = RunPicture(WatchedRun(run).loaded, picture, 2.0, True, trouble=HOSTILE)
     html = status_html([part], 0.1, (6, 4), HOSTILE)

@@ -16,7 +16,7 @@ import pytest
 import torch
 from scene_worlds import make_nerf, make_scene
 from viewer_page import ViewerPage
-from viewer_world import brighter, grasper_scene, write_photographs, write_run
+from viewer_world import brighter, grasper_scene, write_recorded_images, write_run
 
 from neeco.capture.statefile import read_states
 from neeco.evaluation.image_metrics import psnr
@@ -130,10 +130,10 @@ def test_every_view_is_the_one_that_is_named(page: ViewerPage, scene, view: str)
     assert alike(shown, scene, view=IMAGE) < UNLIKE_DB
 
 
-def test_the_difference_is_shown_only_where_there_is_a_photograph(page: ViewerPage) -> None:
+def test_the_difference_is_shown_only_where_there_is_a_recorded_image(page: ViewerPage) -> None:
     page.settled()
     shown = page.after(lambda: page.choose("show", DIFFERENCE))
-    assert shown.mean() < 4  # the scene drew that photograph
+    assert shown.mean() < 4  # the scene drew that image
     shown = page.set("roll (°)", 30.0)
     assert shown.mean() > 10
     page.wait_for("only of a recorded state")
@@ -225,7 +225,7 @@ def test_an_arrow_of_the_gizmo_drags_the_instrument_and_turns_nothing(page: View
 
 def test_the_worst_frame_is_one_choice_away(serve: Serve, context: Any, tmp_path: Path) -> None:
     scene = grasper_scene()
-    capture = write_photographs(scene, tmp_path / "capture")
+    capture = write_recorded_images(scene, tmp_path / "capture")
     spoiled = capture / "images" / "000005.png"
     shutil.copy(capture / "images" / "000000.png", spoiled)
     page = ViewerPage(context, serve(write_run(scene, tmp_path / "run", capture)).address, 900, 900)
@@ -326,7 +326,7 @@ def test_a_run_that_changes_is_shown_anew(serve: Serve, context: Any, made_run: 
 def test_every_method_is_shown_in_all_its_views(method: str, serve: Serve, context: Any, tmp_path: Path) -> None:
     scene = make_nerf() if method == "nerfies" else make_scene(method)
     with torch.no_grad():
-        run = write_run(scene, tmp_path / "run", write_photographs(scene, tmp_path / "capture"))
+        run = write_run(scene, tmp_path / "run", write_recorded_images(scene, tmp_path / "capture"))
     page = ViewerPage(context, serve(run).address)
     shown = [page.settled()]
     for view in views_of(scene, True)[1:]:
@@ -384,7 +384,7 @@ HOSTILE = '<img src=x onerror="window.hacked=1"><script>window.hacked=2</script>
 
 def test_names_of_a_hostile_run_inject_nothing(serve: Serve, context: Any, tmp_path: Path) -> None:
     scene = grasper_scene(HOSTILE, HOSTILE + "joint", "<img src=x onerror=alert(1)>{:06d}")
-    capture = write_photographs(scene, tmp_path / "capture", masks=False)
+    capture = write_recorded_images(scene, tmp_path / "capture", masks=False)
     run = write_run(scene, tmp_path / "<img src=x onerror=alert(2)>", capture)
     dialogs: list[str] = []
     page = ViewerPage(context, serve(run).address, 900, 900)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from scene_worlds import make_nerf, make_scene
-from viewer_world import FRAMES, brighter, grasper_scene, write_photographs, write_run
+from viewer_world import FRAMES, brighter, grasper_scene, write_recorded_images, write_run
 
 from neeco.errors import NeecoError
 from neeco.scene.io import save_scene
@@ -140,7 +140,7 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(run: Path) -> None:
 def test_every_method_can_be_looked_at(method: str, tmp_path: Path) -> None:
     scene = make_nerf() if method == "nerfies" else make_scene(method)
     with torch.no_grad():
-        capture = write_photographs(scene, tmp_path / "capture")
+        capture = write_recorded_images(scene, tmp_path / "capture")
         run = write_run(scene, tmp_path / "run", capture)
     runs = ViewedRuns([run])
     assert len(runs.loaded[0].frames) == len(scene.recorded.names)

@@ -100,24 +100,24 @@ def test_what_no_frame_saw_is_magenta_and_what_frames_saw_is_not(scene) -> None:
 
 def test_there_is_no_difference_to_what_the_scene_itself_drew(scene) -> None:
     state, taken_by = scene.recorded.states[1], scene.recorded.cameras[1]
-    photograph = draw(scene, state, taken_by).image.numpy()
+    recorded = draw(scene, state, taken_by).image.numpy()
     window = replace(taken_by, width=2 * WIDTH, height=2 * HEIGHT, fx=120.0, fy=120.0, cx=WIDTH, cy=HEIGHT)
-    same = difference(scene, state, taken_by, photograph, window)
+    same = difference(scene, state, taken_by, recorded, window)
     assert same.pixels.shape == (2 * HEIGHT, 2 * WIDTH, 3)
     assert same.pixels.max() <= 4  # the darkest colour of the map
-    other = difference(scene, state, taken_by, 1 - photograph, window)
+    other = difference(scene, state, taken_by, 1 - recorded, window)
     assert other.pixels.mean() > 100
 
 
-def test_a_difference_stands_where_the_photograph_does(scene) -> None:
-    """A window twice as wide shows the photograph in its middle half."""
+def test_a_difference_stands_where_the_recorded_image_does(scene) -> None:
+    """A window twice as wide shows the recorded image in its middle half."""
     state, taken_by = scene.recorded.states[0], camera()
-    photograph = 1 - draw(scene, state, taken_by).image.numpy()
+    recorded = 1 - draw(scene, state, taken_by).image.numpy()
     window = replace(taken_by, width=2 * WIDTH, cx=float(WIDTH))
-    drawn = difference(scene, state, taken_by, photograph, window).pixels
+    drawn = difference(scene, state, taken_by, recorded, window).pixels
     assert not drawn[:, : WIDTH // 2].any()
     assert not drawn[:, -WIDTH // 2 :].any()
-    narrow = difference(scene, state, taken_by, photograph, taken_by).pixels
+    narrow = difference(scene, state, taken_by, recorded, taken_by).pixels
     assert (drawn[:, WIDTH // 2 : -WIDTH // 2] == narrow).all()
 
 

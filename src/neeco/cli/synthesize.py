@@ -48,7 +48,7 @@ def run(arguments: Arguments) -> int:
     run_path, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
     with open_run(run_path, device) as trained, counting("synthesize", settings.count) as advance:
-        others = [load_run(cast, device) for cast in instrument_runs]
+        others = [load_run(path, device) for path in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(
                 trained,

@@ -32,8 +32,8 @@ class AblationPlan:
     output: Path
     """Folder for tables, report.html and the runs."""
     tables: tuple[str, ...] = ("paper", "ours")
-    """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, labels,
-    frames, tracker-noise), or tables by name."""
+    """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, parts,
+    shadow, extrapolation, labels, frames, tracker-noise), or tables by name."""
     iterations: int = 1_000
     """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
     kinematic_iterations: int | None = None
