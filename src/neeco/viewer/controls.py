@@ -139,10 +139,10 @@ def _moved(recorded: InstrumentState, shaft: Shaft, controls: InstrumentControls
         * Rotation.from_rotvec(controls.pitch * side)
         * Rotation.from_rotvec(controls.roll * shaft.along)
     )
-    offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
     pose = to_numpy(recorded.pose) if controls.pose is None else controls.pose
     joints = {joint: controls.joints.get(joint, value) for joint, value in recorded.joints.items()}
     with np.errstate(invalid="ignore"):  # a browser may send infinity: nothing can be drawn there
+        offset = rigid(np.eye(3), controls.slide * shaft.along) @ turn_about(shaft.end, turns.as_rotvec())
         return InstrumentState(torch.from_numpy(pose @ offset), joints)
 
 
