@@ -240,7 +240,7 @@ def test_an_unforeseen_failure_leaves_its_traceback(make_job, monkeypatch: pytes
         ),
         (
             {"config": training_config("3dgs", {"max_tissue_gaussians": 99})},
-            "max_tissue_gaussians: this run has 20000, not 99",
+            "max_tissue_gaussians: this run has None, not 99",
         ),
     ],
 )

@@ -37,6 +37,8 @@ EARLY = [
     "deformation.hinge_start=12",
     "deformation.shadow_at=[10]",
     "deformation.label_sharpness_start=14",
+    "resolution.min_side=32",  # images of half their size at first
+    "resolution.search_pixels=4000",
 ]
 CONFIG = training_config("kinematic", {"iterations": 40}, [*EARLY, "schedule.plain_density.interval=15"])
 

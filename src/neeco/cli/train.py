@@ -35,6 +35,8 @@ class Arguments:
     """Continue an interrupted run in --output, under the settings it was started with."""
     transforms: str = "transforms.json"
     """Which transforms file of the capture to read."""
+    scale: float | None = None
+    """Share of the recorded images' size to learn at: less for a quick run or little memory; by default 1."""
     joints: tuple[str, ...] | None = None
     """Joints that move parts; by default those that the pose does not already explain."""
     max_tissue_gaussians: int | None = None
@@ -59,6 +61,7 @@ def run(args: Arguments) -> int:
             "minutes": args.minutes,
             "seed": args.seed,
             "transforms": args.transforms,
+            "scale": args.scale,
             "joints": args.joints,
             "max_tissue_gaussians": args.max_tissue_gaussians,
             "max_instrument_gaussians": args.max_instrument_gaussians,

@@ -8,6 +8,7 @@ scene, so every method is aligned the same way, and a handful of steps does what
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,11 +35,12 @@ class AlignConfig:
     sigma_instrument_deg: float = 0.5
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
-    levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # resolutions, coarse to fine
+    levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # sizes of the images compared, coarse to fine
+    max_pixels: int = 160_000  # of the largest of them, to which larger images are reduced
     steps: tuple[int, ...] = (3, 2, 2)  # Gauss-Newton steps at each
     huber: float = 0.05  # colour residual beyond which a pixel pulls linearly: highlights and unobserved tissue
     correlation_px: float = 100.0  # neighbouring pixels err together: so many count as one observation
-    step_mm: float = 0.1  # finite difference at full resolution, larger at coarse levels
+    step_mm: float = 0.1  # finite difference at the last level, larger at coarse ones
     step_deg: float = 0.1
 
 
@@ -128,7 +130,8 @@ def fit_frame(
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)
     problem, mask = _Problem(scene, frame.state, names, config), frame.load_mask()
-    levels = [_level(frame.camera, image, mask, factor, config) for factor in config.levels]
+    largest = min(1.0, math.sqrt(config.max_pixels / (frame.camera.width * frame.camera.height)))
+    levels = [_level(frame.camera, image, mask, factor, largest, config) for factor in config.levels]
     increments = torch.zeros(6 * (len(names) + 1), dtype=torch.float64)
     if start is not None and len(start) == len(increments):
 
@@ -141,8 +144,11 @@ def fit_frame(
     return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
 
 
-def _level(camera: Camera, image: Tensor, mask: Tensor | None, factor: float, config: AlignConfig) -> _Level:
-    small = resize_camera(camera, factor)
+def _level(
+    camera: Camera, image: Tensor, mask: Tensor | None, factor: float, largest: float, config: AlignConfig
+) -> _Level:
+    """The level of `factor` times the size of the last one, which has `largest` times the image's."""
+    small = resize_camera(camera, factor * largest)
     counted = torch.ones(camera.height, camera.width) if mask is None else mask.float()
     weight = resize_image(counted[..., None], small)[..., 0]
     step = torch.tensor([config.step_deg * torch.pi / 180] * 3 + [config.step_mm] * 3, dtype=torch.float64)

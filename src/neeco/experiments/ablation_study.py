@@ -55,7 +55,7 @@ from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_settings
 from neeco.settings import plain, warn_renamed
-from neeco.training.config import TrainConfig, training_config
+from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
 from neeco.training.run import open_run
 from neeco.training.schedule import MIN_RESET_INTERVAL
 
@@ -244,7 +244,9 @@ def _with_room_to_grow(config: TrainConfig) -> TrainConfig:
     """With INITIAL_SHARE of the tissue's budget: were it full of sparse points, density control could do nothing."""
     if config.initial_points is not None:
         return config
-    return replace(config, initial_points=max(1, round(INITIAL_SHARE * config.max_tissue_gaussians)))
+    return replace(
+        config, initial_points=max(1, round(INITIAL_SHARE * (config.max_tissue_gaussians or TISSUE_GAUSSIANS)))
+    )
 
 
 def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
+import cv2
 import torch
 from torch import Tensor
 
@@ -28,10 +29,20 @@ class TrainingViews:
     prefetcher: PixelPrefetcher | None = None
 
     @classmethod
-    def read(cls, frames: Sequence[Frame]) -> TrainingViews:
-        """Load every frame's pixels. Raises NeecoError where a file cannot be read."""
-        images = tuple((frame.load_image() * 255).round().to(torch.uint8) for frame in frames)
-        return cls(tuple(frames), images, tuple(frame.load_mask() for frame in frames))
+    def read(cls, frames: Sequence[Frame], scale: float = 1.0) -> TrainingViews:
+        """Load every frame's pixels, at `scale` times their size (see `scaled`). Raises NeecoError where a file cannot
+        be read."""
+        read = [cls._read_frame(frame).scaled(scale) for frame in frames]
+        return cls(
+            tuple(view.frames[0] for view in read),
+            tuple(view.images[0] for view in read),
+            tuple(view.masks[0] for view in read),
+        )
+
+    @classmethod
+    def _read_frame(cls, frame: Frame) -> TrainingViews:
+        image = (frame.load_image() * 255).round().to(torch.uint8)
+        return cls((frame,), (image,), (frame.load_mask(),))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -59,6 +70,20 @@ class TrainingViews:
         masks = tuple(None if mask is None else change(mask) for mask in self.masks)
         return replace(self, images=tuple(change(image) for image in self.images), masks=masks)
 
+    def scaled(self, scale: float) -> TrainingViews:
+        """The same views with images of `scale` times their size, area-averaged; a mask counts where all of a pixel
+        does."""
+        if scale == 1:
+            return self
+        frames, images, masks = [], [], []
+        for frame, image, mask in zip(self.frames, self.images, self.masks, strict=True):
+            width, height = (max(1, round(scale * side)) for side in (frame.camera.width, frame.camera.height))
+            frames.append(replace(frame, camera=frame.camera.resized(width, height)))
+            images.append(_area_averaged(image, width, height))
+            masks.append(None if mask is None else _area_averaged(mask.to(torch.uint8) * 255, width, height) == 255)
+        prefetcher = None if self.prefetcher is None else PixelPrefetcher(self.prefetcher.device)
+        return TrainingViews(tuple(frames), tuple(images), tuple(masks), prefetcher)
+
     def target(self, index: int) -> Tensor:
         """The target image [H, W, 3] of one frame, float32 in [0, 1]."""
         return self._pixels(index)[0].float() / 255
@@ -75,6 +100,18 @@ class TrainingViews:
     def _pixels(self, index: int) -> tuple[Tensor, Tensor | None]:
         image, mask = self.images[index], self.masks[index]
         return (image, mask) if self.prefetcher is None else self.prefetcher.get(index, image, mask)
+
+
+def mean_pixels(frames: Sequence[Frame]) -> float:
+    """Of an image, over the frames."""
+    return sum(frame.camera.width * frame.camera.height for frame in frames) / len(frames)
+
+
+def _area_averaged(pixels: Tensor, width: int, height: int) -> Tensor:
+    """uint8 [H, W, ...] at another size, where it was."""
+    resized = cv2.resize(pixels.cpu().numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    found = torch.from_numpy(resized)
+    return found.pin_memory() if pixels.is_pinned() else found.to(pixels.device)
 
 
 class PixelPrefetcher:

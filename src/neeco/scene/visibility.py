@@ -41,6 +41,7 @@ SHARPNESS = 4  # power of the cosine by which a view counts for a direction: hal
 HALF_OBSERVED = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
 MIN_PIXELS = 1e-6  # visibility of the average Gaussian where frames show nothing
 MAX_FRAMES = 128  # frames looked at, evenly spaced; neighbours observe the same
+MAX_PIXELS = 320 * 256  # of each of them, to which larger ones are reduced
 
 CELL = 1 / 40  # of the image's width: spacing of extrapolated Gaussians
 REACH = 0.4  # of the image's width: how far tissue is extrapolated beyond the recorded border
@@ -59,7 +60,7 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
     for index in evenly_spaced(len(recorded.cameras), MAX_FRAMES):
-        camera = recorded.cameras[index]
+        camera = reduced(recorded.cameras[index])
         with torch.no_grad():
             posed = at(recorded.states[index])
             toward = _toward(posed, camera)
@@ -88,6 +89,12 @@ def _toward(posed: Gaussians, camera: Camera) -> Tensor:
         outward = torch.einsum("nji,nj->ni", quat_to_matrix(posed.sh_frames), outward)
     directions = constant(tuple(value for corner in DIRECTIONS for value in corner), outward.device).view(-1, 3)
     return (outward @ directions.T).clamp_min(0) ** SHARPNESS
+
+
+def reduced(camera: Camera) -> Camera:
+    """The same view with at most MAX_PIXELS pixels: as many tell what it shows."""
+    scale = (MAX_PIXELS / (camera.width * camera.height)) ** 0.5
+    return camera if scale >= 1 else camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
 def visible_pixels(posed: Gaussians, camera: Camera) -> Tensor:

@@ -16,10 +16,12 @@ from neeco.errors import NeecoError
 from neeco.scene.methods import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
+from neeco.training.resolution import ResolutionConfig, size_factor
 from neeco.training.schedule import Part, ScheduleConfig
 
 ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
 LOG_INTERVAL = 50
+TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,10 @@ class TrainConfig:
     minutes: float | None = None  # stop in time with a finished run; None: no limit
     seed: int = 0
     transforms: str = "transforms.json"
-    max_tissue_gaussians: int = 20_000
+    scale: float = 1.0  # of the recorded images' size, at most 1, at which the scene is learned
+    max_tissue_gaussians: int | None = None  # None: 20,000 for images of 320x256, more for larger ones
     initial_points: int | None = None  # most sparse points to begin with; None: max_tissue_gaussians
-    max_instrument_gaussians: int = 4_000  # of each instrument
+    max_instrument_gaussians: int | None = None  # of each instrument; None: 4,000 for images of 320x256, as above
     ssim_weight: float = 0.1  # lambda of the paper
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -129,12 +132,19 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+    resolution: ResolutionConfig = field(default_factory=ResolutionConfig)
     log_interval: int = LOG_INTERVAL  # iterations averaged into one row of metrics.jsonl
     checkpoint_interval: int = 500  # iterations
 
     def __post_init__(self) -> None:
         if self.deformation is None:
             object.__setattr__(self, "deformation", method_class(self.method).Settings())
+
+    def gaussian_limits(self, pixels: float) -> tuple[int, int]:
+        """The most Gaussians of the tissue and of each instrument, for images of so many pixels."""
+        factor = size_factor(pixels, self.resolution)
+        tissue, instrument = self.max_tissue_gaussians, self.max_instrument_gaussians
+        return tissue or round(TISSUE_GAUSSIANS * factor), instrument or round(INSTRUMENT_GAUSSIANS * factor)
 
     @property
     def length(self) -> RunLength:
@@ -212,7 +222,7 @@ def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[
 def check_ranges(config: TrainConfig) -> None:
     """Raise NeecoError naming the option of a number that nothing can be trained with."""
     _check_length(config)
-    schedule, density = config.schedule, config.density
+    schedule, density, resolution = config.schedule, config.density, config.resolution
     if (steps := schedule.published_steps) is not None and steps < 1:
         raise NeecoError(f"--set schedule.published_steps: {steps!r} is not a positive whole number; give e.g. 20000")
     if steps is not None and config.minutes is not None:
@@ -227,19 +237,25 @@ def check_ranges(config: TrainConfig) -> None:
         )
     options = {"seed": 0, "batch_size": 1, "max_tissue_gaussians": 1, "max_instrument_gaussians": 1}
     for name, least in options.items():
-        if getattr(config, name) < least:
+        if getattr(config, name) is not None and getattr(config, name) < least:
             raise NeecoError(f"--{name.replace('_', '-')}: {getattr(config, name)} is too small; give at least {least}")
     least_one: dict[str, int | None] = {
         name: getattr(config, name) for name in ("initial_points", "log_interval", "checkpoint_interval")
     }
     for name in ("phase_1", "phase_2", "plain_density"):
         least_one[f"schedule.{name}.interval"] = getattr(schedule, name).interval
-    for group in ("density", "search"):
+    for group in ("density", "search", "resolution"):
         numbers = vars(getattr(config, group)).items()
         least_one |= {f"{group}.{name}": value for name, value in numbers if isinstance(value, int)}
     for name, value in least_one.items():
         if value is not None and value < 1:
             raise NeecoError(f"--set {name}: {value} is too small; give at least 1")
+    if not 0 < config.scale <= 1:
+        raise NeecoError(f"--scale: {config.scale} is not a share of the images' size; give more than 0, at most 1")
+    if not 0 <= resolution.full_size_at <= 1:
+        raise NeecoError(f"--set resolution.full_size_at: {resolution.full_size_at} is not a share; give 0 to 1")
+    if not resolution.step > 1:
+        raise NeecoError(f"--set resolution.step: {resolution.step} makes no image smaller; give more than 1")
     for name, limit in (("split_shrink", math.inf), ("reset_opacity", 1.0)):
         if not 0 < getattr(density, name) < limit:
             raise NeecoError(f"--set density.{name}: {getattr(density, name)} is not between 0 and {limit}")

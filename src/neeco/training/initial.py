@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -15,13 +16,13 @@ from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.methods import make_deformation, method_class
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import InstrumentSearch, Report, Session
-from neeco.scene.training_views import TrainingViews
+from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.shadow import find_shadow
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
-from neeco.training.session import new_session
+from neeco.training.session import GaussianSession, new_session
 
 
 def begin_session(
@@ -38,17 +39,27 @@ def begin_session(
     assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.instruments = InstrumentSearch(
-        find=partial(find_instruments, session),
-        bound=partial(bound_volume, session),
-        place_wrists=partial(place_wrists, session),
-        replace_wrists=partial(replace_wrists, session),
-        find_shadow=partial(find_shadow, session),
+        find=_searching(session, find_instruments),
+        bound=_searching(session, bound_volume),
+        place_wrists=_searching(session, place_wrists),
+        replace_wrists=_searching(session, replace_wrists),
+        find_shadow=_searching(session, find_shadow),
         conclude=partial(conclude, session),
     )
     if is_new:
         scene.deformation.begin(session)
     session.start()
     return session
+
+
+def _searching(session: GaussianSession, search: Callable[..., None]) -> Callable[..., None]:
+    """`search` of this session, on images of the size that searches take."""
+
+    def run(*arguments: object) -> None:
+        with session.searching():
+            search(session, *arguments)
+
+    return run
 
 
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
@@ -61,8 +72,8 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
         for i in capture.instruments
     )
-    recorded = Recorded.of(frames, instruments)
-    positions, colors = _thinned_points(capture, config)
+    recorded = Recorded.of(capture.split("train"), instruments)  # at their recorded size, whatever is learned from
+    positions, colors = _thinned_points(capture, frames, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)
     deformation.fit_ranges(list(recorded.states), tissue.means)
@@ -73,11 +84,12 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     return scene
 
 
-def _thinned_points(capture: Capture, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+def _thinned_points(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
     """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as many as
     the tissue may have Gaussians."""
     positions, colors = capture.points.positions, capture.points.colors
-    most = min(config.max_tissue_gaussians, config.initial_points or config.max_tissue_gaussians)
+    limit, _ = config.gaussian_limits(mean_pixels(frames))
+    most = min(limit, config.initial_points or limit)
     if len(positions) > most:
         chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]

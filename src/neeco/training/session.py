@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,10 +21,11 @@ from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
-from neeco.scene.training_views import TrainingViews
+from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.density import GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
+from neeco.training.resolution import Resolution
 from neeco.training.schedule import Schedule, due, order_by_pose
 
 
@@ -39,7 +40,11 @@ class GaussianSession(GaussianTraining):
     refinement: Refinement = field(init=False)
     rng: np.random.Generator = field(init=False)
     schedule: Schedule = field(init=False)
-    given: list[tuple[State, Camera]] = field(init=False)  # of every frame, as recorded, on the views' device
+    resolution: Resolution = field(init=False)
+    full_views: TrainingViews = field(init=False)  # at full size; `views` are those drawn now
+    scale: float = field(init=False)  # of `views`
+    limits: tuple[int, int] = field(init=False)  # most Gaussians of the tissue, and of each instrument
+    given: list[tuple[State, Camera]] = field(init=False)  # of every frame of `views`, as recorded, on their device
     statistics: GradientStatistics = field(init=False)
     queue: list[int] = field(default_factory=list)
     queue_phase: int = 1
@@ -52,7 +57,25 @@ class GaussianSession(GaussianTraining):
         self.refinement = Refinement(config.refine, frames, names, device)
         self.rng = np.random.default_rng(config.seed)
         self.schedule = Schedule(config.schedule, config.iterations)
-        self.given = [(frame.state.to(device), frame.camera.to(device)) for frame in frames]
+        self.full_views = self.views
+        self.resolution = Resolution(config.resolution, self.views)
+        self.limits = config.gaussian_limits(mean_pixels(frames))
+        self._use_views(self.full_views, 1.0)
+
+    def _use_views(self, views: TrainingViews, scale: float) -> None:
+        """Draw and compare these from now on, whose images have `scale` times their full size."""
+        self.views, self.scale = views, scale
+        self.given = [(frame.state.to(views.device), frame.camera.to(views.device)) for frame in views.frames]
+
+    @contextmanager
+    def searching(self) -> Iterator[None]:
+        """Within the block, `views` have the size at which instruments, joints and shadows are searched."""
+        views, scale, wanted = self.views, self.scale, self.resolution.search_scale
+        if wanted != scale:
+            self._use_views(self.full_views.scaled(wanted), wanted)
+        yield
+        if wanted != scale:
+            self._use_views(views, scale)
 
     def start(self) -> None:
         """Make the scene's tensors leaves of autograd and clear the statistics; once the canonical Gaussians exist."""
@@ -95,6 +118,8 @@ class GaussianSession(GaussianTraining):
         views = self.batch_size
         self.iteration += views
         progress, scene = self.progress, self.scene
+        if (scale := self.resolution.scale(progress)) != self.scale:
+            self._use_views(self.full_views.scaled(scale), scale)
         scene.sh_degree = self.schedule.sh_degree(self.iteration)
         scene.deformation.warming_up = progress < scene.deformation.warm_up
         chosen = [self._next_frame() for _ in range(views)]
@@ -213,11 +238,12 @@ class GaussianSession(GaussianTraining):
         grows = self._due(settings.interval) and progress < config.density_stop
         if grows or (prunes and progress < config.density.prune_stop):
             instruments = len(scene.canonical.counts) - 1
+            tissue, instrument = self.limits
             scene.canonical = control_density(
                 scene.canonical,
                 self.adam,
                 self.statistics,
-                [config.max_tissue_gaussians, *[config.max_instrument_gaussians] * instruments],
+                [self.resolution.limit_at(progress, limit) for limit in (tissue, *[instrument] * instruments)],
                 config.density.dense_size * self.extent,
                 settings.threshold if grows else math.inf,
                 self.generator,

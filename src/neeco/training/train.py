@@ -24,7 +24,7 @@ from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.methods import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
-from neeco.scene.training_views import TrainingViews
+from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.initial import begin_session
 from neeco.training.run import (
@@ -41,6 +41,7 @@ from neeco.training.run import (
 from neeco.training.schedule import due
 
 CPU = torch.device("cpu")
+BASE_BYTES, WORKING_BYTES = 0.6e9, 300  # of a process; of one pixel while it is drawn and compared
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,8 @@ def _begin(
     log: _Log,
 ) -> Session:
     """The session before its first step, or as the checkpoint in `output` holds it."""
-    views = TrainingViews.read(frames).to(device)
+    log.note(_size_note(frames, config))
+    views = TrainingViews.read(frames, config.scale).to(device)
     started = log.clock()
     torch.manual_seed(config.seed)
     if resume and checkpoint_path(output).exists():
@@ -153,6 +155,18 @@ def _begin(
     log.truncate(session.iteration)
     session.seconds += log.clock() - started
     return session
+
+
+def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
+    """What will be learned from, and about how much memory that takes."""
+    camera, pixels = frames[0].camera, config.scale**2 * mean_pixels(frames)
+    tissue, instrument = config.gaussian_limits(pixels)
+    stored, working = 1.5 * 3 * pixels * len(frames), WORKING_BYTES * pixels  # full images and those half their size
+    width, height = round(config.scale * camera.width), round(config.scale * camera.height)
+    return (
+        f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of tissue and {instrument} of each "
+        f"instrument; about {(BASE_BYTES + stored + working) / 1e9:.1f} GB of memory"
+    )
 
 
 def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple[Frame, ...]:

@@ -99,7 +99,8 @@ class Kinematic(HingedInstruments, Deformation):
         "refine.latency": True,
         "refine.frame_poses": True,
         "density_start": 400,
-        "density_stop": 0.7,
+        "density_stop": 0.8,
+        "resolution.full_size_at": 0.6,
     }
     extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
 

@@ -1,0 +1,82 @@
+"""Coarse to fine: at which share of their size images are drawn and compared, and how many Gaussians there may be.
+
+Early steps settle what small images show as well as large ones, at a fraction of the cost. As in DashGaussian (Chen et
+al., CVPR 2025) the images' spectrum says how much of the run each size is worth, and the number of Gaussians follows
+the size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neeco.capture.model import evenly_spaced
+from neeco.scene.training_views import TrainingViews
+
+REFERENCE_PIXELS = 320 * 256  # of the images for which limits of Gaussians are stated
+SPECTRUM_FRAMES = 12  # whose spectra are looked at
+
+
+@dataclass(frozen=True)
+class ResolutionConfig:
+    """Sizes of the images that are drawn and compared over the run, and numbers of Gaussians that follow them."""
+
+    min_side: int = 90  # px, of the shorter side where the run begins; images as small are never reduced
+    step: float = 1.414  # between a size and the next
+    full_size_at: float = 0.0  # share of the run from which images have their full size; 0: all along
+    growth_power: float = 1.0  # most Gaussians while images are reduced: scale^growth_power times those of the run
+    limit_power: float = 0.75  # most Gaussians for images of N times the pixels of 320x256: N^limit_power as many
+    search_pixels: int = REFERENCE_PIXELS  # to which images are reduced where instruments and shadows are searched
+
+
+class Resolution:
+    """Image sizes over one run: a size is drawn until the share of the run is done that it keeps of the amplitudes in
+    the spectrum of the images, as a share of the coarse part of the run."""
+
+    def __init__(self, config: ResolutionConfig, views: TrainingViews) -> None:
+        self.config = config
+        sizes = np.array([image.shape[:2] for image in views.images])
+        self.search_scale = min(1.0, math.sqrt(config.search_pixels / float(sizes.prod(1).mean())))
+        self.scales = reduced_scales(int(sizes.min()), config) if config.full_size_at > 0 else []
+        retained = amplitude_shares(views, self.scales)
+        self.ends = [
+            config.full_size_at * share / retained[-1] for share in retained
+        ]  # progress at which each scale ends
+
+    def scale(self, progress: float) -> float:
+        """Share of the images' size at `progress` in [0, 1] of the run."""
+        return next((scale for scale, end in zip(self.scales, self.ends, strict=True) if progress < end), 1.0)
+
+    def limit_at(self, progress: float, limit: int) -> int:
+        """How many Gaussians a body may have at `progress`, of at most `limit`."""
+        return math.ceil(limit * self.scale(progress) ** self.config.growth_power)
+
+
+def size_factor(pixels: float, config: ResolutionConfig) -> float:
+    """How many times as many Gaussians images of so many pixels take as those of 320x256; at least 1."""
+    return max(1.0, pixels / REFERENCE_PIXELS) ** config.limit_power
+
+
+def reduced_scales(side: int, config: ResolutionConfig) -> list[float]:
+    """Shares below 1 of the images' size, rising, from the smallest at which their shorter side of `side` px still has
+    `config.min_side` px."""
+    count = max(0, math.floor(math.log(side / config.min_side) / math.log(config.step) + 1e-9))
+    return [config.step**-k for k in range(count, 0, -1)]
+
+
+def amplitude_shares(views: TrainingViews, scales: Sequence[float]) -> list[float]:
+    """The share of all amplitudes in the images' spectrum, their means left out, that images reduced to each of
+    `scales` keep."""
+    retained = np.zeros(len(scales))
+    frames = evenly_spaced(len(views), SPECTRUM_FRAMES) if len(scales) else []
+    for index in frames:
+        grey = views.target(index).mean(-1).cpu().numpy()
+        amplitudes = np.abs(np.fft.rfft2(grey - grey.mean()))
+        rows, columns = np.abs(np.fft.fftfreq(grey.shape[0])), np.fft.rfftfreq(grey.shape[1])
+        frequencies = np.maximum(rows[:, None], columns)  # of a pixel, at most 1/2
+        inside = [amplitudes[frequencies <= scale / 2].sum() for scale in scales]
+        retained += np.array(inside) / max(amplitudes.sum(), 1e-12) / len(frames)
+    return retained.tolist()

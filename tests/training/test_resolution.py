@@ -1,0 +1,93 @@
+"""Coarse to fine: sizes that the images' spectrum asks for, reduced views, and limits that follow the size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.capture import read_capture
+from neeco.errors import NeecoError
+from neeco.raster.pinhole import project_world
+from neeco.scene.training_views import TrainingViews
+from neeco.training.config import training_config
+from neeco.training.resolution import Resolution, ResolutionConfig, amplitude_shares, reduced_scales
+
+CONFIG = ResolutionConfig(min_side=16, step=2.0, full_size_at=0.5)
+
+
+def views_of(capture: Path, image: Tensor) -> TrainingViews:
+    """One training frame with this image, uint8 [H, W, 3], and a camera of its size."""
+    frame = read_capture(capture).split("train")[0]
+    resized = replace(frame, camera=frame.camera.resized(image.shape[1], image.shape[0]))
+    return TrainingViews((resized,), (image,), (None,))
+
+
+def noise(side: int) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (side, side, 3), generator=generator, dtype=torch.uint8)
+
+
+def test_sizes_double_from_the_smallest_that_is_large_enough() -> None:
+    assert reduced_scales(256, CONFIG) == [1 / 16, 1 / 8, 1 / 4, 1 / 2]
+    assert reduced_scales(31, CONFIG) == []
+    assert reduced_scales(8, CONFIG) == []
+
+
+def test_smooth_images_lose_nothing_by_reduction_and_noise_in_proportion_to_its_pixels(capture: Path) -> None:
+    wave = torch.sin(torch.arange(64) * (2 * torch.pi * 3 / 64)) * 100 + 128  # 3 periods: 6 px hold it
+    smooth = wave.round().to(torch.uint8)[None, :, None].expand(64, 64, 3).contiguous()
+    kept = amplitude_shares(views_of(capture, smooth), [1 / 16, 1 / 4])
+    assert kept[0] < 0.1
+    assert kept[1] > 0.9
+    kept = amplitude_shares(views_of(capture, noise(64)), [1 / 4, 1 / 2])
+    assert kept == pytest.approx([1 / 16, 1 / 4], rel=0.25)
+
+
+def test_sizes_grow_over_the_coarse_part_of_the_run_as_the_spectrum_says(capture: Path) -> None:
+    resolution = Resolution(CONFIG, views_of(capture, noise(64)))
+    found = [resolution.scale(progress / 1000) for progress in range(1001)]
+    assert found == sorted(found)
+    assert set(found) == {1 / 4, 1 / 2, 1.0}
+    assert found.index(1.0) == 500
+    assert found.index(0.5) == pytest.approx(125, rel=0.2)  # noise: a quarter of what twice the size keeps
+    assert resolution.limit_at(0.0, 1000) == 250
+    assert resolution.limit_at(0.9, 1000) == 1000
+
+
+def test_without_a_coarse_part_images_always_have_their_size(capture: Path) -> None:
+    assert Resolution(ResolutionConfig(), views_of(capture, noise(512))).scale(0.0) == 1.0
+
+
+def test_reduced_views_are_averages_under_cameras_that_see_the_same(capture: Path) -> None:
+    image = noise(64)
+    mask = torch.ones(64, 64, dtype=torch.bool)
+    mask[10, 20] = False
+    full = replace(views_of(capture, image), masks=(mask,))
+    half = full.scaled(0.5)
+    means = image.float().reshape(32, 2, 32, 2, 3).mean((1, 3))
+    assert float((half.images[0].float() - means).abs().max()) <= 0.5 + 1e-3
+    assert half.masks[0] is not None
+    assert (~half.masks[0]).nonzero().tolist() == [[5, 10]]  # a pixel counts where all that it averages does
+    points = torch.tensor([[1.0, 2.0, 60.0], [-5.0, 3.0, 90.0]], dtype=torch.float64)
+    places = [project_world(points, views.frames[0].camera)[0] for views in (full, half)]
+    assert torch.allclose(places[0], 2 * places[1])
+    assert full.scaled(1.0) is full
+
+
+def test_limits_follow_the_number_of_pixels_unless_given() -> None:
+    config = training_config("kinematic", {})
+    assert config.gaussian_limits(100) == config.gaussian_limits(320 * 256) == (20_000, 4_000)
+    assert config.gaussian_limits(16 * 320 * 256) == (160_000, 32_000)
+    assert training_config("kinematic", {"max_tissue_gaussians": 70}).gaussian_limits(1e6)[0] == 70
+
+
+@pytest.mark.parametrize(
+    "setting", ["resolution.full_size_at=1.5", "resolution.step=1", "resolution.min_side=0", "scale=2"]
+)
+def test_sizes_that_make_no_sense_are_refused(setting: str) -> None:
+    with pytest.raises(NeecoError, match=setting.split("=")[0]):
+        training_config("kinematic", {}, [setting])
