@@ -23,7 +23,8 @@ from neeco.scene.deformations.base import otsu
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene
 
-# Measured: the instrument's moving shadow is learned with labels of .3 to .5, so half is too low; .65 to .7 is best.
+# Of scenes without a threshold of their own: the instrument's moving shadow is learned with labels of .3 to .5, so
+# half is too low; .65 to .7 is best.
 LABEL_THRESHOLD = 0.65
 SHADOWED_THRESHOLD = 0.55  # where the scene models that shadow: .65 then loses as much of the silhouette's border
 # A share below the first is clearly tissue, one above the second clearly instrument. Measured by what a U-Net learns
@@ -37,6 +38,8 @@ DELTAS = ("means", "quats", "scales")
 
 def threshold_of(scene: Drawable) -> float:
     """The share of a pixel from which the scene's labels count it as instrument, unless a user says otherwise."""
+    if scene.label_threshold is not None:
+        return scene.label_threshold
     return SHADOWED_THRESHOLD if scene.casts_shadow else LABEL_THRESHOLD
 
 

@@ -62,6 +62,10 @@ class Drawable(Protocol):
         """Is the instruments' shadow drawn as one, so that none is learned as a faint part of them?"""
 
     @property
+    def label_threshold(self) -> float | None:
+        """Share of a pixel from which its label is an instrument's; None: by its shadows."""
+
+    @property
     def label_names(self) -> Sequence[tuple[str, str]]:
         """(instrument, part) of each label column; empty where the scene learns no labels."""
 

@@ -16,6 +16,7 @@ from neeco.raster.posing import HingedBody, part_weights
 from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
 
+LABEL_SHARE = "label_share"  # the per-Gaussian extra [N] in [0, 1]: how far one of an instrument counts as instrument
 PART_LOGITS = "part_logits"  # the per-Gaussian extra [N, logit_count] that part weights are the softmax of
 # in radii of the shaft
 JAW_BEHIND_HINGE = 1.0  # how far behind its hinge a jaw may reach

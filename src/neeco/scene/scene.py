@@ -41,7 +41,8 @@ class Scene(nn.Module):
     in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
     instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`, `shadow_strengths` (0: no such
     lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`). `background` in [0, 1] is the grey
-    behind everything.
+    behind everything. `label_threshold` in (0, 1) is the share of a pixel from which it is labelled an instrument;
+    None: by what shadows the scene draws (see `neeco.labels.labellers`).
     """
 
     has_gaussians = True
@@ -66,6 +67,7 @@ class Scene(nn.Module):
         self.recorded = recorded
         self.sh_degree = 0
         self.background = 0.0
+        self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
         self.register_buffer("center", center.float())  # [3] mm, middle of the tissue
         self.registration = nn.Parameter(torch.zeros(7))
@@ -95,6 +97,7 @@ class Scene(nn.Module):
             "counts": list(canonical.counts),
             "sh_degree": self.sh_degree,
             "background": self.background,
+            "label_threshold": self.label_threshold,
         }
 
     @classmethod
@@ -116,6 +119,10 @@ class Scene(nn.Module):
         scene.background = float(header.get("background", header.get("backdrop", 0.0)))
         if not 0 <= scene.background <= 1:
             raise ValueError(f"its background is {scene.background}, not a grey in [0, 1]")
+        if (threshold := header.get("label_threshold")) is not None:  # older scenes have none
+            scene.label_threshold = float(threshold)
+            if not 0 < scene.label_threshold < 1:
+                raise ValueError(f"its label_threshold is {threshold}, not a share between 0 and 1")
         return scene
 
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:

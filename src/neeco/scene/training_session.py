@@ -143,6 +143,8 @@ class InstrumentSearch:
     replace_wrists: Callable[[HingedInstruments], None]
     # find lamps that explain the instruments' shadows, beside those found before
     find_shadow: Callable[[], None]
+    # find how far each of the instruments' Gaussians counts as instrument, by the images' colours
+    weigh_labels: Callable[[], None]
     # set each instrument's extent, prolong its shaft, and judge whether its joints were found
     conclude: Callable[[HingedInstruments], None]
 

@@ -97,14 +97,16 @@ def reduced(camera: Camera) -> Camera:
     return camera if scale >= 1 else camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
-def visible_pixels(posed: Gaussians, camera: Camera) -> Tensor:
-    """[N] how many of the camera's pixels each posed Gaussian takes up: the gradient of a drawn channel of 1."""
+def visible_pixels(posed: Gaussians, camera: Camera, weight: Tensor | None = None) -> Tensor:
+    """[N] how many of the camera's pixels, of `weight` [H, W] each, every posed Gaussian takes up: the gradient of a
+    drawn channel of 1."""
     channel = torch.ones_like(posed.opacities)[:, None].requires_grad_()
     with torch.enable_grad():
         unlit = replace(posed, sh=posed.sh[:, :1], headlight=None)
         composited = rasterize(unlit, camera, channels=channel).channels
         assert composited is not None
-        (pixels,) = torch.autograd.grad(composited.sum(), channel)
+        seen = composited.sum() if weight is None else (composited[..., 0] * weight).sum()
+        (pixels,) = torch.autograd.grad(seen, channel)
     return pixels[:, 0]
 
 

@@ -95,6 +95,7 @@ class SearchConfig:
     border_frames: int = 40  # frames whose colours along the shaft are looked at
     spin_frames: int = 16  # frames in which shafts are spun to test their symmetry
     spin_angle: float = 0.5  # rad: small, so that visible sides stay in view
+    label_frames: int = 40  # frames whose colours tell instruments from what they do to the tissue beside them
     lamp_frames: int = 12  # frames in which lamps are tried
     lamp_directions: int = 8  # tried around the lens
     min_lamp_agreement: float = 0.75  # share of the frames that the first lamps found improve, at least

@@ -20,6 +20,7 @@ from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
+from neeco.training.instruments.label_shares import store_label_shares
 from neeco.training.instruments.shadow import find_shadow
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
@@ -44,6 +45,7 @@ def begin_session(
         place_wrists=_searching(session, place_wrists),
         replace_wrists=_searching(session, replace_wrists),
         find_shadow=_searching(session, find_shadow),
+        weigh_labels=_searching(session, store_label_shares),
         conclude=partial(conclude, session),
     )
     if is_new:

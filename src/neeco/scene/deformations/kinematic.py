@@ -30,7 +30,7 @@ from neeco.scene.deformations.base import (
     state_of,
 )
 from neeco.scene.drawable import HingeMotion
-from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges
+from neeco.scene.instruments import LABEL_SHARE, PART_LOGITS, HingedInstruments, Hinges
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.training_session import GaussianTraining
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
@@ -57,7 +57,8 @@ class KinematicSettings:
     `hinge_start`, from which on hinges are learned, by rates that `rate_scale` multiplies; `refine_wrists`: whether
     wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
     looked for and drawn (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`: whether
-    tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`)."""
+    tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`: whether
+    Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours."""
 
     renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
 
@@ -74,6 +75,7 @@ class KinematicSettings:
     shadow: bool = True
     shadow_at: tuple[int, ...] = (1000, 1500)  # instruments have shape, and no shadow is learned yet as a part of them
     extrapolate_tissue: bool = True
+    label_shares: bool = True
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,8 @@ class Kinematic(HingedInstruments, Deformation):
                 parts = labels.new_ones(canonical.counts[index + 1], 1)
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
-        return labels
+        share = canonical.extras.get(LABEL_SHARE)
+        return labels if share is None else labels * share[:, None]
 
     def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
         """Change from canonical to posed; tissue does not change, so the thresholds of the paper's labels separate
@@ -191,7 +194,8 @@ class Kinematic(HingedInstruments, Deformation):
 
     def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
         logits, columns = extras[PART_LOGITS], self.logit_count
-        return {PART_LOGITS: nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]}
+        logits = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
+        return {PART_LOGITS: logits, LABEL_SHARE: extras.get(LABEL_SHARE, logits.new_ones(len(logits)))}
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
         return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
@@ -255,6 +259,8 @@ class Kinematic(HingedInstruments, Deformation):
             training.instruments.replace_wrists(self)
 
     def finish(self, training: GaussianTraining) -> None:
+        if self.settings.label_shares and self.label_names:
+            training.instruments.weigh_labels()
         training.instruments.conclude(self)
         if self.settings.extrapolate_tissue:
             scene = training.scene

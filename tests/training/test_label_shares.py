@@ -1,0 +1,102 @@
+"""Gaussians that model an instrument's shadow count less in its labels than those that model the instrument."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from neeco.raster.types import Camera, Gaussians
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.instruments import LABEL_SHARE
+from neeco.training.instruments import label_shares as module
+from neeco.training.instruments.label_shares import store_label_shares
+
+TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)
+SHADE = 0.35  # of the tissue's light, in the shadow
+SIDE = 64
+CAMERA = Camera(np.eye(4), 60.0, 60.0, 32.0, 32.0, SIDE, SIDE)
+
+
+def flat(
+    x: tuple[float, float], depth: float, color: tuple[float, float, float], step: float = 1.0
+) -> CanonicalGaussians:
+    """Opaque Gaussians over the columns x [mm] of a plane before the camera."""
+    across, down = torch.meshgrid(torch.arange(*x, step), torch.arange(-36.0, 36.0, step), indexing="ij")
+    points = torch.stack([across, down, torch.full_like(across, depth)], -1).reshape(-1, 3)
+    count = len(points)
+    return seed_gaussians(points, torch.tensor(color).expand(count, 3), torch.full((count,), 0.7 * step), opacity=0.99)
+
+
+@dataclass
+class StillScene:
+    """Tissue behind an instrument of two stripes: metal, and at its side what models its shadow."""
+
+    metal: tuple[float, float, float] = METAL
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+    label_threshold: float | None = None
+
+    def __post_init__(self) -> None:
+        shadow = tuple(SHADE * value for value in TISSUE)
+        stripes = [flat((-14.0, 4.0), 58.0, self.metal), flat((4.0, 6.0), 58.0, shadow)]  # type: ignore[arg-type]
+        self.metal_count = len(stripes[0])
+        self.canonical = join_bodies([flat((-36.0, 36.0), 60.0, TISSUE), self.joined(stripes)])
+
+    @staticmethod
+    def joined(stripes: list[CanonicalGaussians]) -> CanonicalGaussians:
+        both = join_bodies(stripes)
+        return replace(both, counts=(len(both),))
+
+    def at(self, state: object) -> Gaussians:
+        canonical = self.canonical
+        return Gaussians(
+            canonical.means,
+            canonical.quats,
+            canonical.log_scales.exp(),
+            torch.sigmoid(canonical.opacity_logits),
+            canonical.sh_dc,
+        )
+
+
+def session_of(scene: StillScene) -> Any:
+    """A session of one frame, recorded as the scene is drawn."""
+    with torch.no_grad():
+        image: Tensor = module.rasterize(scene.at(None), CAMERA).color
+    views = SimpleNamespace(target=lambda index: image, mask=lambda index: None)
+    config = SimpleNamespace(search=SimpleNamespace(label_frames=1))
+    return SimpleNamespace(
+        scene=scene,
+        views=views,
+        config=config,
+        corrected=lambda index: (None, CAMERA),
+        frames_along_poses=lambda count: [0],
+    )
+
+
+def test_what_looks_like_tissue_in_another_shade_is_no_instrument() -> None:
+    scene = StillScene()
+    store_label_shares(session_of(scene))
+    tissue, instrument = scene.canonical.body(0), scene.canonical.body(1)
+    share = scene.canonical.extras[LABEL_SHARE]
+    metal, shadow = share[instrument][: scene.metal_count], share[instrument][scene.metal_count :]
+    points = scene.canonical.means[instrument][scene.metal_count :]
+    in_view = (points[:, 0] > 4.5) & (points[:, 1].abs() < 25)
+    assert float(metal.min()) > 0.9
+    assert float(shadow[in_view].max()) < 0.1
+    assert bool((share[tissue] == 1).all())
+    assert scene.label_threshold == 0.5
+
+
+@pytest.mark.parametrize("metal", [tuple(0.5 * value for value in TISSUE)])
+def test_where_colours_do_not_tell_everything_stays_as_it_was(metal: tuple[float, float, float]) -> None:
+    scene = StillScene(metal)
+    before = scene.canonical
+    store_label_shares(session_of(scene))
+    assert scene.canonical is before
+    assert scene.label_threshold is None
+    assert scene.diagnostics["label_shares"]["inside"] < module.MIN_INSIDE
