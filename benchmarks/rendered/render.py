@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rendered import instrument as tools
 from rendered.instrument import Design, Material
+from rendered.motion import Moment
 from rendered.noise import blur
 from rendered.tissue import Tissue
 
@@ -76,8 +77,20 @@ class Place:
     lens: Lens
 
 
-def draw(place: Place, view: View) -> Drawing:
-    """Draw a frame with 2 x 2 samples a pixel; parts and depth are exact at pixel centres."""
+def view_of(moment: Moment) -> View:
+    """What `draw` needs of a moment."""
+    camera, tool = (torch.from_numpy(m).float() for m in (moment.scene_from_camera, moment.scene_from_mechanical))
+    return View(camera, tool, moment.opening)
+
+
+def draw(place: Place, view: View, gain: tuple[float, float, float] | None = None) -> Drawing:
+    """Draw a frame; gain: what the camera multiplies red, green and blue light by."""
+    light, parts, depth = gather(place, view)
+    return Drawing(develop(light, gain), parts, depth)
+
+
+def gather(place: Place, view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Linear light [H, W, 3] from 2 x 2 samples a pixel; parts [H, W] and depth [H, W], exact at pixel centres."""
     truth = _truth(place, view)
     lit = _shadows(place, view, truth.tissue)
     planes = truth.tissue[None, None]
@@ -94,7 +107,7 @@ def draw(place: Place, view: View) -> Drawing:
         share = lit[:, row::2, column::2].reshape(len(lit), -1)
         total += _shade(place, view, directions, (near, far), (around, t[hit], parts[hit]), share) / 4
     depth = torch.minimum(truth.tissue, truth.instrument)
-    return Drawing(_develop(total.reshape(*depth.shape, 3)), truth.parts, depth)
+    return total.reshape(*depth.shape, 3), truth.parts, depth
 
 
 @dataclass(frozen=True)
@@ -222,12 +235,14 @@ def _light(lamps: Lamps, position: Tensor, points: Tensor) -> tuple[Tensor, Tens
     return share * cone * lamps.distance**2 / squared, light
 
 
-def _develop(light: Tensor) -> Tensor:
-    """Linear light [H, W, 3] to sRGB in [0, 1]: lens blur, vignette, soft shoulder, transfer curve."""
+def develop(light: Tensor, gain: tuple[float, float, float] | None = None) -> Tensor:
+    """Linear light [H, W, 3] to sRGB in [0, 1]: lens blur, vignette, exposure, soft shoulder, transfer curve."""
     light = blur(light.permute(2, 0, 1), BLOOM).permute(1, 2, 0)
     height, width = light.shape[:2]
     v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     light = light * (1 - 0.13 * (u.square() + v.square()))[..., None]
+    if gain is not None:
+        light = light * torch.tensor(gain)
     shoulder = 0.7
     light = torch.where(
         light > shoulder, shoulder + (1 - shoulder) * (1 - torch.exp(-(light - shoulder) / (1 - shoulder))), light
