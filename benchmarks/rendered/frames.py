@@ -17,7 +17,9 @@ from torch import Tensor
 from neeco.capture.images import write_labels
 from neeco.files import write_atomically
 from rendered import instrument
+from rendered.adaptive import draw_detailed
 from rendered.breathing import Mode, breathing_modes, displacement_at
+from rendered.detail import Detail, make_detail
 from rendered.hinge import truth_ids
 from rendered.motion import Array, Moment, Trajectory, is_unseen
 from rendered.optics import Optics
@@ -43,6 +45,21 @@ class Settings:
     optics: bool = False  # raw/: the images as an endoscope distorts them, in a round border
     video: bool = False  # recording/: what `neeco ingest` takes
     workers: int = 1
+
+    @property
+    def options(self) -> str:
+        """Those of the command line that make these settings, each after a blank."""
+        size = "" if self.lens == Lens() else f" --size {self.lens.width}x{self.lens.height}"
+        given = [
+            (self.detail and not size, " --detail"),
+            (self.breathing_mm, f" --breathing {self.breathing_mm:g}"),
+            (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
+            (self.exposure, " --exposure"),
+            (self.optics, " --lens"),
+            (self.video, " --video"),
+            (self.every > 1, f" --every {self.every}"),
+        ]
+        return size + "".join(option for wanted, option in given if wanted)
 
     def modes(self, spec: SceneSpec) -> tuple[Mode, ...]:
         """How the tissue moves."""
@@ -94,23 +111,33 @@ class Renderer:
     settings: Settings
     path: Path
     place: Place  # at rest
+    detail: Detail | None
     gains: Gains  # by frame number; empty without automatic exposure
+
+    @staticmethod
+    def of(spec: SceneSpec, settings: Settings, path: Path, place: Place, gains: Gains) -> Renderer:
+        """The renderer of `place`, with the textures that the settings ask for."""
+        detail = make_detail(spec.organ, place.tissue, spec.seed) if settings.detail else None
+        return Renderer(spec, settings, path, place, detail, gains)
 
     def render(self, shot: Shot) -> Rendered:
         """Render a frame and write its image, its mask of parts and its depth."""
         place = moved(self.place, self.settings.modes(self.spec), shot.time)
-        view, gain = view_of(shot.moment), self.gains.get(shot.number)
-        drawing = draw(place, view, gain)
+        drawing = self._draw(place, shot)
         pixels = _add_noise(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
         self._write_truth(shot, drawing)
         recorded = pixels
         if self.settings.optics:
             optics = Optics.of(self.settings.lens)
-            color = optics.add_border(draw(replace(place, lens=optics), view, gain).color)
+            color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
             recorded = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
             _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, recorded)
         return Rendered(pixels, drawing, recorded)
+
+    def _draw(self, place: Place, shot: Shot) -> Drawing:
+        view, gain = view_of(shot.moment), self.gains.get(shot.number)
+        return draw_detailed(place, self.detail, view, gain) if self.detail else draw(place, view, gain)
 
     def _write_truth(self, shot: Shot, drawing: Drawing) -> None:
         truth, name = self.path / "truth", f"{shot.number:06d}.png"
@@ -144,7 +171,7 @@ _renderers: list[Renderer] = []  # of this worker
 def _start(spec: SceneSpec, settings: Settings, path: Path, gains: Gains) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _renderers.append(Renderer(spec, settings, path, settings.place(spec), gains))
+    _renderers.append(Renderer.of(spec, settings, path, settings.place(spec), gains))
 
 
 def _render(shot: Shot) -> Rendered:

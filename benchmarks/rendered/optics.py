@@ -27,9 +27,9 @@ class Optics(Lens):
         """The optics before a pinhole's sensor."""
         return Optics(lens.width, lens.height, lens.focal)
 
-    def rays(self, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
-        """Directions [H * W, 3] with z = 1 of the distorted image's pixels."""
-        rays = super().rays(shift)
+    def rays_through(self, u: Tensor, v: Tensor) -> Tensor:
+        """Directions [M, 3] with z = 1 of positions u, v [M] px of the distorted image."""
+        rays = super().rays_through(u, v)
         x, y = wanted = rays[:, :2].double().numpy().T
         for _ in range(INVERSIONS):
             seen = distort(x, y)
@@ -44,7 +44,7 @@ class Optics(Lens):
 
     def visible(self) -> Array:
         """bool [H, W]: which pixels of the pinhole image show what lies inside the border."""
-        x, y = Lens.rays(self)[:, :2].double().numpy().T
+        x, y = Lens(self.width, self.height, self.focal).rays()[:, :2].double().numpy().T
         distance = np.hypot(*distort(x, y)) * self.focal
         return (distance < (RADIUS - 3 * SOFT) * self.height).reshape(self.height, self.width)
 

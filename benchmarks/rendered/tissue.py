@@ -48,6 +48,11 @@ class Tissue:
         bottom = flat[index + size] * (1 - fu) + flat[index + size + 1] * fu
         return top * (1 - fv) + bottom * fv
 
+    def texels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Column and row [M] of positions [M] in `height`."""
+        scale = (self.height.shape[0] - 1) / (2 * HALF_SIZE)
+        return (x + HALF_SIZE) * scale, (y + HALF_SIZE) * scale
+
     def intersect(self, origin: Tensor, directions: Tensor) -> Tensor:
         """Distance [M] mm along rays from `origin` [3] with `directions` [M, 3] (any length, z < 0) to the surface."""
         low, high = self.bounds

@@ -43,7 +43,7 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
     gains = {shot.number: exposure.of(shot.number) for shot in shots} if exposure else {}
     generator = np.random.default_rng(spec.seed + 1)
     sampler = PointSampler(len(shots), generator)
-    renderer = Renderer(spec, settings, path, place, gains)
+    renderer = Renderer.of(spec, settings, path, place, gains)
     started = _cpu_seconds()
     for index, (shot, rendered) in enumerate(zip(shots, render_all(renderer, shots), strict=True)):
         displacement = breathing.displacement_at(modes, shot.time)
@@ -61,7 +61,7 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
     if settings.optics:
         capture = _behind_optics(capture, Optics.of(settings.lens), path)
     quality["smallest clearance mm"] = clearance(place, settings, spec, shots)
-    write_text(path / "README.md", readme(spec, capture, quality))
+    write_text(path / "README.md", readme(spec, settings, capture, quality))
     write_capture(capture, path)
     report(f"{path}: {len(shots)} frames, {(_cpu_seconds() - started) / len(shots):.2f} s CPU each")
 
