@@ -1,16 +1,60 @@
-"""Doc."""
+"""Renders captures with exact truth: other organs and instruments than the samples, to test what must work on any.
+
+    python benchmarks/rendered_captures.py bowel OUT [--every N] [--positive] [--workers N]
+    python benchmarks/rendered_captures.py stomach OUT --size 1920x1080 --every 3
+    python benchmarks/rendered_captures.py stomach OUT --breathing 3 --exposure --lens --video
+
+Writes a complete `neeco-capture/1` folder of 275 frames, 320x256: images, `transforms.json` and `sparse.ply` with the
+errors a tracker, SfM and a jaw sensor make, and `truth/` (part masks, depth, exact `transforms.json`, `hinge.json`
+with the hinge and the shaft in the sensor's frame). Nothing beyond neeco's own dependencies is needed (`--video`: those
+of `ingest`). The same command gives the same pixels on the same machine, with any number of workers.
+
+    --size WxH       the same scene, motion and errors of the sensors in mm, degrees and s, in images of another size.
+                     The vertical field of view stays, so wider images show more at both sides; sparse points err by
+                     as many pixels. Sides are multiples of 4. Other sizes than 320x256 always have fine detail
+    --detail         fine detail at 320x256, too: the scene of larger sizes, each pixel the mean of what it covers
+    --every N        keep one frame in so many
+    --workers N      processes that draw
+    --positive       let the jaw's reading grow as it opens
+    --breathing MM   the tissue moves by this amplitude about its mean, with a period of 4 s (truth/breathing.json);
+                     cameras, instrument and sparse points stay
+    --pulse MM       part of the tissue also moves with a period of 0.85 s
+    --exposure       one gain and one colour gain a frame, as a camera's automatics choose them (truth/exposure.json)
+    --lens           also raw/: the images as an endoscope distorts them, in a round border, and optics/calibration.yaml
+                     (OpenCV). images/ stay pinhole; what the border hides is masked (`mask_path`)
+    --video          also recording/: video.mp4 (of raw/ with --lens), logs of trackers and jaw on clocks of their own,
+                     recording.yaml, for `neeco ingest OUT/recording/recording.yaml`
+
+CPU seconds a frame, on a core of an EPYC: TIMES
+
+How it works (`benchmarks/rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`),
+the instrument a distance function (`instrument.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
+(`render.py`). With fine detail (`detail.py`, `textures.py`), `adaptive.py` draws from coarse to fine: one sample a
+pixel, 3 x 3 at edges, where a pixel's part is what most samples see. `motion.py` plans camera and instrument,
+`breathing.py` moves the tissue, `exposure.py` and `optics.py` are the camera's, `errors.py` is what the sensors make of
+it, `scenes.py` holds the scenes; `frames.py`, `truth.py`, `points.py`, `recording.py` and `writing.py` write. A new
+scene is one more entry in `scenes.SCENES`.
+
+    bowel     5 mm black shaft, gold wrist, long thin curved scissors; both blades move, 64/36; the reading is 0.22 rad
+              when closed; sensor 26 mm behind the wrist, tilted 9 degrees
+    stomach   8 mm grey shaft, short fat grasper of which one jaw moves; the reading falls as it opens; sensor 9 mm
+              behind the wrist, tilted 16 degrees
+    bowel-grasper, stomach-scissors
+              each with the other's instrument, in other colours, under a single lamp whose shadow falls beside it
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import torch
 from rendered.frames import Settings
 from rendered.render import Lens
-from rendered.scenes import SCENES
+from rendered.scenes import SCENES, SceneSpec
 from rendered.writing import without_sign, write_recording
 
 from neeco.errors import NeecoError
@@ -20,22 +64,33 @@ SMALLEST = 32  # px of either side that a scene is drawn at
 
 def main() -> int:
     """Parse the command line and write one capture."""
+    spec, output, settings = parse(sys.argv[1:])
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        write_recording(spec, output, settings, print)
+    except NeecoError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
+    """What the command line asks for. Exits with status 2 when it cannot be understood."""
     parser = argparse.ArgumentParser(description="Render a capture with exact truth.")
     parser.add_argument("scene", choices=sorted(SCENES))
     parser.add_argument("output", type=Path)
     parser.add_argument("--every", type=_count, default=1, metavar="N", help="keep one frame in so many")
     parser.add_argument("--positive", action="store_true", help="let the jaw's reading grow as it opens")
     parser.add_argument("--size", type=_lens, default=Lens(), metavar="WxH", help="of the images (320x256)")
-    parser.add_argument("--detail", action="store_true", help="fine texture at 320x256 too, where it is averaged")
+    parser.add_argument("--detail", action="store_true", help="fine detail at 320x256, too")
     parser.add_argument("--breathing", type=_length, default=0.0, metavar="MM", help="amplitude of the tissue's motion")
     parser.add_argument("--pulse", type=_length, default=0.0, metavar="MM", help="amplitude of a heartbeat")
     parser.add_argument("--exposure", action="store_true", help="automatic exposure and white balance")
     parser.add_argument("--lens", action="store_true", help="also raw/: distorted images in a round border")
-    parser.add_argument("--video", action="store_true", help="also recording/: video and logs, as `neeco ingest` takes")
+    parser.add_argument("--video", action="store_true", help="also recording/: video and logs for `neeco ingest`")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
     settings = Settings(
         arguments.size,
@@ -48,12 +103,7 @@ def main() -> int:
         video=arguments.video,
         workers=arguments.workers,
     )
-    try:
-        write_recording(without_sign(spec) if arguments.positive else spec, arguments.output, settings, print)
-    except NeecoError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+    return without_sign(spec) if arguments.positive else spec, arguments.output, settings
 
 
 def _lens(text: str) -> Lens:

@@ -17,9 +17,19 @@ from torch import Tensor
 from rendered import instrument as tools
 from rendered.detail import Detail
 from rendered.render import (
-    BLOOM, WET, WET_SHARPNESS, Drawing, Lens, Place, View, develop, light_instrument, light_tissue, mechanical_from_camera,
+    BLOOM,
+    WET,
+    WET_SHARPNESS,
+    Drawing,
+    Lens,
+    Place,
+    View,
+    develop,
+    light_instrument,
+    light_tissue,
+    mechanical_from_camera,
     widened,
-)  # fmt: skip
+)
 from rendered.textures import remap
 
 BLOCK = 4  # px
@@ -55,9 +65,7 @@ class _Samples:
     depth: Tensor
 
 
-def draw_detailed(
-    place: Place, detail: Detail, view: View, gain: tuple[float, float, float] | None = None
-) -> Drawing:
+def draw_detailed(place: Place, detail: Detail, view: View, gain: tuple[float, float, float] | None = None) -> Drawing:
     """Draw a frame. Parts are what most of a pixel's samples see; depth is that part's, mm."""
     lens = place.lens
     frame = _prepare(place, detail, view)
@@ -68,9 +76,9 @@ def draw_detailed(
     again = torch.nonzero(_changes(light.reshape(*shape, 3), parts.reshape(shape), depth.reshape(shape)).reshape(-1))
     again = again[:, 0]
     offsets = [(column - 1) / SAMPLES for column in range(SAMPLES)]
-    around = [
-        _sample(frame, again, (x, y), RESAMPLED) for y in offsets for x in offsets if (x, y) != (0.0, 0.0)
-    ] + [_Samples(light[again], parts[again], depth[again])]
+    around = [_sample(frame, again, (x, y), RESAMPLED) for y in offsets for x in offsets if (x, y) != (0.0, 0.0)] + [
+        _Samples(light[again], parts[again], depth[again])
+    ]
     light[again] = torch.stack([samples.light for samples in around]).mean(0)
     seen = torch.stack([samples.parts for samples in around])
     votes = torch.stack([(seen == part).sum(0) for part in range(5)])
@@ -92,8 +100,9 @@ def _prepare(place: Place, detail: Detail, view: View) -> _Frame:
     rays = _grid(lens, BLOCK)
     rotation, origin = view.scene_from_camera[:3, :3], view.scene_from_camera[:3, 3]
     tissue = place.tissue.intersect(origin, rays @ rotation.T).reshape(shape)
-    far = F.max_pool2d(tissue[None, None], 3, 1, 1)[0, 0] + SLACK_MM
-    near = -F.max_pool2d(-tissue[None, None], 3, 1, 1)[0, 0] - SLACK_MM
+    slack = SLACK_MM + tissue * (BLOCK / 2 / lens.focal)  # blocks at the border have no neighbours farther out
+    far = F.max_pool2d(tissue[None, None], 3, 1, 1)[0, 0] + slack
+    near = -F.max_pool2d(-tissue[None, None], 3, 1, 1)[0, 0] - slack
     transform = mechanical_from_camera(view)
     unit = F.normalize(rays @ transform[:3, :3].T, dim=-1)
     spread = 0.75 * BLOCK / lens.focal  # a little beyond a block's corners

@@ -206,12 +206,12 @@ def _metal(generator: np.random.Generator) -> np.ndarray:
         stroke = np.zeros_like(scratches)
         start = generator.uniform(0, fine, 2)
         turn = generator.normal(0, 0.5) + (np.pi / 2 if generator.random() < 0.7 else 0)
+        thickness = int(generator.integers(2, 6))
         end = start + generator.uniform(60, 500) * np.array([np.cos(turn), np.sin(turn)])
-        for shift_x in (-fine, 0, fine):
-            for shift_y in (-fine, 0, fine):
-                first, last = (tuple(np.rint(p + (shift_x, shift_y)).astype(int).tolist()) for p in (start, end))
-                if -600 < first[0] < fine + 600 and -600 < first[1] < fine + 600:
-                    cv2.line(stroke, first, last, 1.0, int(generator.integers(2, 6)), cv2.LINE_AA)
+        for shift in fine * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)]):  # over the edges, too
+            first, last = (tuple(np.rint(p + shift).astype(int).tolist()) for p in (start, end))
+            if min(*first) > -600 and max(*first) < fine + 600:
+                cv2.line(stroke, first, last, 1.0, thickness, cv2.LINE_AA)
         scratches += stroke * generator.uniform(-0.5, 1.0)
     engraved = np.zeros((fine, fine), np.float32)
     pixel = 24  # 0.29 mm

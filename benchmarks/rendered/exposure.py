@@ -45,7 +45,7 @@ def meter(place: Place, trajectory: Trajectory) -> Exposure:
     """What the camera's automatics choose for each frame: they follow, with a delay, the centre-weighted mean of what
     they see (thumbnails), towards its median over the recording."""
     lens = place.lens
-    width = round(METER_ROWS * lens.width / lens.height)
+    width = 2 * round(METER_ROWS * lens.width / lens.height / 2)  # shadows are found for 2 x 2 pixels
     small = replace(place, lens=Lens(width, METER_ROWS, lens.focal * METER_ROWS / lens.height))
     v, u = torch.meshgrid(torch.linspace(-1, 1, METER_ROWS), torch.linspace(-1, 1, width), indexing="ij")
     weight = torch.exp(-1.5 * (u.square() + v.square()))[..., None]

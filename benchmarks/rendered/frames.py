@@ -95,12 +95,10 @@ def take_shots(trajectory: Trajectory, spec: SceneSpec, every: int = 1) -> list[
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame as the rest of the pipeline needs it: pixels uint8 [H, W, 3], the drawing it came from, and the pixels
-    of the recording's video where they are others."""
+    """One frame as the rest of the pipeline needs it: pixels uint8 [H, W, 3] and the drawing they came from."""
 
     pixels: Array
     drawing: Drawing
-    recorded: Array
 
 
 @dataclass(frozen=True)
@@ -127,13 +125,12 @@ class Renderer:
         pixels = _add_noise(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
         _write_jpeg(self.path / image_name(shot), pixels)
         self._write_truth(shot, drawing)
-        recorded = pixels
         if self.settings.optics:
             optics = Optics.of(self.settings.lens)
             color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
-            recorded = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
-            _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, recorded)
-        return Rendered(pixels, drawing, recorded)
+            raw = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
+            _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, raw)
+        return Rendered(pixels, drawing)
 
     def _draw(self, place: Place, shot: Shot) -> Drawing:
         view, gain = view_of(shot.moment), self.gains.get(shot.number)

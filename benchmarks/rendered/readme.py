@@ -17,7 +17,8 @@ def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[
     errors = "\n".join(f"- {name}: {value:.3f}" for name, value in quality.items())
     return f"""# {spec.organ}: rendered laparoscopic capture
 
-Made by `benchmarks/rendered_captures.py {spec.organ}{settings.options}`; nothing here is a real recording. {size}, {counts}.
+Made by `benchmarks/rendered_captures.py {spec.organ}{settings.options}`; nothing here is a real recording. \
+{size}, {counts}.
 Shows {spec.words}.
 {_switched_on(settings)}
 World: the tracker's frame, mm; `pose` = world_from_sensor, the sensor tilted

@@ -23,6 +23,7 @@ from rendered.motion import Array, Trajectory, plan
 from rendered.optics import Optics
 from rendered.points import PointSampler
 from rendered.readme import readme
+from rendered.recording import write_raw_recording
 from rendered.render import Lens, Place
 from rendered.scenes import SceneSpec
 from rendered.truth import JOINT, World, truth_document
@@ -53,6 +54,8 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
     world = World(spec, shots)
     write_json(path / "truth" / "transforms.json", truth_document(world, settings.lens))
     write_json(path / "truth" / "hinge.json", describe_hinge(spec))
+    if settings.video:
+        write_raw_recording(world, trajectory, settings, path, np.random.default_rng(spec.seed + 2))
     if modes:
         write_json(path / "truth" / "breathing.json", breathing.describe(modes, spec.world_from_scene().tolist()))
     if exposure:
