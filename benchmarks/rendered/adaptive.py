@@ -73,22 +73,27 @@ def draw_detailed(place: Place, detail: Detail, view: View, gain: tuple[float, f
     middle = _sample(frame, pixels, (0.0, 0.0), 1.0)
     shape = (lens.height, lens.width)
     light, parts, depth = middle.light, middle.parts, middle.depth
-    again = torch.nonzero(_changes(light.reshape(*shape, 3), parts.reshape(shape), depth.reshape(shape)).reshape(-1))
-    again = again[:, 0]
-    offsets = [(column - 1) / SAMPLES for column in range(SAMPLES)]
-    around = [_sample(frame, again, (x, y), RESAMPLED) for y in offsets for x in offsets if (x, y) != (0.0, 0.0)] + [
-        _Samples(light[again], parts[again], depth[again])
-    ]
-    light[again] = torch.stack([samples.light for samples in around]).mean(0)
-    seen = torch.stack([samples.parts for samples in around])
-    votes = torch.stack([(seen == part).sum(0) for part in range(5)])
-    parts[again] = votes.argmax(0).to(torch.uint8)
-    agrees = seen == parts[again]
-    depths = torch.stack([samples.depth for samples in around])
-    mean = (depths * agrees).sum(0) / agrees.sum(0)
-    depth[again] = torch.where(agrees[-1], depth[again], mean)
+    changes = _changes(light.reshape(*shape, 3), parts.reshape(shape), depth.reshape(shape))
+    again = torch.nonzero(changes.reshape(-1))[:, 0]
+    if len(again):
+        here = _Samples(light[again], parts[again], depth[again])
+        voted = _sample_again(frame, again, here)
+        light[again], parts[again], depth[again] = voted.light, voted.parts, voted.depth
     blurred = cv2.GaussianBlur(light.reshape(*shape, 3).numpy(), (0, 0), BLOOM, borderType=cv2.BORDER_REPLICATE)
     return Drawing(develop(torch.from_numpy(blurred), gain), parts.reshape(shape), depth.reshape(shape))
+
+
+def _sample_again(frame: _Frame, pixels: Tensor, middle: _Samples) -> _Samples:
+    """The given pixels [M], whose middles are drawn, from SAMPLES x SAMPLES samples: the mean of the light, the part
+    that most see, and of those that see it the depth: the middle's if it does, else the mean."""
+    offsets = [(place - (SAMPLES - 1) / 2) / SAMPLES for place in range(SAMPLES)]
+    around = [_sample(frame, pixels, (x, y), RESAMPLED) for y in offsets for x in offsets if x or y] + [middle]
+    light, parts, depth = (torch.stack([getattr(s, name) for s in around]) for name in ("light", "parts", "depth"))
+    votes = torch.stack([(parts == part).sum(0) for part in range(tools.SECOND_JAW + 1)])
+    chosen = votes.argmax(0).to(torch.uint8)
+    agrees = parts == chosen
+    mean = (depth * agrees).sum(0) / agrees.sum(0)
+    return _Samples(light.mean(0), chosen, torch.where(agrees[-1], middle.depth, mean))
 
 
 def _prepare(place: Place, detail: Detail, view: View) -> _Frame:
@@ -134,11 +139,10 @@ def _grid(lens: Lens, step: int) -> Tensor:
 
 def _sample(frame: _Frame, pixels: Tensor, shift: tuple[float, float], size: float) -> _Samples:
     """What rays through the given pixels [M] see, `shift` px off their centres; size: of a sample, in pixels."""
-    tool = _meet_instrument(frame, pixels, shift)
-    bands = [
-        _sample_band(frame, *band, shift, size) for band in zip(*(x.split(BAND) for x in (pixels, *tool)), strict=True)
-    ]
-    return _Samples(*(torch.cat([getattr(band, name) for band in bands]) for name in ("light", "parts", "depth")))
+    tool_depth, parts = _meet_instrument(frame, pixels, shift)
+    bands = [slice(first, first + BAND) for first in range(0, len(pixels), BAND)]
+    drawn = [_sample_band(frame, pixels[band], tool_depth[band], parts[band], shift, size) for band in bands]
+    return _Samples(*(torch.cat([getattr(band, name) for band in drawn]) for name in ("light", "parts", "depth")))
 
 
 def _locate(lens: Lens, pixels: Tensor, shift: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -78,7 +79,7 @@ _CLOCKS = {"em": EM_CLOCK_S, JOINT: JAW_CLOCK_S}
 def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[str, object]:
     """recording.yaml, with the capture's splits."""
     spec, lens = world.spec, settings.lens
-    joint = {"file": "logs/jaw.csv", "columns": {"time": "t_s", "value": "hall_raw"}}
+    joint: dict[str, object] = {"file": "logs/jaw.csv", "columns": {"time": "t_s", "value": "hall_raw"}}
     joint |= {"calibration": "logs/jaw_calibration.csv", "limits": list(spec.joint.limits)}
     of = {split: [k for k, shot in enumerate(world.shots) if shot.split == split] for split in ("test", "unseen")}
     return {
@@ -141,5 +142,5 @@ def _pose_rows(times: Array, poses: Array, generator: np.random.Generator) -> li
     ]
 
 
-def _write_csv(path: Path, header: str, rows: list[tuple[object, ...]]) -> None:
+def _write_csv(path: Path, header: str, rows: Sequence[tuple[object, ...]]) -> None:
     write_text(path, "\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")

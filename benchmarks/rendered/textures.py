@@ -81,5 +81,6 @@ def _halved(image: np.ndarray, least: int) -> list[np.ndarray]:
     levels = [np.ascontiguousarray(image, dtype=np.float32)]
     while len(levels[-1]) // 2 >= least:
         half = len(levels[-1]) // 2
-        levels.append(cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA).reshape(half, half, -1))
+        smaller = cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA)
+        levels.append(smaller.reshape(half, half, -1).astype(np.float32, copy=False))
     return levels

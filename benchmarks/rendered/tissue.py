@@ -85,11 +85,12 @@ class Tissue:
         """Surface properties [M, 8] at points [M, 3]; normals are not of unit length."""
         rest = points[:, :2]
         if self.displacement is not None:
-            rest = torch.stack(self.displacement.rest(*rest.unbind(-1)), -1)
+            x, y = self.displacement.rest(points[:, 0], points[:, 1])
+            rest = torch.stack([x, y], -1)
         grid = (rest / HALF_SIZE)[None, None]
         found = F.grid_sample(self.surface[None], grid, padding_mode="border", align_corners=True)[0, :, 0]
         if self.displacement is not None:
-            found[3], found[4] = self.displacement.turn(*rest.unbind(-1), (found[3], found[4], found[5]))
+            found[3], found[4] = self.displacement.turn(x, y, (found[3], found[4], found[5]))
         return found.T
 
     def displaced(self, displacement: Displacement | None) -> Tissue:
