@@ -69,26 +69,30 @@ def draw_detailed(place: Place, detail: Detail, view: View, gain: tuple[float, f
     """Draw a frame. Parts are what most of a pixel's samples see; depth is that part's, mm."""
     lens = place.lens
     frame = _prepare(place, detail, view)
-    pixels = torch.arange(lens.width * lens.height)
-    middle = _sample(frame, pixels, (0.0, 0.0), 1.0)
     shape = (lens.height, lens.width)
+    v, u = torch.meshgrid(torch.arange(lens.height) + 0.5, torch.arange(lens.width) + 0.5, indexing="ij")
+    middle = _sample(frame, u.reshape(-1), v.reshape(-1), 1.0)
     light, parts, depth = middle.light, middle.parts, middle.depth
     changes = _changes(light.reshape(*shape, 3), parts.reshape(shape), depth.reshape(shape))
     again = torch.nonzero(changes.reshape(-1))[:, 0]
     if len(again):
         here = _Samples(light[again], parts[again], depth[again])
-        voted = _sample_again(frame, again, here)
+        voted = _sample_again(frame, u.reshape(-1)[again], v.reshape(-1)[again], here)
         light[again], parts[again], depth[again] = voted.light, voted.parts, voted.depth
     blurred = cv2.GaussianBlur(light.reshape(*shape, 3).numpy(), (0, 0), BLOOM, borderType=cv2.BORDER_REPLICATE)
     return Drawing(develop(torch.from_numpy(blurred), gain), parts.reshape(shape), depth.reshape(shape))
 
 
-def _sample_again(frame: _Frame, pixels: Tensor, middle: _Samples) -> _Samples:
-    """The given pixels [M], whose middles are drawn, from SAMPLES x SAMPLES samples: the mean of the light, the part
-    that most see, and of those that see it the depth: the middle's if it does, else the mean."""
+def _sample_again(frame: _Frame, u: Tensor, v: Tensor, middle: _Samples) -> _Samples:
+    """The pixels at u, v [M] px, whose middles are drawn, from SAMPLES x SAMPLES samples: the mean of the light, the
+    part that most see, and of those that see it the depth: the middle's if it does, else the mean."""
     offsets = [(place - (SAMPLES - 1) / 2) / SAMPLES for place in range(SAMPLES)]
-    around = [_sample(frame, pixels, (x, y), RESAMPLED) for y in offsets for x in offsets if x or y] + [middle]
-    light, parts, depth = (torch.stack([getattr(s, name) for s in around]) for name in ("light", "parts", "depth"))
+    shifts = [(x, y) for y in offsets for x in offsets if x or y]
+    found = _sample(frame, torch.cat([u + x for x, _ in shifts]), torch.cat([v + y for _, y in shifts]), RESAMPLED)
+    light, parts, depth = (
+        torch.cat([getattr(found, name).unflatten(0, (len(shifts), -1)), getattr(middle, name)[None]])
+        for name in ("light", "parts", "depth")
+    )
     votes = torch.stack([(parts == part).sum(0) for part in range(tools.SECOND_JAW + 1)])
     chosen = votes.argmax(0).to(torch.uint8)
     agrees = parts == chosen
@@ -137,45 +141,39 @@ def _grid(lens: Lens, step: int) -> Tensor:
     return lens.rays_through((u.reshape(-1) + 0.5) * step, (v.reshape(-1) + 0.5) * step)
 
 
-def _sample(frame: _Frame, pixels: Tensor, shift: tuple[float, float], size: float) -> _Samples:
-    """What rays through the given pixels [M] see, `shift` px off their centres; size: of a sample, in pixels."""
-    tool_depth, parts = _meet_instrument(frame, pixels, shift)
-    bands = [slice(first, first + BAND) for first in range(0, len(pixels), BAND)]
-    drawn = [_sample_band(frame, pixels[band], tool_depth[band], parts[band], shift, size) for band in bands]
+def _sample(frame: _Frame, u: Tensor, v: Tensor, size: float) -> _Samples:
+    """What rays through image positions u, v [M] px see; size: of a sample, in pixels."""
+    tool_depth, parts = _meet_instrument(frame, u, v)
+    bands = [slice(first, first + BAND) for first in range(0, len(u), BAND)]
+    drawn = [_sample_band(frame, u[band], v[band], tool_depth[band], parts[band], size) for band in bands]
     return _Samples(*(torch.cat([getattr(band, name) for band in drawn]) for name in ("light", "parts", "depth")))
 
 
-def _locate(lens: Lens, pixels: Tensor, shift: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
-    """Image positions u, v [M] and block [M] of pixels [M]."""
-    row, column = torch.div(pixels, lens.width, rounding_mode="floor"), pixels % lens.width
-    blocks = torch.div(row, BLOCK, rounding_mode="floor") * (lens.width // BLOCK)
-    blocks += torch.div(column, BLOCK, rounding_mode="floor")
-    return column + (0.5 + shift[0]), row + (0.5 + shift[1]), blocks
+def _blocks(lens: Lens, u: Tensor, v: Tensor) -> Tensor:
+    """The block [M] of image positions u, v [M] px."""
+    return (v / BLOCK).long() * (lens.width // BLOCK) + (u / BLOCK).long()
 
 
-def _meet_instrument(frame: _Frame, pixels: Tensor, shift: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Depth [M] mm and part [M] of the instrument at pixels [M]; inf and 0 where there is none."""
-    u, v, blocks = _locate(frame.place.lens, pixels, shift)
-    depth, parts = torch.full((len(pixels),), torch.inf), torch.zeros(len(pixels), dtype=torch.uint8)
-    candidates = torch.nonzero(frame.instrument.reshape(-1)[blocks])[:, 0]
-    transform = mechanical_from_camera(frame.view)
-    directions = frame.place.lens.rays_through(u[candidates], v[candidates]) @ transform[:3, :3].T
+def _meet_instrument(frame: _Frame, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth [M] mm and part [M] of the instrument at image positions u, v [M]; inf and 0 where there is none."""
+    lens = frame.place.lens
+    depth, parts = torch.full((len(u),), torch.inf), torch.zeros(len(u), dtype=torch.uint8)
+    candidates = torch.nonzero(frame.instrument.reshape(-1)[_blocks(lens, u, v)])[:, 0]
     if len(candidates):
+        transform = mechanical_from_camera(frame.view)
+        directions = lens.rays_through(u[candidates], v[candidates]) @ transform[:3, :3].T
         found = tools.trace(frame.place.design, frame.view.opening, transform[:3, 3], directions)
         depth[candidates], parts[candidates] = found
     return depth, parts
 
 
-def _sample_band(
-    frame: _Frame, pixels: Tensor, tool_depth: Tensor, parts: Tensor, shift: tuple[float, float], size: float
-) -> _Samples:
+def _sample_band(frame: _Frame, u: Tensor, v: Tensor, tool_depth: Tensor, parts: Tensor, size: float) -> _Samples:
     lens = frame.place.lens
-    u, v, blocks = _locate(lens, pixels, shift)
-    rays = lens.rays_through(u, v)
+    rays, blocks = lens.rays_through(u, v), _blocks(lens, u, v)
     depth = _meet_tissue(frame, rays, blocks)
     parts = parts * (tool_depth < depth)
     depth = torch.minimum(depth, tool_depth)
-    light = torch.empty(len(pixels), 3)
+    light = torch.empty(len(u), 3)
     on_tissue, on_tool = torch.nonzero(parts == 0)[:, 0], torch.nonzero(parts)[:, 0]
     pixel = size / lens.focal
     if len(on_tissue):
