@@ -52,5 +52,5 @@ def _switched_on(settings: Settings) -> str:
         said.append("`raw/`: the images as the endoscope distorts them, in a round border (optics/calibration.yaml);")
         said.append("`images/` are pinhole, what the border hides is masked.")
     if settings.video:
-        said.append("`recording/`: the same as a recording, for `neeco ingest recording/recording.yaml`; the camera rolls.")
+        said.append("`recording/`: the same as a recording, for `neeco ingest`; the camera rolls.")
     return "".join(f"{line}\n" for line in said)
