@@ -27,7 +27,7 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      either way then: turns about two axes calibrate the tracker on the laparoscope
 
 CPU seconds a frame, written, on one core of an EPYC: 0.6 at 320x256 (0.7 with detail), 1.3 at 640x512, 2.3 at 1280x720,
-4.1 at 1920x1080; `--lens` doubles them.
+4.1 at 1920x1080; two to three times that with `--lens`.
 
 How it works (`benchmarks/rendered/`): the organ is a height field with procedural colour (`tissue.py`, `noise.py`),
 the instrument a distance function (`instrument.py`); rays meet both, 2 x 2 a pixel, lit by lamps beside the lens
