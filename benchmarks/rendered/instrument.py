@@ -126,6 +126,20 @@ class Design:
         pin = _rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
         return torch.minimum(torch.minimum(collar, prongs), pin)
 
+    def on_link(self, opening: float, points: Tensor, parts: Tensor) -> Tensor:
+        """Points [M, 3] on the given parts [M] as they lie with the jaws closed, from the hinge."""
+        return self.turn_to_link(opening, points - torch.tensor([0.0, 0.0, self.hinge]), parts)
+
+    def turn_to_link(self, opening: float, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
+        """Vectors [M, 3] as they are with the jaws closed; sense -1: the other way round."""
+        for part, sign, share in zip((FIRST_JAW, SECOND_JAW), (sense, -sense), self.shares, strict=True):
+            vectors = torch.where((parts == part)[:, None], _turn_x(vectors, sign * share * opening), vectors)
+        return vectors
+
+    def turn_from_link(self, opening: float, vectors: Tensor, parts: Tensor) -> Tensor:
+        """The inverse of `turn_to_link`."""
+        return self.turn_to_link(opening, vectors, parts, -1)
+
     def everything(self, points: Tensor, opening: float) -> Tensor:
         """Lower bound [M] mm of the distance to the whole instrument, shaft included."""
         x, y, z = points.unbind(-1)
@@ -167,6 +181,18 @@ def trace(design: Design, opening: float, origin: Tensor, directions: Tensor) ->
     return distance / lengths, part
 
 
+def may_meet(design: Design, opening: float, origin: Tensor, unit: Tensor, spread: float) -> Tensor:
+    """Which cones [M] around the unit directions [M, 3], `spread` rad from middle to rim, may meet the instrument."""
+    centers, radii = design.balls(opening)
+    nearest = unit @ (centers - origin).T
+    off = ((centers - origin).square().sum(-1) - nearest.square()).clamp_min(0).sqrt()
+    head = ((off < radii + spread * nearest) & (nearest > 0)).any(-1)
+    flat, slope = origin[:2], unit[:, :2]
+    t = (-(slope @ flat) / slope.square().sum(-1).clamp_min(1e-9)).clamp_min(0)
+    beside = (flat + t[:, None] * slope).norm(dim=-1) < design.radius + spread * t
+    return head | (beside & (origin[2] + t * unit[:, 2] < 4 * design.radius))
+
+
 def normals(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:
     """Unit outward normals [M, 3] at surface points [M, 3] of the given parts [M]."""
     around = F.normalize(points * torch.tensor([1.0, 1.0, 0.0]), dim=-1)
@@ -180,9 +206,7 @@ def normals(design: Design, opening: float, points: Tensor, parts: Tensor) -> Te
 
 def grain(design: Design, opening: float, points: Tensor, parts: Tensor) -> Tensor:
     """Worn metal, in [-1, 1]: a pattern [M] that stays where it is on each part; points [M, 3], parts [M]."""
-    arm = points - torch.tensor([0.0, 0.0, design.hinge])
-    for part, sign, share in zip((FIRST_JAW, SECOND_JAW), (1, -1), design.shares, strict=True):
-        arm = torch.where((parts == part)[:, None], _turn_x(arm, sign * share * opening), arm)
+    arm = design.on_link(opening, points, parts)
     wavy = arm + 0.8 * torch.sin(arm[:, [1, 2, 0]] * torch.tensor([1.3, 0.8, 1.9]))
     coarse = torch.sin(wavy @ torch.tensor([0.9, -0.7, 0.5])) * torch.sin(wavy @ torch.tensor([-0.4, 1.1, 0.8]))
     fine = torch.sin(wavy @ torch.tensor([2.1, 1.5, -1.1])) * torch.sin(wavy @ torch.tensor([1.2, -1.9, 1.7]))

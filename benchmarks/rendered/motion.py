@@ -33,6 +33,7 @@ class Path:
     roll_middle: float
     roll_train: float  # about the middle, either way
     roll_most: float
+    camera_rolling: float = 0.0  # rad, how far the camera rolls either way
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Trajectory:
         hinge = np.asarray(self._hinge(time))
         opening, roll = float(self._opening(time)), float(self._roll(time))
         return Moment(
-            _look(center, target, self.path.camera_roll),
+            _look(center, target, self.path.camera_roll + self.path.camera_rolling * math.sin(time)),
             _aim(np.array(self.path.trocar), hinge, self.path.roll_middle + roll, self.hinge_mm),
             opening,
             roll,

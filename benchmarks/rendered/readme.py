@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from neeco.capture import Capture
+from rendered.frames import Settings
 from rendered.scenes import SceneSpec
 
 
-def readme(spec: SceneSpec, capture: Capture, quality: dict[str, float]) -> str:
+def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[str, float]) -> str:
     """README.md of a capture: what it shows, conventions, splits, and its measured errors against the truth."""
     path, joint = spec.path, spec.joint
     counts = ", ".join(f"{name} {len(capture.split(name))}" for name in capture.splits)
@@ -16,9 +17,10 @@ def readme(spec: SceneSpec, capture: Capture, quality: dict[str, float]) -> str:
     errors = "\n".join(f"- {name}: {value:.3f}" for name, value in quality.items())
     return f"""# {spec.organ}: rendered laparoscopic capture
 
-Made by `benchmarks/rendered_captures.py {spec.organ}`; nothing here is a real recording. {size}, {counts}.
+Made by `benchmarks/rendered_captures.py {spec.organ}{settings.options}`; nothing here is a real recording. \
+{size}, {counts}.
 Shows {spec.words}.
-
+{_switched_on(settings)}
 World: the tracker's frame, mm; `pose` = world_from_sensor, the sensor tilted
 {math.degrees(spec.mount.tilt):.0f} degrees against the shaft and off its axis.
 Reading `jaw_angle` = {joint.zero} + ({joint.sign}) * opening, rad.
@@ -34,3 +36,21 @@ Errors of transforms.json against the truth (rms; the reconstruction's scale is 
 {errors}
 - sparse points: {len(capture.points.positions)}
 """
+
+
+def _switched_on(settings: Settings) -> str:
+    """What the switches change; nothing without any."""
+    said = []
+    if settings.detail:
+        said.append("Texture as fine as a full-size image shows; each pixel holds the mean of what it covers, and the")
+        said.append("part that most of it sees.")
+    if settings.breathing_mm or settings.pulse_mm:
+        said.append("The tissue moves (truth/breathing.json); sparse points lie where it rests.")
+    if settings.exposure:
+        said.append("Exposure and white balance are automatic (truth/exposure.json).")
+    if settings.optics:
+        said.append("`raw/`: the images as the endoscope distorts them, in a round border (optics/calibration.yaml);")
+        said.append("`images/` are pinhole, what the border hides is masked.")
+    if settings.video:
+        said.append("`recording/`: the same as a recording, for `neeco ingest`; the camera rolls.")
+    return "".join(f"{line}\n" for line in said)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rendered import instrument as tools
 from rendered.instrument import Design, Material
+from rendered.motion import Moment
 from rendered.noise import blur
 from rendered.tissue import Tissue
 
@@ -43,9 +44,12 @@ class Lens:
     def rays(self, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
         """Directions [H * W, 3] with z = 1, camera frame, through pixel centres moved by `shift` px."""
         v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
-        x = (u + shift[0] - self.width / 2) / self.focal
-        y = (v + shift[1] - self.height / 2) / self.focal
-        return torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
+        return self.rays_through((u + shift[0]).reshape(-1), (v + shift[1]).reshape(-1))
+
+    def rays_through(self, u: Tensor, v: Tensor) -> Tensor:
+        """Directions [M, 3] with z = 1, camera frame, through image positions u, v [M] px."""
+        x, y = (u - self.width / 2) / self.focal, (v - self.height / 2) / self.focal
+        return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,21 @@ class Place:
     lens: Lens
 
 
-def draw(place: Place, view: View) -> Drawing:
-    """Draw a frame with 2 x 2 samples a pixel; parts and depth are exact at pixel centres."""
+def view_of(moment: Moment) -> View:
+    """What `draw` needs of a moment."""
+    camera, tool = (torch.from_numpy(m).float() for m in (moment.scene_from_camera, moment.scene_from_mechanical))
+    return View(camera, tool, moment.opening)
+
+
+def draw(place: Place, view: View, gain: tuple[float, float, float] | None = None) -> Drawing:
+    """Draw a frame; gain: what the camera multiplies red, green and blue light by."""
+    light, parts, depth = gather(place, view)
+    light = blur(light.permute(2, 0, 1), BLOOM).permute(1, 2, 0)
+    return Drawing(develop(light, gain), parts, depth)
+
+
+def gather(place: Place, view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Linear light [H, W, 3] from 2 x 2 samples a pixel; parts [H, W] and depth [H, W], exact at pixel centres."""
     truth = _truth(place, view)
     lit = _shadows(place, view, truth.tissue)
     planes = truth.tissue[None, None]
@@ -87,14 +104,14 @@ def draw(place: Place, view: View) -> Drawing:
     around = torch.nonzero(F.max_pool2d(truth.parts[None, None].float(), 5, 1, 2).reshape(-1) > 0)[:, 0]
     samples = [(row, column) for row in range(2) for column in range(2)]
     rays = [place.lens.rays((column / 2 - 0.25, row / 2 - 0.25)) for row, column in samples]
-    t, parts = _meet_instrument(place, view, torch.cat([directions[around] for directions in rays]))
+    t, parts = meet_instrument(place, view, torch.cat([directions[around] for directions in rays]))
     total = torch.zeros(truth.parts.numel(), 3)
     for index, ((row, column), directions) in enumerate(zip(samples, rays, strict=True)):
         hit = slice(index * len(around), (index + 1) * len(around))
         share = lit[:, row::2, column::2].reshape(len(lit), -1)
         total += _shade(place, view, directions, (near, far), (around, t[hit], parts[hit]), share) / 4
     depth = torch.minimum(truth.tissue, truth.instrument)
-    return Drawing(_develop(total.reshape(*depth.shape, 3)), truth.parts, depth)
+    return total.reshape(*depth.shape, 3), truth.parts, depth
 
 
 @dataclass(frozen=True)
@@ -111,22 +128,22 @@ def _truth(place: Place, view: View) -> _Truth:
     shape = (place.lens.height, place.lens.width)
     rotation, origin = view.scene_from_camera[:3, :3], view.scene_from_camera[:3, 3]
     tissue = place.tissue.intersect(origin, directions @ rotation.T)
-    t, parts = _meet_instrument(place, view, directions)
+    t, parts = meet_instrument(place, view, directions)
     return _Truth((parts * (t < tissue)).reshape(shape), tissue.reshape(shape), t.reshape(shape))
 
 
-def _mechanical_from_camera(view: View) -> Tensor:
+def mechanical_from_camera(view: View) -> Tensor:
     return torch.linalg.inv(view.scene_from_mechanical.double()).float() @ view.scene_from_camera
 
 
-def _meet_instrument(place: Place, view: View, directions: Tensor) -> tuple[Tensor, Tensor]:
-    transform = _mechanical_from_camera(view)
+def meet_instrument(place: Place, view: View, directions: Tensor) -> tuple[Tensor, Tensor]:
+    transform = mechanical_from_camera(view)
     return tools.trace(place.design, view.opening, transform[:3, 3], directions @ transform[:3, :3].T)
 
 
 def _shadows(place: Place, view: View, tissue: Tensor) -> Tensor:
     """Share [L, 2H, 2W] of each lamp's light that passes the instrument, found between pixels and interpolated."""
-    transform = _mechanical_from_camera(view)
+    transform = mechanical_from_camera(view)
     lens = place.lens
     rays = lens.rays((0.5, 0.5)).reshape(lens.height, lens.width, 3)[::2, ::2]
     points = (F.avg_pool2d(tissue[None], 2)[0, ..., None] * rays).reshape(-1, 3)
@@ -168,30 +185,52 @@ def _shade_tissue(place: Place, view: View, points: Tensor, lit: Tensor) -> Tens
     surface = place.tissue.look_up(points @ rotation.T + origin)
     albedo, gloss, openness = surface[:, :3], surface[:, 6:7], surface[:, 7:8]
     normal = F.normalize(surface[:, 3:6] @ rotation, dim=-1)
+    return light_tissue(place.lamps, points, albedo, normal, gloss, openness, lit)
+
+
+def light_tissue(
+    lamps: Lamps, points: Tensor, albedo: Tensor, normal: Tensor, gloss: Tensor, openness: Tensor, lit: Tensor,
+    sharpness: float | Tensor = WET_SHARPNESS, wet: float | Tensor = WET,
+) -> Tensor:  # fmt: skip
+    """Colour [M, 3] of wet tissue at points [M, 3] with unit normals [M, 3], camera frame. gloss, openness [M, 1];
+    lit [L, M]: share of each lamp that reaches it; sharpness, wet ([M, 1]): of its highlights."""
     towards_eye = F.normalize(-points, dim=-1)
     color = SKY * albedo * openness
-    for lamp, share in zip(place.lamps.positions, lit, strict=True):
-        strength, light = _light(place.lamps, torch.tensor(lamp), points)
+    for lamp, share in zip(lamps.positions, lit, strict=True):
+        strength, light = _light(lamps, torch.tensor(lamp), points)
         strength = strength * (0.06 + 0.94 * share[:, None])
         facing = (normal * light).sum(-1, keepdim=True)
         diffuse = ((facing + 0.15) / 1.15).clamp_min(0)  # light also comes out beside where it went in
         halfway = F.normalize(light + towards_eye, dim=-1)
-        glint = (normal * halfway).sum(-1, keepdim=True).clamp_min(0) ** WET_SHARPNESS
-        color += strength * openness * (albedo * diffuse + WET * gloss.square() * glint)
+        glint = (normal * halfway).sum(-1, keepdim=True).clamp_min(0) ** sharpness
+        color += strength * openness * (albedo * diffuse + wet * gloss.square() * glint)
     return color
 
 
 def _shade_instrument(place: Place, view: View, points: Tensor, parts: Tensor) -> Tensor:
     """Colour [M, 3] of the instrument at points [M, 3], camera frame, on the given parts [M]."""
-    transform = _mechanical_from_camera(view)
+    transform = mechanical_from_camera(view)
     local = points @ transform[:3, :3].T + transform[:3, 3]
     normal = tools.normals(place.design, view.opening, local, parts) @ transform[:3, :3]
+    tone = 1 + 0.16 * tools.grain(place.design, view.opening, local, parts)[:, None]
+    return light_instrument(place, points, normal, parts, tone)
+
+
+def light_instrument(
+    place: Place, points: Tensor, normal: Tensor, parts: Tensor, tone: Tensor, spread: float | Tensor = 0.0
+) -> Tensor:
+    """Colour [M, 3] of the instrument at points [M, 3] with unit normals [M, 3], camera frame, on the given parts [M].
+
+    tone [M, 1] multiplies the material's colour; spread [M, 1]: variance of the slopes within a pixel.
+    """
     towards_eye = F.normalize(-points, dim=-1)
     shaft, wrist, jaw = (_rows(material) for material in place.design.materials)
     is_shaft, is_wrist = (parts == tools.SHAFT)[:, None], (parts == tools.WRIST)[:, None]
     rows = torch.where(is_shaft, shaft, torch.where(is_wrist, wrist, jaw))
     base, diffuse_share, shine, sharpness = rows[:, :3], rows[:, 3:4], rows[:, 4:5], rows[:, 5:6]
-    base = base * (1 + 0.16 * tools.grain(place.design, view.opening, local, parts)[:, None])
+    base = base * tone
+    if isinstance(spread, Tensor):
+        shine, sharpness = widened(shine, sharpness, spread)
     mirrored = 2 * (normal * towards_eye).sum(-1, keepdim=True) * normal - towards_eye
     seen = torch.tensor([0.30, 0.13, 0.10]) * (0.25 + 0.75 * (mirrored[:, 2:] * 0.5 + 0.5))  # tissue in the metal
     graze = (1 - (normal * towards_eye).sum(-1, keepdim=True).clamp(0, 1)) ** 4
@@ -208,6 +247,13 @@ def _shade_instrument(place: Place, view: View, points: Tensor, parts: Tensor) -
     return color
 
 
+def widened(strength: float | Tensor, sharpness: float | Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """Strength and sharpness [M, 1] of highlights whose normals vary with variance `spread` [M, 1] of their slopes:
+    as much light in a wider highlight (Toksvig, "Mipmapping normal maps", 2005)."""
+    share = 1 / (1 + sharpness * spread)
+    return strength * share, sharpness * share
+
+
 def _rows(material: Material) -> Tensor:
     return torch.tensor([*material.color, material.diffuse, material.shine, material.sharpness])
 
@@ -222,12 +268,13 @@ def _light(lamps: Lamps, position: Tensor, points: Tensor) -> tuple[Tensor, Tens
     return share * cone * lamps.distance**2 / squared, light
 
 
-def _develop(light: Tensor) -> Tensor:
-    """Linear light [H, W, 3] to sRGB in [0, 1]: lens blur, vignette, soft shoulder, transfer curve."""
-    light = blur(light.permute(2, 0, 1), BLOOM).permute(1, 2, 0)
+def develop(light: Tensor, gain: tuple[float, float, float] | None = None) -> Tensor:
+    """Linear light [H, W, 3] to sRGB in [0, 1]: vignette, exposure, soft shoulder, transfer curve."""
     height, width = light.shape[:2]
     v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     light = light * (1 - 0.13 * (u.square() + v.square()))[..., None]
+    if gain is not None:
+        light = light * torch.tensor(gain)
     shoulder = 0.7
     light = torch.where(
         light > shoulder, shoulder + (1 - shoulder) * (1 - torch.exp(-(light - shoulder) / (1 - shoulder))), light

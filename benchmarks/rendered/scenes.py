@@ -59,6 +59,10 @@ class SceneSpec:
     world_shift: tuple[float, float, float]  # … and shift
     errors: ErrorModel = field(default_factory=ErrorModel)
 
+    def with_rolling_camera(self) -> SceneSpec:
+        """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
+        return replace(self, path=replace(self.path, camera_rolling=0.3))
+
     def world_from_scene(self) -> Array:
         """[4, 4]."""
         return rigid(Rotation.from_rotvec(self.world_turn).as_matrix(), np.array(self.world_shift))

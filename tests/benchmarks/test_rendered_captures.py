@@ -23,16 +23,17 @@ def capture(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """A scene's whole pipeline for six frames of 40x32: four to train on, one `test`, one `unseen`."""
     sys.path.insert(0, str(BENCHMARKS))
     try:
+        from rendered.frames import Settings
         from rendered.render import Lens
         from rendered.scenes import SCENES
-        from rendered.writing import Size, write_recording
+        from rendered.writing import write_recording
     finally:
         sys.path.remove(str(BENCHMARKS))
     path = tmp_path_factory.mktemp(request.param)
-    size = Size(Lens(WIDTH, HEIGHT, FOCAL), resolution=240, every=50)
+    settings = Settings(Lens(WIDTH, HEIGHT, FOCAL), resolution=240, every=50)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # for images this small threads only wait for each other
-    write_recording(SCENES[request.param], path, size, lambda line: None)
+    write_recording(SCENES[request.param], path, settings, lambda line: None)
     torch.set_num_threads(threads)
     return path
 

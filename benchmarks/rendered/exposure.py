@@ -1,0 +1,72 @@
+"""Automatic exposure and white balance: one gain and one colour gain per frame, as a camera chooses them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from rendered.motion import FRAME_RATE, Array, Trajectory
+from rendered.render import Lens, Place, gather, view_of
+
+METER_ROWS = 32  # of the thumbnail that is metered
+REACT_S, BALANCE_S = 0.4, 1.5  # how slowly exposure and white balance follow what they see
+STRENGTH, BALANCE = 0.85, 0.5  # exponents: how much of a change they take back
+LEAST, MOST = 0.4, 2.5
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Gain [F], and colour gains [F, 3] (green 1), of every frame of a recording; both multiply linear light."""
+
+    gain: Array
+    color: Array
+
+    def of(self, number: int) -> tuple[float, float, float]:
+        """What multiplies red, green and blue light of a frame."""
+        red, green, blue = (float(self.gain[number] * value) for value in self.color[number])
+        return red, green, blue
+
+    def describe(self, numbers: list[int]) -> dict[str, Any]:
+        """truth/exposure.json, of the frames `numbers`."""
+        return {
+            "meaning": "linear light of frame k was multiplied by gain[k] * color_gain[k] before the tone curve; "
+            "without automatic exposure both are 1",
+            "frames": numbers,
+            "gain": [round(float(self.gain[number]), 6) for number in numbers],
+            "color_gain": [[round(float(value), 6) for value in self.color[number]] for number in numbers],
+        }
+
+
+def meter(place: Place, trajectory: Trajectory) -> Exposure:
+    """What the camera's automatics choose for each frame: they follow, with a delay, the centre-weighted mean of what
+    they see (thumbnails), towards its median over the recording."""
+    lens = place.lens
+    width = 2 * round(METER_ROWS * lens.width / lens.height / 2)  # shadows are found for 2 x 2 pixels
+    small = replace(place, lens=Lens(width, METER_ROWS, lens.focal * METER_ROWS / lens.height))
+    v, u = torch.meshgrid(torch.linspace(-1, 1, METER_ROWS), torch.linspace(-1, 1, width), indexing="ij")
+    weight = torch.exp(-1.5 * (u.square() + v.square()))[..., None]
+    seen = []
+    for time in trajectory.times:
+        light = gather(small, view_of(trajectory.at(float(time))))[0].clamp_max(1)  # a sensor saturates
+        seen.append(((light * weight).sum((0, 1)) / weight.sum()).numpy())
+    means = np.array(seen, dtype=np.float64)
+    bright = means @ [0.2126, 0.7152, 0.0722]
+    gain = _follow(STRENGTH * np.log(np.median(bright) / bright), REACT_S)
+    tint = np.log(means / means[:, 1:2])
+    color = np.stack([_follow(BALANCE * (np.median(t) - t), BALANCE_S) for t in tint.T], -1)
+    return Exposure(np.exp(gain).clip(LEAST, MOST), np.exp(color))
+
+
+def _follow(wanted: Array, seconds: float) -> Array:
+    """A first-order lag [F] behind what is wanted [F]."""
+    step = 1 - math.exp(-1 / (seconds * FRAME_RATE))
+    found = np.empty_like(wanted)
+    value = wanted[0]
+    for index, target in enumerate(wanted):
+        value += step * (target - value)
+        found[index] = value
+    return found

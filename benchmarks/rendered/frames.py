@@ -1,0 +1,199 @@
+"""Render a recording's frames, one after the other or in several processes, and write their files."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from neeco.capture.images import write_labels
+from neeco.files import write_atomically
+from rendered import instrument
+from rendered.adaptive import draw_detailed
+from rendered.breathing import Mode, breathing_modes, displacement_at
+from rendered.detail import Detail, make_detail
+from rendered.hinge import truth_ids
+from rendered.motion import Array, Moment, Trajectory, is_unseen
+from rendered.optics import Optics
+from rendered.render import Drawing, Lens, Place, draw, view_of
+from rendered.scenes import SceneSpec
+from rendered.tissue import ORGANS
+
+DEPTH_UNIT_MM, DEPTH_STRIDE, DEPTH_EVERY = 0.05, 2, 4
+Gains = dict[int, tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to render, and how."""
+
+    lens: Lens = field(default_factory=Lens)
+    resolution: int = 2400  # texels along the tissue's side
+    every: int = 1  # keep one frame in so many (previews)
+    detail: bool = False  # texture finer than a pixel of the smallest size
+    breathing_mm: float = 0.0  # amplitude about the mean, where the tissue moves most
+    pulse_mm: float = 0.0
+    exposure: bool = False  # automatic exposure and white balance
+    optics: bool = False  # raw/: the images as an endoscope distorts them, in a round border
+    video: bool = False  # recording/: what `neeco ingest` takes
+    workers: int = 1
+
+    @property
+    def options(self) -> str:
+        """Those of the command line that make these settings, each after a blank."""
+        size = "" if self.lens == Lens() else f" --size {self.lens.width}x{self.lens.height}"
+        given = [
+            (self.detail and not size, " --detail"),
+            (self.breathing_mm, f" --breathing {self.breathing_mm:g}"),
+            (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
+            (self.exposure, " --exposure"),
+            (self.optics, " --lens"),
+            (self.video, " --video"),
+            (self.every > 1, f" --every {self.every}"),
+        ]
+        return size + "".join(option for wanted, option in given if wanted)
+
+    def modes(self, spec: SceneSpec) -> tuple[Mode, ...]:
+        """How the tissue moves."""
+        return breathing_modes(self.breathing_mm, self.pulse_mm, spec.seed)
+
+    def place(self, spec: SceneSpec) -> Place:
+        """Tissue at rest, instrument, lamps and lens."""
+        tissue = ORGANS[spec.organ](spec.seed, self.resolution)
+        return Place(tissue, spec.design, spec.lamps, self.lens)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame of the recording: exact motion, and what was seen."""
+
+    number: int
+    time: float
+    split: str
+    moment: Moment
+
+
+def take_shots(trajectory: Trajectory, spec: SceneSpec, every: int = 1) -> list[Shot]:
+    """The recording's frames in order; checks that each obeys its split's rule."""
+    shots = []
+    for number, (moment_time, split) in enumerate(zip(trajectory.times, trajectory.splits, strict=True)):
+        moment = trajectory.at(float(moment_time))
+        if is_unseen(spec.path, moment) != (split == "unseen"):
+            raise ValueError(f"frame {number} is {split}, but its state says otherwise")
+        if number % every == 0:
+            shots.append(Shot(number, float(moment_time), split, moment))
+    return shots
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One frame as the rest of the pipeline needs it: pixels uint8 [H, W, 3] and the drawing they came from."""
+
+    pixels: Array
+    drawing: Drawing
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Renders frames of one scene into the folder `path`."""
+
+    spec: SceneSpec
+    settings: Settings
+    path: Path
+    place: Place  # at rest
+    detail: Detail | None
+    gains: Gains  # by frame number; empty without automatic exposure
+
+    @staticmethod
+    def of(spec: SceneSpec, settings: Settings, path: Path, place: Place, gains: Gains) -> Renderer:
+        """The renderer of `place`, with the textures that the settings ask for."""
+        detail = make_detail(spec.organ, place.tissue, spec.seed) if settings.detail else None
+        return Renderer(spec, settings, path, place, detail, gains)
+
+    def render(self, shot: Shot) -> Rendered:
+        """Render a frame and write its image, its mask of parts and its depth."""
+        place = moved(self.place, self.settings.modes(self.spec), shot.time)
+        drawing = self._draw(place, shot)
+        pixels = _add_noise(drawing.color, np.random.default_rng((self.spec.seed, shot.number)))
+        _write_jpeg(self.path / image_name(shot), pixels)
+        self._write_truth(shot, drawing)
+        if self.settings.optics:
+            optics = Optics.of(self.settings.lens)
+            color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
+            raw = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
+            _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, raw)
+        return Rendered(pixels, drawing)
+
+    def _draw(self, place: Place, shot: Shot) -> Drawing:
+        view, gain = view_of(shot.moment), self.gains.get(shot.number)
+        return draw_detailed(place, self.detail, view, gain) if self.detail else draw(place, view, gain)
+
+    def _write_truth(self, shot: Shot, drawing: Drawing) -> None:
+        truth, name = self.path / "truth", f"{shot.number:06d}.png"
+        ids = torch.tensor([0, instrument.SHAFT, instrument.WRIST, *truth_ids(self.spec)], dtype=torch.uint8)
+        write_labels(truth / "masks" / name, ids[drawing.parts.long()])
+        if has_depth(shot):
+            counts = (drawing.depth[::DEPTH_STRIDE, ::DEPTH_STRIDE] / DEPTH_UNIT_MM).round().clamp(0, 65535)
+            depth = Image.fromarray(counts.numpy().astype(np.uint16))
+            write_atomically(truth / "depth" / name, lambda target: depth.save(target, "PNG"))
+
+
+def moved(place: Place, modes: tuple[Mode, ...], time: float) -> Place:
+    """A place at rest as it is at `time`."""
+    return replace(place, tissue=place.tissue.displaced(displacement_at(modes, time)))
+
+
+def render_all(renderer: Renderer, shots: list[Shot]) -> Iterator[Rendered]:
+    """All frames in order, drawn by `settings.workers` processes; the same bytes for any number of them."""
+    if renderer.settings.workers == 1:
+        yield from map(renderer.render, shots)
+        return
+    context = multiprocessing.get_context("spawn")  # a forked process would share threads' locks
+    arguments = (renderer.spec, renderer.settings, renderer.path, renderer.gains)
+    with ProcessPoolExecutor(renderer.settings.workers, context, _start, arguments) as pool:
+        yield from pool.map(_render, shots)
+
+
+_renderers: list[Renderer] = []  # of this worker
+
+
+def _start(spec: SceneSpec, settings: Settings, path: Path, gains: Gains) -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _renderers.append(Renderer.of(spec, settings, path, settings.place(spec), gains))
+
+
+def _render(shot: Shot) -> Rendered:
+    return _renderers[0].render(shot)
+
+
+def _add_noise(color: Tensor, generator: np.random.Generator) -> Array:
+    """uint8 [H, W, 3] with the sensor's noise (about 1.5/255, mostly luminance)."""
+    noisy = color.numpy().astype(np.float64)
+    noisy = noisy + generator.normal(0, 1.4 / 255, (*noisy.shape[:2], 1)) + generator.normal(0, 0.6 / 255, noisy.shape)
+    return np.clip(np.rint(noisy * 255), 0, 255).astype(np.uint8)
+
+
+def _write_jpeg(path: Path, pixels: Array) -> None:
+    image = Image.fromarray(pixels, "RGB")
+    write_atomically(
+        path, lambda target: image.save(target, format="JPEG", quality=95, subsampling=0, progressive=True)
+    )
+
+
+def image_name(shot: Shot) -> str:
+    """An image's path in the capture."""
+    return f"images/{shot.number:06d}.jpg"
+
+
+def has_depth(shot: Shot) -> bool:
+    """Whether a frame's depth is stored."""
+    return shot.number % DEPTH_EVERY == 0 or shot.split == "unseen"

@@ -1,0 +1,51 @@
+"""Sparse points as structure from motion would find them. float64, mm."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from rendered.breathing import Displacement
+from rendered.motion import Array, Moment
+from rendered.render import Drawing, Lens
+
+POINTS, OUTLIERS, ON_INSTRUMENT = 4500, 0.015, 0.003  # how many, and what shares of them
+
+
+class PointSampler:
+    """Gathers sparse points as SfM would find them: on texture, from many frames, scene frame."""
+
+    def __init__(self, frames: int, generator: np.random.Generator) -> None:
+        self.each = -(-POINTS // frames)
+        self.generator = generator
+        self.positions: list[Array] = []
+        self.colors: list[Array] = []
+
+    def take(
+        self, moment: Moment, drawing: Drawing, pixels: Array, lens: Lens, displacement: Displacement | None = None
+    ) -> None:
+        """Pick points of one frame: tissue where the image has texture, hardly ever the instrument. They err by as
+        many pixels at every size, and lie where the tissue, moved by `displacement`, rests."""
+        grey = pixels.astype(np.float64).mean(-1)
+        texture = np.hypot(*np.gradient(grey)) + 0.5
+        texture[grey > 225] = 0  # highlights move; SfM throws them out
+        parts = drawing.parts.numpy()
+        texture[parts > 0] *= ON_INSTRUMENT * (parts == 0).sum() / max(1, (parts > 0).sum())
+        chances = texture.ravel() / texture.sum()
+        chosen = self.generator.choice(chances.size, min(self.each, chances.size // 4), replace=False, p=chances)
+        rays = lens.rays().numpy()[chosen].astype(np.float64)
+        depth = drawing.depth.numpy().ravel()[chosen, None].astype(np.float64)
+        points = rays * depth
+        pixel = Lens.focal / lens.focal  # against that of the smallest size
+        points += self.generator.normal(0, 0.15 * pixel, points.shape)
+        points += rays * self.generator.normal(0, 0.35 * pixel, depth.shape)  # worst along the line of sight
+        wild = self.generator.random(len(points)) < OUTLIERS
+        points[wild] += rays[wild] * self.generator.normal(0, 6.0, (int(wild.sum()), 1))
+        pose = moment.scene_from_camera
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+        if displacement is not None:
+            x, y, z = torch.from_numpy(points).unbind(-1)
+            x, y = displacement.rest(x, y)
+            points = np.stack([x, y, z - displacement.at(x, y)[2]], -1)
+        self.positions.append(points)
+        self.colors.append(pixels.reshape(-1, 3)[chosen] / 255)
