@@ -90,8 +90,8 @@ def _drawn_share(session: GaussianSession, index: int, channel: Tensor) -> np.nd
     state, camera = session.corrected(index)
     channels = rasterize(session.scene.at(state), camera, channels=channel).channels
     assert channels is not None
-    drawn: np.ndarray = channels[..., 0].cpu().numpy()
-    return drawn
+    found: np.ndarray = channels[..., 0].cpu().numpy()
+    return found
 
 
 @torch.no_grad()
