@@ -137,6 +137,19 @@ class Camera:
         """The same camera, its pose on `device`."""
         return replace(self, world_from_camera=self.world_from_camera.to(device))
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in an image of width x height px; pixel centres lie at +0.5, so scaling needs no offset."""
+        across, down = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=self.cx * across,
+            cy=self.cy * down,
+            width=width,
+            height=height,
+        )
+
 
 def differentiable(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None
