@@ -71,8 +71,8 @@ class LayeredDrawing(Drawing):
 
 @torch.no_grad()
 def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
-    """Draw `state` as `camera` sees it, with the scene's own labels where it has any."""
-    rendering = scene.render(state, camera, labels=True)
+    """Draw `state` as `camera`, of any size and lens, sees it, with the scene's own labels where it has any."""
+    rendering = scene.render(state, scene.recorded.as_learned(camera), labels=True)
     parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
 
@@ -81,11 +81,12 @@ def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
 def draw_layers(
     scene: Scene, labeller: Labeller, state: State, camera: Camera, min_component: float, tissue_image: bool = False
 ) -> LayeredDrawing:
-    """Draw `state` as `camera` sees it, labelled by `labeller`; tissue and instruments also alone, for their depth, and
+    """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also alone, for their depth, and
     with `tissue_image` for what the tissue looks like.
 
     Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
     """
+    camera = scene.recorded.as_learned(camera)
     gaussians = scene.at(state)
     owners = labeller.owners(state, gaussians)
     unobserved = scene.unobserved(gaussians, camera)

@@ -61,7 +61,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
         for i in capture.instruments
     )
-    recorded = Recorded.of(frames, instruments)
+    recorded = Recorded.of(frames, instruments, capture.lens)
     positions, colors = _thinned_points(capture, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)

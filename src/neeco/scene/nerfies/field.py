@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
+from neeco.raster.optics import draw_through
 from neeco.raster.types import Rendering
 from neeco.scene.deformations.base import octave_angles
 from neeco.scene.drawable import Recorded
@@ -421,6 +422,10 @@ class NerfScene(nn.Module):
     @torch.no_grad()
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """The image at `state.time`, `settings.chunk` rays at once, without gradients. The field has no labels."""
+        if camera.is_resampled:
+            return draw_through(
+                camera, lambda pinhole: self.render(state, dataclasses.replace(pinhole, learned_fx=None))
+            )
         rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []
         for start in range(0, len(rays), self.settings.chunk):
