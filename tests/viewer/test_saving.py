@@ -17,7 +17,7 @@ from viewer_world import HEIGHT, WIDTH
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.samplers import make_sampler, moved_camera
-from neeco.synthesis.writers.folder import PIXELS, load_record
+from neeco.synthesis.writers.folder import LABELS, load_record
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.runs import LoadedRun, WatchedRun
 from neeco.viewer.saving import SavedStates
@@ -87,7 +87,7 @@ def test_a_saved_image_is_one_that_synthesize_would_write(saved: SavedStates, lo
     state = some_state(loaded)
     path = saved.save_image(loaded, state, VIEW)
     samples = path.parent.parent
-    assert all((samples / folder / path.name).is_file() for folder in PIXELS)
+    assert all((samples / folder / path.name).is_file() for folder in LABELS)
     record = load_record(samples, 0)
     assert record["instruments"][0]["joints"] == dict(state.instruments["grasper"].joints)
     assert record["labels"][0]["name"] == "grasper"

@@ -59,10 +59,20 @@ class Lens:
         seen = replace(pinhole, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
         return replace(seen, distortion=self.distortion, border=self.border)
 
+    @classmethod
+    def of(cls, camera: Camera) -> Lens:
+        """The lens of a camera."""
+        size = camera.width, camera.height
+        return cls(camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion, size, camera.border)
+
     def to_json(self) -> dict[str, Any]:
-        """As a capture's transforms.json has it: w, h, fl_x, fl_y, cx, cy, k1 ..., border {cx, cy, radius}, px."""
+        """As a capture's transforms.json has it: w and h, px, and the intrinsics."""
         assert self.size is not None
-        found: dict[str, Any] = dict(zip(("w", "h", *INTRINSICS), (*self.size, *self.intrinsics), strict=True))
+        return {"w": self.size[0], "h": self.size[1], **self.intrinsics_json()}
+
+    def intrinsics_json(self) -> dict[str, Any]:
+        """fl_x, fl_y, cx, cy, px, and where there are any k1, k2, p1, p2, k3 ... and border {cx, cy, radius}, px."""
+        found: dict[str, Any] = dict(zip(INTRINSICS, self.intrinsics, strict=True))
         found |= dict(zip(COEFFICIENT_NAMES, self.distortion, strict=False))
         return found if self.border is None else found | {"border": dict(zip(BORDER, self.border, strict=True))}
 

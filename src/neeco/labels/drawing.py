@@ -81,8 +81,8 @@ def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
 def draw_layers(
     scene: Scene, labeller: Labeller, state: State, camera: Camera, min_component: float, tissue_image: bool = False
 ) -> LayeredDrawing:
-    """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also alone, for their depth, and
-    with `tissue_image` for what the tissue looks like.
+    """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also
+    alone, for their depth, and with `tissue_image` for what the tissue looks like.
 
     Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
     """

@@ -30,8 +30,9 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     """What `camera`, which has a lens or a size other than the learned one, sees; `draw` draws for pinholes of its
     learned size or larger.
 
-    Smaller than learned, a whole number of times as many pixels are drawn along each side, and averaged. Through a lens,
-    a pinhole is drawn whose field holds the lens's, and sampled bilinearly; beyond border and field nothing is there.
+    Smaller than learned, a whole number of times as many pixels are drawn along each side, and averaged. Through a
+    lens, a pinhole is drawn whose field holds the lens's, and sampled bilinearly; beyond border and field there is
+    nothing.
     """
     fine = supersampled(camera)
     seen = field_pinhole(fine)

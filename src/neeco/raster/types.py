@@ -102,8 +102,8 @@ class Camera:
 
     A pinhole, unless it is given OpenCV's distortion or a round border, black beyond, as an endoscope has. `learned_fx`
     asks that an image of another size than the learned one show the same picture, larger or smaller (see `draw_through`
-    in neeco.raster.optics); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which become float32 (`as_pose`). Raises NeecoError when it
-    is not 4x4, or given so and no rotation and translation.
+    in neeco.raster.optics); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
+    become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation.
 
         neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """

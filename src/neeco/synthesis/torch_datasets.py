@@ -38,7 +38,9 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
+from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, require_like
@@ -64,7 +66,7 @@ STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the 
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
 ASKED_BY = "LabelledImages"  # in error messages
-READ = ("images", "parts", "ignore", "depth")  # folders of the files that a sample is made of
+READ = ("parts", "ignore", "depth")  # folders of the files that a sample is made of beside its image
 REMEDY = "give a folder that `neeco synthesize` wrote"
 INFO_LIKE = {
     "ids": [{"id": int, "part": str}],
@@ -286,9 +288,10 @@ class StoredImages(Dataset[Sample]):
         record = self._records[index]
         name, size = f"{stem(record['index'])}.png", (record["width"], record["height"])
         files = {folder: require_inside(self.folder / folder / name, self.folder) for folder in READ}
+        image = require_inside(self.folder / record["image"], self.folder)
         depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
         labelled = LabelledImage.of(
-            read_image(files["images"], size),
+            read_image(image, size),
             torch.from_numpy(depth),
             read_labels(files["parts"], size),
             read_labels(files["ignore"], size) == self._ignored,
@@ -299,9 +302,13 @@ class StoredImages(Dataset[Sample]):
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]}, record["time"]
         )
-        lens = record["intrinsics"]
         world_from_camera = torch.from_numpy(swap_camera_axes(np.array(record["camera"], np.float64)))
-        camera = Camera(world_from_camera, lens["fl_x"], lens["fl_y"], lens["cx"], lens["cy"], *size)
+        place = Node(
+            {"w": size[0], "h": size[1]} | record["intrinsics"], str(self.folder / "states.jsonl"), "", RaisingReport()
+        )
+        lens = parse_lens(place)
+        assert lens is not None
+        camera = lens.before(Camera(world_from_camera, *lens.intrinsics, *size))
         found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
         return found if self.transform is None else self.transform(found)
 

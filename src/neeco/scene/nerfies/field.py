@@ -26,6 +26,7 @@ import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -423,9 +424,8 @@ class NerfScene(nn.Module):
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """The image at `state.time`, `settings.chunk` rays at once, without gradients. The field has no labels."""
         if camera.is_resampled:
-            return draw_through(
-                camera, lambda pinhole: self.render(state, dataclasses.replace(pinhole, learned_fx=None))
-            )
+            plain = partial(dataclasses.replace, learned_fx=None)
+            return draw_through(camera, lambda pinhole: self.render(state, plain(pinhole)))
         rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []
         for start in range(0, len(rays), self.settings.chunk):
