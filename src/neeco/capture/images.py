@@ -71,7 +71,8 @@ def has_alpha(path: Path) -> bool:
 def write_image(path: Path, image: Tensor, quality: int | None = None) -> None:
     """Write an image [H, W, 3] in [0, 1] (clipped, rounded to 8 bits), atomically: as JPEG of `quality`, 1 to 100, or
     where that is None as PNG. Raises NeecoError."""
-    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()[..., ::-1]  # as OpenCV has them
+    pixels = image.detach().cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8).contiguous().numpy()
+    pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)  # as OpenCV has them
     if quality is None:
         write_png(path, pixels)
         return

@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
         else:
             views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
         with counting("render", len(views)) as advance:
-            rendered = render(trained.scene, views, folder, arguments.images, advance)
+            rendered = render(trained.scene, views, folder, advance, arguments.images)
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")

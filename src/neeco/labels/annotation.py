@@ -229,7 +229,7 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     """
     x, y, width, height = bounding_box(mask)
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
-    fine = np.kron(inside, np.ones((FINE, FINE), np.uint8))
+    fine = inside.repeat(FINE, 0).repeat(FINE, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]
     lower_left, lower_right = inside[1:, :-1], inside[1:, 1:]
     touching = (upper_left == lower_right) & (upper_right == lower_left) & (upper_left != upper_right)

@@ -6,6 +6,7 @@ Whatever device draws, a drawing is on the CPU.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -116,7 +117,7 @@ def draw_layers(
 
 def surface_depth(rendering: Rendering) -> np.ndarray:
     """Expected depth [H, W] mm where something opaque was drawn, 0 elsewhere."""
-    return to_numpy(torch.where(rendering.alpha > SURFACE_ALPHA, rendering.depth, 0.0))
+    return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
@@ -136,7 +137,13 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if not border.any():
         return border
     unclear = (share > CLEAR_SHARES[0]) & (share < CLEAR_SHARES[1])
-    return border | (unclear & (_distance_to(border) <= REACH * np.hypot(*mask.shape)))
+    reach = float(REACH * np.hypot(*mask.shape))
+    x, y, width, height = cv2.boundingRect(border.astype(np.uint8))
+    margin = math.ceil(reach)
+    near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
+    edge = border.copy()
+    edge[near] |= unclear[near] & (_distance_to(border[near]) <= reach)
+    return edge
 
 
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:

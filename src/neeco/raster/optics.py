@@ -37,6 +37,8 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     fine = supersampled(camera)
     seen = field_pinhole(fine)
     drawn = draw(seen)
+    if fine is camera and camera.is_pinhole:
+        return drawn
     alpha = drawn.alpha[..., None]
     planes = [drawn.color, alpha, drawn.depth[..., None] * alpha]
     planes += [] if drawn.channels is None else [drawn.channels]

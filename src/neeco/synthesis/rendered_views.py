@@ -22,7 +22,7 @@ from neeco.raster.types import Camera
 from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import moved_camera, states_file
-from neeco.synthesis.settings import ImageSettings
+from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
@@ -81,8 +81,8 @@ def render(
     scene: Drawable,
     views: Sequence[View],
     folder: Path,
-    images: ImageSettings,
     on_progress: Callable[[int], None] = lambda done: None,
+    images: ImageSettings = AS_RECORDED,
 ) -> Rendered:
     """Write NAME.png (or .jpg), NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json:
     what the ids mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
