@@ -21,7 +21,8 @@ def thin_needles(count: int = 60) -> Gaussians:
     means = torch.rand(count, 3, generator=generator) * torch.tensor([90.0, 66.0, 10.0]) - torch.tensor([45.0, 33, -95])
     quats = torch.randn(count, 4, generator=generator)
     colors = torch.rand(count, 1, 3, generator=generator)
-    return Gaussians(means, quats, torch.tensor([[8.0, 0.15, 0.15]]).expand(count, 3), torch.full((count,), 0.9), colors)
+    scales = torch.tensor([[8.0, 0.15, 0.15]]).expand(count, 3)
+    return Gaussians(means, quats, scales, torch.full((count,), 0.9), colors)
 
 
 def averaged(image: torch.Tensor, times: int) -> torch.Tensor:
@@ -54,8 +55,8 @@ def test_an_image_larger_than_learned_shows_the_learned_one() -> None:
 
 
 def test_the_learned_size_is_drawn_as_ever() -> None:
-    gaussians = thin_needles()
-    assert torch.equal(rasterize(gaussians, replace(LEARNED, learned_fx=60.0)).color, rasterize(gaussians, LEARNED).color)
+    drawn = (rasterize(thin_needles(), replace(LEARNED, learned_fx=learned)).color for learned in (None, 60.0))
+    assert torch.equal(*drawn)
 
 
 @pytest.mark.parametrize("distortion", [BARREL, (0.2, 0.05, 0.0, 0.0), (-0.2, 0.1, 0.001, 0.002, 0.01, 0.02, 0.0, 0.0)])
@@ -90,8 +91,8 @@ def test_a_border_alone_moves_no_pixel() -> None:
 def test_points_fall_where_the_lens_draws_them() -> None:
     camera = replace(LEARNED.resized(256, 192), distortion=BARREL)
     points = torch.tensor([[30.0, 20.0, 100.0], [-25.0, 12.0, 90.0], [0.0, -28.0, 110.0]])
-    dots = Gaussians(points, torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), torch.full((3, 3), 0.5), torch.full((3,), 0.99),
-                     torch.zeros(3, 1, 3))  # fmt: skip
+    upright, size = torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), torch.full((3, 3), 0.5)
+    dots = Gaussians(points, upright, size, torch.full((3,), 0.99), torch.zeros(3, 1, 3))
     drawn: Rendering = rasterize(dots, camera, channels=torch.eye(3))
     assert drawn.channels is not None
     rows, columns = torch.meshgrid(torch.arange(192) + 0.5, torch.arange(256) + 0.5, indexing="ij")

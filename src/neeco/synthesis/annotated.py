@@ -23,7 +23,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
-from neeco.labels.annotation import annotate
+from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
 from neeco.raster.lens import field_pinhole
@@ -149,32 +149,51 @@ class _Annotator:
             labels = annotate(self.scene, drawing, self.labeller.names)
             facts["labels"] = [label.to_json() for label in labels]
             return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
-        drawing = self._as_written(drawing, image)
+        drawing, missing = self._as_written(drawing, image)
         labels = annotate(self.scene, drawing, self.labeller.names)
+        if missing is not None:
+            labels = [_without_keypoints_in(missing, label) for label in labels]
         return write_sample(self.output, index, drawing, labels, {}, facts, self.images.jpeg_quality)
 
-    def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> LayeredDrawing:
-        """The recorded `image` with the labels of `drawing`, as the images asked for."""
+    def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
+        """The recorded `image` with the labels of `drawing`, as the images asked for, and where it shows nothing of a
+        lens's field, bool [H, W]."""
         recorded = drawing.camera
         wanted = self.cameras(recorded)
         if wanted is recorded:
-            return replace(drawing, image=image)
+            return replace(drawing, image=image), None
         drawing = draw_layers(self.scene, self.labeller, drawing.state, wanted, Settings.min_component)
         if wanted.is_pinhole:
             method = cv2.INTER_AREA if wanted.width < recorded.width else cv2.INTER_CUBIC
             pixels = cv2.resize(image.numpy(), (wanted.width, wanted.height), interpolation=method)
-            return replace(drawing, image=torch.from_numpy(pixels).clamp(0, 1))
+            return replace(drawing, image=torch.from_numpy(pixels).clamp(0, 1)), None
         fine = supersampled(drawing.camera)
         field = field_pinhole(fine)
         shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
         known = torch.cat([image, torch.ones_like(image[..., :1])], -1)
         found = resampled(known, recorded, fine, wanted)
-        missing = (found[..., 3] < shown - NOT_RECORDED).to(drawing.unobserved)
-        return replace(drawing, image=found[..., :3], unobserved=torch.maximum(drawing.unobserved, missing))
+        missing = found[..., 3] < shown - NOT_RECORDED
+        drawing = replace(
+            drawing,
+            image=found[..., :3],
+            parts=drawing.parts.masked_fill(missing, 0),
+            share=drawing.share.masked_fill(missing, 0.0),
+            unobserved=drawing.unobserved.masked_fill(missing, 1.0),
+        )
+        return drawing, missing
 
     def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
         fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
         return fit, drawing, estimate_trust(drawing, image, frame.load_mask(), self.typical)
+
+
+def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> InstrumentLabel:
+    """The label without the keypoints in pixels that show nothing, bool [H, W]."""
+    kept = {
+        name: Keypoint(0.0, 0.0, OUTSIDE) if point.visibility and missing[int(point.y), int(point.x)] else point
+        for name, point in label.keypoints.items()
+    }
+    return replace(label, keypoints=kept)
 
 
 def fitted(
