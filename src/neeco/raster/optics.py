@@ -36,20 +36,20 @@ def draw_through(camera: Camera, draw: Draw) -> Rendering:
     """
     fine = supersampled(camera)
     seen = field_pinhole(fine)
-    drawn = draw(seen)
+    rendering = draw(seen)
     if fine is camera and camera.is_pinhole:
-        return drawn
-    alpha = drawn.alpha[..., None]
-    planes = [drawn.color, alpha, drawn.depth[..., None] * alpha]
-    planes += [] if drawn.channels is None else [drawn.channels]
+        return rendering
+    alpha = rendering.alpha[..., None]
+    planes = [rendering.color, alpha, rendering.depth[..., None] * alpha]
+    planes += [] if rendering.channels is None else [rendering.channels]
     found = resampled(torch.cat(planes, -1), seen, fine, camera)
     alpha = found[..., 3]
     return replace(
-        drawn,
+        rendering,
         color=found[..., :3],
         alpha=alpha,
         depth=torch.where(alpha > 0, found[..., 4] / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0.0),
-        channels=None if drawn.channels is None else found[..., 5:],
+        channels=None if rendering.channels is None else found[..., 5:],
     )
 
 

@@ -189,11 +189,11 @@ class _Annotator:
 
 def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> InstrumentLabel:
     """The label without the keypoints in pixels that show nothing, bool [H, W]."""
-    kept = {
+    keypoints = {
         name: Keypoint(0.0, 0.0, OUTSIDE) if point.visibility and missing[int(point.y), int(point.x)] else point
         for name, point in label.keypoints.items()
     }
-    return replace(label, keypoints=kept)
+    return replace(label, keypoints=keypoints)
 
 
 def fitted(

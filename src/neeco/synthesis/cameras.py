@@ -30,10 +30,10 @@ class DrawnCameras:
                 "--lens: the scene's capture does not tell of its lens; ingest the recording again and train on it, or "
                 "leave --lens out"
             )
-        drawn = cls(images, recorded.lens if images.lens else None)
+        found = cls(images, recorded.lens if images.lens else None)
         for camera in cameras:
-            drawn(camera)
-        return drawn
+            found(camera)
+        return found
 
     def __call__(self, camera: Camera) -> Camera:
         """The camera in the place of `camera`, a pinhole."""
