@@ -17,6 +17,7 @@ from viewer_world import HEIGHT, WIDTH
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.samplers import make_sampler, moved_camera
+from neeco.synthesis.settings import SizeSettings
 from neeco.synthesis.writers.folder import LABELS, load_record
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.runs import LoadedRun, WatchedRun
@@ -102,6 +103,12 @@ def test_a_saved_image_is_one_that_synthesize_would_write(saved: SavedStates, lo
 def test_images_are_numbered_on(saved: SavedStates, loaded: LoadedRun) -> None:
     names = [saved.save_image(loaded, some_state(loaded, roll=roll), VIEW).name for roll in (0.0, 0.5)]
     assert names == ["000000.png", "000001.png"]
+
+
+def test_a_saved_image_is_as_large_as_was_asked(saved: SavedStates, loaded: LoadedRun) -> None:
+    path = SavedStates(saved.folder.parent, SizeSettings(scale=2.0)).save_image(loaded, some_state(loaded), VIEW)
+    with Image.open(path) as image:
+        assert image.size == (2 * WIDTH, 2 * HEIGHT)
 
 
 def test_a_scene_without_labels_saves_none(saved: SavedStates, loaded: LoadedRun) -> None:
