@@ -1,4 +1,5 @@
-"""How well a run draws sizes that it did not learn: PSNR against recorded frames of those sizes.
+"""How well a run draws sizes that it did not learn: PSNR against recorded frames of those sizes, and how large its
+masks are, as a share of the true ones, where the capture has those.
 
     python benchmarks/sizes.py runs/liver                        # smaller: against its test frames, area-averaged
     python benchmarks/sizes.py runs/small --truth captures/large # larger: against a capture with larger images
@@ -18,6 +19,7 @@ import torch
 
 from neeco.capture import read_capture
 from neeco.evaluation.image_metrics import psnr, resize_image
+from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.reference import LOW_PASS, camera_from_world, project
@@ -46,20 +48,31 @@ def main() -> None:
     with open_run(given.run) as trained:
         scene = gaussian_scene(trained.scene, "sizes")
         learned = scene.recorded.cameras[0]
-        frames = (trained.capture() if given.truth is None else read_capture(given.truth)).split("test")[: given.frames]
+        capture = trained.capture() if given.truth is None else read_capture(given.truth)
+        frames = capture.split("test")[: given.frames]
         largest = frames[0].camera.width / learned.width
         for scale in given.scales if given.truth is None else [largest]:
             rows: dict[str, list[float]] = {}
+            areas: dict[str, list[float]] = {}
             for frame in frames:
                 camera = frame.camera.resized(round(learned.width * scale), round(learned.height * scale))
                 truth = resize_image(frame.load_image(), camera)
                 gaussians = scene.at(frame.state)
-                images = {"plain": rasterize(gaussians, camera).color, "drawn": draw(scene, frame.state, camera).image}
+                plain = draw(scene, frame.state, replace(camera, learned_fx=camera.fx))
+                drawing = draw(scene, frame.state, camera)
+                images = {"plain": plain.image, "drawn": drawing.image}
+                reference = load_reference(capture, frame)
+                if reference is not None and reference.mask.shape == truth.shape[:2]:
+                    for name, found in {"plain": plain, "drawn": drawing}.items():
+                        assert found.parts is not None
+                        areas.setdefault(name, []).append(int((found.parts > 0).sum()) / int(reference.mask.sum()))
                 if scale < 1:
                     images["compensated"] = rasterize(compensated(gaussians, camera, scale), camera).color
                 for name, image in images.items():
                     rows.setdefault(name, []).append(float(psnr(image.clamp(0, 1), truth)))
-            print(f"{camera.width}x{camera.height}", *(f"{name} {np.mean(row):.2f} dB" for name, row in rows.items()))
+            words = [f"{name} {np.mean(row):.2f} dB" for name, row in rows.items()]
+            words += [f"mask {name} {np.mean(row):.3f}" for name, row in areas.items()]
+            print(f"{camera.width}x{camera.height}", *words)
 
 
 if __name__ == "__main__":

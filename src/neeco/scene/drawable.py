@@ -40,7 +40,10 @@ class Recorded:
         return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens)
 
     def as_learned(self, camera: Camera) -> Camera:
-        """The camera, told what size of images was learned from: the focal length of theirs that is nearest its own."""
+        """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs
+        that is nearest its own."""
+        if camera.learned_fx is not None:
+            return camera
         focal = [recorded.fx for recorded in self.cameras]
         nearest = min(max(camera.fx, min(focal)), max(focal)) if focal else camera.fx
         return camera if camera.fx == nearest else replace(camera, learned_fx=nearest)

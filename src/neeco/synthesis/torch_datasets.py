@@ -158,8 +158,8 @@ class LabelledImages(_Generated, Dataset[Sample]):
     scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
     drawn over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
     FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
-    `settings`: any other field of `neeco.synthesis.settings.Settings`. transform: sample -> sample, such as an
-    augmentation. Samples are described in this module's docstring.
+    `settings`: any other field of `neeco.synthesis.settings.Settings`, such as size="1280x1024", scale=2.0 or
+    lens=True. transform: sample -> sample, such as an augmentation. Samples are described in this module's docstring.
 
     Sample `index` is what `neeco synthesize` draws as image `index` for the same settings and seed, before its pixels
     are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
