@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from neeco.raster.types import Camera, Gaussians, Rendering
 
 # Of the learned size: from here up the backends' own low-pass is near enough. Measured at .9: .1 dB less than averaged.
 COARSE = 0.9
+ORIGIN = torch.eye(4)  # one tensor, so that cameras there are equal when their numbers are
 NOWHERE = 2.0  # in the coordinates of `grid_sample`, beyond the image
 
 Draw = Callable[[Camera], Rendering]
@@ -91,10 +93,18 @@ def resampled(image: Tensor, seen: Camera, fine: Camera, camera: Camera) -> Tens
     has a whole number along each side of each of its own; 0 where it sees nothing of it."""
     planes = image.permute(2, 0, 1)[None]
     if not fine.is_pinhole:
-        focal, center, size = ((seen.fx, seen.fy), (seen.cx, seen.cy), (seen.width, seen.height))
-        place = lens_field(fine).slopes * np.array(focal, np.float32) + np.array(center, np.float32)
-        grid = np.nan_to_num(2 * place / np.array(size, np.float32) - 1, nan=NOWHERE)
-        planes = grid_sample(planes, torch.from_numpy(grid).to(planes)[None], align_corners=False)
+        pinhole = (seen.fx, seen.fy), (seen.cx, seen.cy), (seen.width, seen.height)
+        grid = _sampling_grid(replace(fine, world_from_camera=ORIGIN), pinhole)
+        planes = grid_sample(planes, grid.to(planes), align_corners=False)
     if fine.width != camera.width:
         planes = avg_pool2d(planes, fine.width // camera.width)
-    return planes[0].permute(1, 2, 0)
+    return planes[0].permute(1, 2, 0).contiguous()
+
+
+@lru_cache(maxsize=4)
+def _sampling_grid(lens: Camera, pinhole: tuple[tuple[float, float], ...]) -> Tensor:
+    """[1, H, W, 2] where the pixels of `lens`, a camera at ORIGIN, lie in the image of a pinhole of these focal
+    lengths, principal point and size, as `grid_sample` takes it."""
+    focal, center, size = (np.array(pair, np.float32) for pair in pinhole)
+    place = lens_field(lens).slopes * focal + center
+    return torch.from_numpy(np.nan_to_num(2 * place / size - 1, nan=NOWHERE))[None]
