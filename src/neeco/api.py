@@ -91,10 +91,12 @@ class Scene:
         `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint, and with `labels` where
         the method learns none.
 
-            drawn = neeco.load("runs/sample").scene.draw(state, camera)
+            run = neeco.load("runs/sample")
+            drawn = run.scene.draw(state, camera)
             drawn.image, drawn.depth                      # float32 [H, W, 3] in [0, 1]; float32 [H, W] mm, 0 = none
             drawn.masks, drawn.parts                      # bool [I, H, W]; uint8 [H, W], 0 tissue
             drawn.boxes, drawn.keypoints                  # float32 [I, 4] px; float32 [I, K, 3]
+            run.scene.draw(state, camera.resized(1280, 1024))  # the same, larger
         """
         with self.learned.torch_threads():
             return draw_labelled(self.learned, state, camera, labels)

@@ -18,6 +18,7 @@ from neeco.capture.points import read_ply, write_ply
 from neeco.cli import check as check_verb
 from neeco.errors import NeecoError
 
+LENS = {"w": 32, "h": 24, "fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12}
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 
 
@@ -103,6 +104,11 @@ EDITS = [
     (_head("instrument_frame", "moon"), "instrument_frame", "'moon'"),
     (_head("ply_file_path", "../sparse.ply"), "ply_file_path", "leaves the capture's folder"),
     (_head("ply_file_path", "none.ply"), "ply_file_path", "no such file"),
+    (_head("lens", []), "lens", "expected an object"),
+    (_head("lens", LENS | {"fl_x": -1}), "lens.fl_x", "out of range"),
+    (_head("lens", LENS | {"k3": "x"}), "lens.k3", "expected a number"),
+    (_head("lens", LENS | {"border": {"cx": 3, "cy": 4}}), "lens.border.radius", "expected a number"),
+    (_head("lens", LENS | {"k1": -90}), "lens", "folds the image over"),
     (_head("frames", []), "frames", "empty"),
     (lambda d: d.pop("frames"), "frames", "missing"),
     (lambda d: d["frames"].__delitem__(slice(2, None)), "frames", "too few frames"),

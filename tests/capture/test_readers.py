@@ -16,8 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
+from neeco.capture.lens import Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.points import points_in_view, read_ply
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import load_reference
 from neeco.raster import Camera
@@ -56,6 +58,19 @@ def test_a_written_capture_reads_back_exactly(folder, tmp_path):
     assert not errors_only(check_capture(tmp_path / "copy"))
     with pytest.raises(NeecoError, match="already holds a capture"):
         write_capture(capture, tmp_path / "copy")
+
+
+LENS = Lens(30.0, 31.0, 16.5, 12.0, (-0.2, 0.05, 0.0, 0.001), (32, 24), (16.0, 12.0, 14.0))
+
+
+@pytest.mark.parametrize("lens", [LENS, Lens(30.0, 30.0, 16.0, 12.0, (), (32, 24))])
+def test_the_lens_of_a_recording_is_written_and_read_back(folder, tmp_path, lens):
+    capture = read_capture(folder.root)
+    assert capture.lens is None
+    write_capture(replace(capture, lens=lens), tmp_path / "copy")
+    copy = read_capture(tmp_path / "copy")
+    assert copy.lens == lens
+    assert fingerprint(copy) != fingerprint(replace(copy, lens=None)) == fingerprint(capture)
 
 
 def test_the_sample_round_trips_and_has_truth(tmp_path):

@@ -14,6 +14,7 @@ from torch import Tensor
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.raster import Camera, Gaussians, Rendering, rasterize
+from neeco.scene import Recorded
 from neeco.scene.deformations.static import Static
 
 WIDTH, HEIGHT = 48, 40
@@ -45,6 +46,7 @@ class TinyScene:
         self.colors = torch.rand(count, 1, 3, generator=random) * 2 - 1
         self.colors[len(self.tissue) :] += 1.2
         self.instruments = (Instrument("bar"),)
+        self.recorded = Recorded()
         self.deformation = Rest(self.instruments)
         self.label_names = (("bar", "shaft"), ("bar", "jaw_left")) if self.labelled else ()
 

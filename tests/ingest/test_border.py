@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from neeco.ingest.lens import visible_mask
+from neeco.ingest.lens import find_border, visible_mask
 
 HEIGHT, WIDTH = 120, 160
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
@@ -31,8 +31,10 @@ def disc(x, y, radius):
 @pytest.mark.parametrize("circle", [(80, 60, 57), (84, 55, 72), (80, 60, 85)])
 def test_a_round_border_is_found(circle, gain):
     true = disc(*circle)
-    mask = visible_mask(film(ndimage.gaussian_filter(true.astype(float), 0.6), gain))
-    assert mask is not None
+    border = find_border(film(ndimage.gaussian_filter(true.astype(float), 0.6), gain))
+    assert border is not None
+    assert np.allclose(border, np.add(circle, [0.5, 0.5, 0]), atol=1.0)
+    mask = visible_mask(border, (WIDTH, HEIGHT))
     assert not (mask & ~true).any()
     assert (true & ~mask).sum() < 0.08 * true.sum()
 
@@ -49,9 +51,9 @@ def test_a_round_border_is_found(circle, gain):
     ids=["no border", "vignette", "dark side", "letterbox"],
 )
 def test_other_darkness_is_no_border(shade, gain):
-    assert visible_mask(film(shade, gain)) is None
+    assert find_border(film(shade, gain)) is None
 
 
 def test_black_frames_and_no_frames():
-    assert visible_mask([]) is None
-    assert visible_mask([np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)] * 5) is None
+    assert find_border([]) is None
+    assert find_border([np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)] * 5) is None

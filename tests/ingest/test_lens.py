@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.lens import Lens, read_lens
+from neeco.ingest.lens import read_lens
 
 OPENCV = """%YAML:1.0
 ---

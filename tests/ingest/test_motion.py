@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("cv2")
 
-from neeco.ingest.lens import Lens
+from neeco.capture.lens import Lens
 from neeco.ingest.motion import STEP, carve_shape, observations_on, project_mask
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))

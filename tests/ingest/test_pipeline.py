@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from neeco.capture import check_capture, read_capture
 from neeco.capture.check import errors_only
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording import read_recording
@@ -93,6 +94,8 @@ def test_the_sample_recorded_again_becomes_the_sample(recording: Path, tmp_path:
     order = sorted(truth, key=lambda stem: truth[stem].state.time)
     made = read_capture(tmp_path / "capture")
     assert len(made.frames) > 70
+    camera = made.frames[0].camera
+    assert made.lens == Lens(camera.fx, camera.fy, camera.cx, camera.cy, (), (camera.width, camera.height))
     errors = []
     for frame in made.frames:
         given = truth[order[int(frame.image_path.stem)]]

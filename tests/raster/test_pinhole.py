@@ -93,3 +93,12 @@ def test_the_image_holds_what_lies_before_the_camera_and_within_its_edges():
     assert in_image(points, camera).tolist() == [True, True, False, False]
     behind = 2 * camera.world_from_camera[:3, 3].double() - points
     assert not bool(in_image(behind, camera).any())
+
+
+def test_a_resized_camera_sees_points_at_the_same_share_of_the_image():
+    camera = a_camera()
+    points = torch.from_numpy(np.random.default_rng(3).uniform(-20, 20, (30, 3)))
+    pixels, _ = project_world(points, camera)
+    resized, _ = project_world(points, camera.resized(480, 64))
+    assert torch.allclose(resized, pixels * torch.tensor([3.0, 0.5], dtype=torch.float64))
+    assert camera.resized(480, 64).resized(160, 128) == camera

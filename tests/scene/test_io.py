@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.scene import Scene
 from neeco.scene.io import load_scene, pack_scene, save_scene, save_tensors
@@ -40,6 +42,22 @@ def test_a_scene_comes_back_exactly(any_scene: Scene, tmp_path: Path) -> None:
             assert torch.equal(a.sh, b.sh)
             assert b.background.tolist() == [0.75] * 3
             assert torch.equal(a.headlight.falloff, b.headlight.falloff)
+
+
+def test_a_scene_knows_the_lens_of_its_recording(kinematic: Scene, tmp_path: Path) -> None:
+    lens = Lens(60.0, 61.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0, 0.01), (64, 48), (31.0, 25.0, 28.0))
+    assert load_scene(_saved(kinematic, tmp_path)).recorded.lens is None
+    kinematic.recorded = dataclasses.replace(kinematic.recorded, lens=lens)
+    path = _saved(kinematic, tmp_path)
+    assert load_scene(path).recorded.lens == lens
+    kinematic.recorded = dataclasses.replace(kinematic.recorded, lens=dataclasses.replace(lens, fl_x=-1.0))
+    with pytest.raises(NeecoError, match=r"lens\.fl_x.*train again"):
+        load_scene(_saved(kinematic, tmp_path))
+
+
+def _saved(scene: Scene, folder: Path) -> Path:
+    save_scene(scene, folder / "scene.safetensors")
+    return folder / "scene.safetensors"
 
 
 def test_saving_again_gives_the_same_bytes(any_scene: Scene, tmp_path: Path) -> None:

@@ -13,7 +13,9 @@ import torch
 from PIL import Image
 from rod_world import CAMERA, FakeRun, rod_state
 
+from neeco import StoredImages
 from neeco.capture.images import write_image
+from neeco.capture.lens import Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -23,6 +25,7 @@ from neeco.raster.rotations import rigid_from_vector
 from neeco.report.run_page import write_annotated_page
 from neeco.scene import Scene
 from neeco.synthesis.annotated import TypicalErrors, annotate_capture, estimate_trust, typical_errors_of
+from neeco.synthesis.settings import ImageSettings
 
 USUAL = TypicalErrors(0.05, 0.05)
 HIDDEN = 5  # the frame whose instrument something is held before
@@ -213,3 +216,28 @@ def test_a_recording_that_changed_is_not_gone_on_with(made: Path, recorded: Reco
     changed = replace(recorded, recording=replace(recorded.recording, frames=tuple(frames)))
     with pytest.raises(NeecoError, match=r"dataset.json: settings.captures_sha256: begun with .*use a new folder"):
         annotate_capture(changed, begun, resume=True)
+
+
+def test_recorded_images_and_labels_are_written_as_large_as_asked_and_through_the_lens(
+    recorded: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = replace(recorded, recording=replace(recorded.recording, frames=recorded.recording.frames[2:4]))
+    lens = Lens(50.0, 50.0, 32.0, 24.0, (-0.3, 0.1, 0.0, 0.0), (64, 48), (32.0, 24.0, 31.0))
+    monkeypatch.setattr(few.scene, "recorded", replace(few.scene.recorded, lens=lens))
+    annotate_capture(few, tmp_path / "large", images=ImageSettings(scale=2.0, image_format="jpg"), formats=())
+    annotate_capture(few, tmp_path / "bent", images=ImageSettings(lens=True), formats=())
+    large, bent = (StoredImages(tmp_path / name)[0] for name in ("large", "bent"))
+    recorded_image = few.recording.frames[0].load_image().permute(2, 0, 1)
+    shrunk = torch.nn.functional.avg_pool2d(large["image"], 2)
+    assert float((shrunk - recorded_image).abs().mean()) < 0.02
+    assert large["parts"].shape == (96, 128)
+    # the pinhole saw less than the lens does: what it left out, no label speaks of
+    black = bent["image"].sum(0) == 0
+    assert 0.05 < float(black.float().mean()) < 0.5
+    assert (bent["parts"][black] == 0).all()
+    rows, columns = np.mgrid[0:48, 0:64] + 0.5
+    away = torch.from_numpy(np.hypot(columns - 32, rows - 24))
+    assert bent["ignore"][black & (away < 30)].all()
+    assert not bent["ignore"][away > 32].any()  # nothing is there in the recording either
+    seen, straight = bent["image"][:, bent["parts"] > 0], recorded_image[:, large["parts"][::2, ::2] > 0]
+    assert float((seen.mean(1) - straight.mean(1)).abs().max()) < 0.1

@@ -12,9 +12,11 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.raster.pinhole import project_world
+from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
 from neeco.training.resolution import Resolution, ResolutionConfig, amplitude_shares, reduced_scales
+from neeco.training.train import train
 
 CONFIG = ResolutionConfig(min_side=16, step=2.0, full_size_at=0.5)
 
@@ -91,3 +93,15 @@ def test_limits_follow_the_number_of_pixels_unless_given() -> None:
 def test_sizes_that_make_no_sense_are_refused(setting: str) -> None:
     with pytest.raises(NeecoError, match=setting.split("=")[0]):
         training_config("kinematic", {}, [setting])
+
+
+def test_what_is_learned_from_reduced_images_is_drawn_at_the_recorded_size(capture: Path, tmp_path: Path) -> None:
+    notes: list[str] = []
+    config = training_config("3dgs", {"iterations": 2, "scale": 0.5})
+    run = train(capture, tmp_path / "run", config, progress=lambda row: notes.append(row.note))
+    scene = load_scene(run / "scene.safetensors")
+    recorded = read_capture(capture).split("train")[0].camera
+    half = f"{round(recorded.width / 2)}x{round(recorded.height / 2)}"
+    assert any(f"images of {half};" in note and "GB of memory" in note for note in notes)
+    assert scene.recorded.cameras[0].width == recorded.width
+    assert scene.recorded.as_learned(recorded).learned_fx == pytest.approx(recorded.fx / 2)

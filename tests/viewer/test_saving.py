@@ -17,7 +17,8 @@ from viewer_world import HEIGHT, WIDTH
 from neeco.errors import NeecoError
 from neeco.labels.drawing import draw
 from neeco.synthesis.samplers import make_sampler, moved_camera
-from neeco.synthesis.writers.folder import PIXELS, load_record
+from neeco.synthesis.settings import SizeSettings
+from neeco.synthesis.writers.folder import LABELS, load_record
 from neeco.viewer.controls import Controls, InstrumentControls, controlled_state
 from neeco.viewer.runs import LoadedRun, WatchedRun
 from neeco.viewer.saving import SavedStates
@@ -87,7 +88,7 @@ def test_a_saved_image_is_one_that_synthesize_would_write(saved: SavedStates, lo
     state = some_state(loaded)
     path = saved.save_image(loaded, state, VIEW)
     samples = path.parent.parent
-    assert all((samples / folder / path.name).is_file() for folder in PIXELS)
+    assert all((samples / folder / path.name).is_file() for folder in LABELS)
     record = load_record(samples, 0)
     assert record["instruments"][0]["joints"] == dict(state.instruments["grasper"].joints)
     assert record["labels"][0]["name"] == "grasper"
@@ -102,6 +103,12 @@ def test_a_saved_image_is_one_that_synthesize_would_write(saved: SavedStates, lo
 def test_images_are_numbered_on(saved: SavedStates, loaded: LoadedRun) -> None:
     names = [saved.save_image(loaded, some_state(loaded, roll=roll), VIEW).name for roll in (0.0, 0.5)]
     assert names == ["000000.png", "000001.png"]
+
+
+def test_a_saved_image_is_as_large_as_was_asked(saved: SavedStates, loaded: LoadedRun) -> None:
+    path = SavedStates(saved.folder.parent, SizeSettings(scale=2.0)).save_image(loaded, some_state(loaded), VIEW)
+    with Image.open(path) as image:
+        assert image.size == (2 * WIDTH, 2 * HEIGHT)
 
 
 def test_a_scene_without_labels_saves_none(saved: SavedStates, loaded: LoadedRun) -> None:

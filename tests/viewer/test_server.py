@@ -266,3 +266,12 @@ def test_a_slow_scene_is_drawn_smaller_and_a_fast_one_as_large_as_the_window() -
     assert slow.height(False, 900, 1.6) < slow.height(True, 900, 1.6) < 100
     fast.record(60.0, 256 * 400)  # had to find something out first
     assert fast.height(False, 900, 1.6) == MOVING_PX
+
+
+def test_a_size_asked_for_is_rendered_whatever_it_takes() -> None:
+    asked = AdaptiveResolution(sharp_px=1280)
+    for _ in range(3):
+        asked.record(5.0, 256 * 400)
+    assert asked.height(True, 2000, 1.6) == 1280
+    assert asked.height(True, 900, 1.6) == 900  # all that the window shows
+    assert asked.height(False, 2000, 1.6) < 100

@@ -11,6 +11,7 @@ from typing import Any, Literal, NoReturn
 
 import numpy as np
 
+from neeco.capture.lens import Lens
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
@@ -243,6 +244,7 @@ class Parsed:
     registered: bool = True
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
+    lens: Lens | None = None  # through which it was recorded
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
 

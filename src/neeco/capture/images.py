@@ -68,10 +68,16 @@ def has_alpha(path: Path) -> bool:
         return _is_transparent(image)
 
 
-def write_image(path: Path, image: Tensor) -> None:
-    """Write an image [H, W, 3] in [0, 1] (clipped, rounded to 8 bits) as PNG, atomically. Raises NeecoError."""
-    pixels = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    write_png(path, pixels[..., ::-1])  # OpenCV's order of colours
+def write_image(path: Path, image: Tensor, quality: int | None = None) -> None:
+    """Write an image [H, W, 3] in [0, 1] (clipped, rounded to 8 bits), atomically: as JPEG of `quality`, 1 to 100, or
+    where that is None as PNG. Raises NeecoError."""
+    pixels = image.detach().cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8).contiguous().numpy()
+    pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)  # as OpenCV has them
+    if quality is None:
+        write_png(path, pixels)
+        return
+    _, code = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    write_atomically(Path(path), lambda temporary: temporary.write_bytes(code.tobytes()))
 
 
 def write_labels(path: Path, labels: Tensor) -> None:

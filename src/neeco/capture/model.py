@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
+from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
 from neeco.raster.rotations import as_pose
 from neeco.raster.types import Camera
@@ -117,6 +118,7 @@ class Capture:
     points: PointCloud = field(default_factory=lambda: PointCloud(measured=False))
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
+    lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
 
     def __post_init__(self) -> None:
         for name, kind in {"root": Path, "frames": tuple, "instruments": tuple}.items():

@@ -40,7 +40,9 @@ def capture_of(parsed: Parsed) -> Capture:
     points = parsed.points
     if points is None:
         points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
-    return Capture(parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed)
+    return Capture(
+        parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed, parsed.lens
+    )
 
 
 def parse_capture(

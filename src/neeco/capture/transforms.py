@@ -13,6 +13,7 @@ import torch
 
 from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.images import EXTENSIONS, image_size
+from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Frame, State, swap_camera_axes
 from neeco.capture.points import random_points, read_ply
 from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
@@ -88,7 +89,7 @@ def _frame_objects(document: Node) -> list[dict[str, Any]]:
 
 
 def _parse_header(document: Node, parsed: Parsed) -> None:
-    """Check what holds for the whole file: schema and units, and read `instrument_frame`."""
+    """Check what holds for the whole file: schema and units, and read `instrument_frame` and `lens`."""
     value = document.value
     schema = value.get("schema", SCHEMA)
     if schema != SCHEMA:
@@ -102,6 +103,8 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
     if registration not in ("world", "unregistered"):
         document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
     parsed.registered = registration != "unregistered"
+    if document.has("lens"):
+        parsed.lens = parse_lens(document.child("lens"))
     parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA
 
 

@@ -67,6 +67,8 @@ def write_capture(
         }
         for instrument in capture.instruments
     ]
+    if capture.lens is not None:
+        header["lens"] = capture.lens.to_json()
     pixels = [None] * len(names) if images is None else images
     header["frames"] = [
         _write_frame(frame, name, path, image) for frame, name, image in zip(capture.frames, names, pixels, strict=True)
@@ -96,6 +98,8 @@ def fingerprint(capture: Capture) -> str:
             digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
     instruments = [[item.name, dict(item.joints)] for item in capture.instruments]
     digest.update(json.dumps([instruments, capture.registered, capture.timed]).encode())
+    if capture.lens is not None:  # captures without one keep the fingerprint that older versions noted
+        digest.update(json.dumps(capture.lens.to_json()).encode())
     for numbers in (capture.points.positions, capture.points.colors):
         digest.update(numbers.tobytes())
     return digest.hexdigest()

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from neeco.settings import Device
-from neeco.synthesis.settings import MIN_TRUST, Format
+from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Arguments:
     """Frames trusted less are listed, not written: 0 to 1, about the overlap (IoU) that the image speaks for."""
     formats: tuple[Format, ...] = ("coco", "yolo")
     """Index files beside the plain images, masks, parts and depth."""
+    images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     resume: bool = False
     """Continue a data set begun with the same settings."""
     device: Device = "auto"
@@ -40,6 +41,7 @@ def run(arguments: Arguments) -> int:
     from neeco.synthesis.annotated import annotate_capture
     from neeco.training.run import open_run
 
+    arguments.images.check()
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         capture = None if arguments.capture is None else read_checked(arguments.capture)
         with (
@@ -52,6 +54,7 @@ def run(arguments: Arguments) -> int:
                 capture=capture,
                 min_trust=arguments.min_trust,
                 formats=arguments.formats,
+                images=arguments.images,
                 resume=arguments.resume,
                 on_progress=advance,
             )

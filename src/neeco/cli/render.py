@@ -8,6 +8,7 @@ from pathlib import Path
 import tyro
 
 from neeco.settings import Device
+from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Arguments:
     """Which frames."""
     states: Path | None = None
     """Draw these states (JSON lines) instead of a split."""
+    images: tyro.conf.OmitArgPrefixes[ImageSettings] = AS_RECORDED
     device: Device = "auto"
 
 
@@ -34,13 +36,14 @@ def run(arguments: Arguments) -> int:
     from neeco.synthesis.rendered_views import STATES_FOLDER, render, split_views, state_views
     from neeco.training.run import open_run
 
+    arguments.images.check()
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         if arguments.states is not None:
             views, folder = state_views(trained.scene, arguments.states), arguments.output / STATES_FOLDER
         else:
             views, folder = split_views(trained, arguments.split, arguments.capture), arguments.output / arguments.split
         with counting("render", len(views)) as advance:
-            rendered = render(trained.scene, views, folder, advance)
+            rendered = render(trained.scene, views, folder, advance, arguments.images)
     print(f"{rendered.images} images in {rendered.folder}")
     if not rendered.labelled:
         print(f"no part ids and masks: method {trained.scene.method!r} learns no labels")

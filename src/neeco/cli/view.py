@@ -10,6 +10,7 @@ import tyro
 
 from neeco.errors import NeecoError
 from neeco.settings import Device
+from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Arguments:
     """Open no web browser; only print the address."""
     export: Path | None = None
     """Write this HTML file instead, of the one run given."""
+    size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
     device: Device = "auto"
@@ -39,11 +41,14 @@ def run(arguments: Arguments) -> int:
     if not arguments.runs:
         raise NeecoError("view: no run given; give one, or two to compare")
     if arguments.export is not None:
+        if arguments.size != RECORDED_SIZE:
+            raise NeecoError("--size, --scale: an exported page draws as large as its window is; leave them out")
         return _export(arguments, arguments.export)
+    arguments.size.check()
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
-    with ViewerServer(arguments.runs, arguments.host, arguments.port, device) as viewer:
+    with ViewerServer(arguments.runs, arguments.host, arguments.port, device, arguments.size) as viewer:
         try:
             print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
             if not arguments.no_browser:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -261,17 +261,7 @@ def _to_uint8(pixels: np.ndarray) -> Pixels:
 
 def resize_camera(camera: Camera, factor: float) -> Camera:
     """The same pinhole with `factor` times the pixels along each side (rounded to whole pixels, at least one)."""
-    width, height = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
-    across, down = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,  # pixel centres lie at +0.5, so scaling needs no offset
-        cy=camera.cy * down,
-        width=width,
-        height=height,
-    )
+    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
 
 
 def resize_image(image: Tensor, camera: Camera) -> Tensor:

@@ -1,33 +1,27 @@
-"""What the optics do to the images: the lens, read from a calibration and undistorted, and the round field of view."""
+"""What the optics do to the images: the lens, as a calibration has it, and the round field of view."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 import yaml
 from scipy import ndimage
 
 from neeco.capture.documents import as_float, printable
+from neeco.capture.lens import COEFFICIENTS, Border, Lens
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
-from neeco.raster.types import Camera
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
-WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
 LARGEST = 1e9  # of any of a lens's numbers
-COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
 
 # The dark border around a round field of view.
 BORDER_SAMPLES = 48  # frames looked at
@@ -36,97 +30,6 @@ MARGIN = 0.015  # of the radius taken off: the border's edge is blurred
 MISFIT = 0.015  # of the radius: how far the edge may be off a circle
 CLEAN = 0.9  # share of the pixels outside the circle that must be dark, of those inside that must not be
 SHARP = 0.6  # share of the brightness inside the edge that must be gone right outside
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Focal lengths and principal point, px, pixel centres at +0.5; distortion: OpenCV's k1, k2, p1, p2[, k3, ...],
-    empty for a pinhole; size: (width, height) of the images it was measured on, None when nothing says it."""
-
-    fl_x: float
-    fl_y: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-    size: tuple[int, int] | None = None
-
-    @property
-    def distorted(self) -> bool:
-        return any(self.distortion)
-
-    @property
-    def intrinsics(self) -> tuple[float, float, float, float]:
-        """fl_x, fl_y, cx, cy."""
-        return self.fl_x, self.fl_y, self.cx, self.cy
-
-    def camera(self, world_from_camera: np.ndarray) -> Camera:
-        """A pinhole's camera at a pose [4, 4] with OpenCV axes."""
-        assert self.size is not None
-        assert not self.distorted
-        return Camera(torch.from_numpy(world_from_camera.copy()), *self.intrinsics, *self.size)
-
-    def check_size(self, size: tuple[int, int], source: object) -> None:
-        """Raise NeecoError when measured on images of another size than (width, height). source: named in it."""
-        if self.size is not None and self.size != tuple(size):
-            measured, found = "x".join(map(str, self.size)), "x".join(map(str, size))
-            raise NeecoError(
-                f"{source}: calibrated on {measured} images, the video is {found}; calibrate at the video's size, or "
-                "scale fl_x, fl_y, cx, cy and the size if the video was only resized"
-            )
-        if not (0 < self.cx < size[0] and 0 < self.cy < size[1]):
-            raise NeecoError(
-                f"{source}: the principal point ({self.cx:g}, {self.cy:g}) lies outside the {size[0]}x{size[1]} video; "
-                "give the calibration of this video"
-            )
-        if not all(WIDEST < focal / max(size) < LONGEST for focal in (self.fl_x, self.fl_y)):
-            raise NeecoError(
-                f"{source}: focal lengths {self.fl_x:g} and {self.fl_y:g} px fit no lens on a {size[0]}x{size[1]} "
-                "video; give the calibration of this video, in pixels"
-            )
-
-    def pinhole(self, size: tuple[int, int]) -> Lens:
-        """The pinhole of undistorted images (width, height): zoomed so that every pixel shows something. Raises
-        NeecoError when the distortion folds the image over."""
-        if not self.distorted:
-            return replace(self, distortion=(), size=size)
-        matrix, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), self._coefficients(), size, 0.0)
-        fl_x, fl_y, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        found = Lens(fl_x, fl_y, cx + 0.5, cy + 0.5, (), size)
-        if not (0.2 < fl_x / self.fl_x < 5 and 0.2 < fl_y / self.fl_y < 5) or self._folds(found, size):
-            listed = ", ".join(f"{value:g}" for value in self.distortion)
-            raise NeecoError(f"lens: distortion {listed} folds the image over; calibrate again")
-        return found
-
-    def undistort(self, image: np.ndarray) -> np.ndarray:
-        """An image uint8 [H, W, 3] (or [H, W]) as `pinhole` sees it, bilinear."""
-        return self._remap(image, cv2.INTER_LINEAR)
-
-    def undistort_mask(self, mask: np.ndarray) -> np.ndarray:
-        """A mask bool [H, W] as `pinhole` sees it."""
-        return self._remap(mask.astype(np.uint8), cv2.INTER_NEAREST) > 0
-
-    def _remap(self, image: np.ndarray, interpolation: int) -> np.ndarray:
-        if not self.distorted:
-            return image
-        maps = _maps(self, (image.shape[1], image.shape[0]))
-        return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT)
-
-    def _folds(self, pinhole: Lens, size: tuple[int, int]) -> bool:
-        """Whether somewhere in the undistorted image a ray farther out is not seen farther out."""
-        x = np.array([-pinhole.cx, size[0] - pinhole.cx]) / pinhole.fl_x
-        y = np.array([-pinhole.cy, size[1] - pinhole.cy]) / pinhole.fl_y
-        r2 = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), 200) ** 2
-        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *[0.0] * 8)[:8]
-        with np.errstate(all="ignore"):
-            seen = np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        return not bool((np.diff(seen) > 0).all())
-
-    def _matrix(self) -> np.ndarray:
-        """K [3, 3] as OpenCV means it: the first pixel's centre at 0."""
-        return np.array([[self.fl_x, 0, self.cx - 0.5], [0, self.fl_y, self.cy - 0.5], [0, 0, 1]])
-
-    def _coefficients(self) -> np.ndarray:
-        return np.array(self.distortion, dtype=np.float64)
 
 
 def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
@@ -143,12 +46,6 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     if source.suffix.lower() == ".json":
         return _nerfstudio(source, read_json(source))
     return _opencv(source, _read_opencv_yaml(source))
-
-
-@lru_cache(maxsize=4)
-def _maps(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    new = lens.pinhole(size)._matrix()
-    return cv2.initUndistortRectifyMap(lens._matrix(), lens._coefficients(), None, new, size, cv2.CV_32FC1)
 
 
 def _nerfstudio(path: Path, document: Any) -> Lens:
@@ -257,8 +154,8 @@ def _numbers(path: Path, value: Any, field: str) -> list[float]:
     return flat
 
 
-def visible_mask(images: Iterable[np.ndarray]) -> np.ndarray | None:
-    """bool [H, W], False on the dark border around a round field of view; None when the images have no such border.
+def find_border(images: Iterable[np.ndarray]) -> Border | None:
+    """The dark border around a round field of view; None when the images have no such border.
 
     images: uint8 [H, W, 3], frames spread over the recording (10 or more; at most BORDER_SAMPLES are used). The border
     stays at the black level although the scene lights up pixels beside it. Only one with a circular edge, sharp all
@@ -278,8 +175,14 @@ def visible_mask(images: Iterable[np.ndarray]) -> np.ndarray | None:
     if circle is None or not _divides_dark_from_bright(circle, outside, brightness, threshold):
         return None
     x, y, radius = circle
-    rows, columns = np.indices(outside.shape)
-    return np.hypot(columns - x, rows - y) < radius * (1 - MARGIN) - 0.5
+    return x + 0.5, y + 0.5, radius  # which the circle counts from the first pixel's centre
+
+
+def visible_mask(border: Border, size: tuple[int, int]) -> np.ndarray:
+    """bool [H, W] of images of `size` (width, height): False on the border and on its blurred edge."""
+    x, y, radius = border
+    rows, columns = np.indices(size[::-1])
+    return np.hypot(columns + 0.5 - x, rows + 0.5 - y) < radius * (1 - MARGIN) - 0.5
 
 
 def _brightest(images: Iterable[np.ndarray]) -> np.ndarray | None:

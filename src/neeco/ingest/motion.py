@@ -17,7 +17,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import binary_dilation
 from scipy.spatial import QhullError
 
-from neeco.ingest.lens import Lens
+from neeco.capture.lens import Lens
 from neeco.ingest.sfm import SfmResult
 from neeco.raster.pinhole import project, project_world
 from neeco.raster.types import Camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,13 @@ import numpy as np
 import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
+from neeco.capture.lens import Border, Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.convert import staged
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
-from neeco.ingest.lens import BORDER_SAMPLES, Lens, read_lens, visible_mask
+from neeco.ingest.lens import BORDER_SAMPLES, find_border, read_lens, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, Recording, Splits
 from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
@@ -109,7 +110,8 @@ class _Ingest:
         self.names = [f"{frame:06d}.png" for frame in self.selected]
         self._write_images()
         (folder / "sfm").mkdir()
-        self.visible = self._write_visible()
+        self.border = self._find_border()
+        self.visible = None if self.border is None else self._write_visible(self.border)
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
             folder / "sfm", self.data.video.path, folder / "raw", self.names, self.pinhole, self.visible, self.settings
@@ -185,13 +187,15 @@ class _Ingest:
             straight = self.lens.undistort(image) if self.lens else image
             write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
 
-    def _write_visible(self) -> Path | None:
-        """Masks of the endoscope's dark border, one file per frame as SfM wants them; None without a border."""
+    def _find_border(self) -> Border | None:
+        """The endoscope's dark border, in the frames as recorded."""
         count = len(self.names)
         sample = self.selected[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
-        seen = visible_mask(image for _, image in self.data.video.read(np.unique(sample).tolist()))
-        if seen is None:
-            return None
+        return find_border(image for _, image in self.data.video.read(np.unique(sample).tolist()))
+
+    def _write_visible(self, border: Border) -> Path:
+        """Masks of the endoscope's dark border, one file per frame as SfM wants them."""
+        seen = visible_mask(border, self.size)
         if self.lens is not None:
             seen = self.lens.undistort_mask(seen)
         folder = self.folder / "visible"
@@ -319,7 +323,9 @@ class _Ingest:
             if item.poses is not None
         )
         registered = registration is not None or not data.poses
-        capture = Capture(self.folder, capture_frames, instruments, cloud, registered)
+        assert self.lens is not None
+        lens = replace(self.lens, size=self.size, border=self.border)
+        capture = Capture(self.folder, capture_frames, instruments, cloud, registered, lens=lens)
         write_capture(capture, self.folder / "capture")
         position = {row: index for index, row in enumerate(chosen.tolist())}
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []

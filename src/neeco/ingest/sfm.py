@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.lens import Lens
 from neeco.ingest.recording import MIN_FRAMES, IngestSettings
 from neeco.ingest.video import require_installed
 

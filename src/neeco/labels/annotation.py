@@ -18,7 +18,7 @@ from torch import Tensor
 from neeco.capture.model import State
 from neeco.labels.drawing import LayeredDrawing, draw_layers, surface_depth, to_numpy
 from neeco.labels.labellers import CompositedLabels, instruments_of
-from neeco.raster.pinhole import project
+from neeco.raster.pinhole import project_seen
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 
@@ -122,7 +122,7 @@ def visibility(seen: np.ndarray, unoccluded: np.ndarray) -> float:
 def place_in_image(point: np.ndarray, camera: Camera) -> tuple[float, float, float] | None:
     """Position (x, y) px and depth mm of a world point [3] mm; None where the image does not show the place."""
     local = (np.linalg.inv(to_numpy(camera.world_from_camera)) @ np.append(point, 1.0))[:3]
-    x, y = project(local, camera.fx, camera.fy, camera.cx, camera.cy, nearest=camera.near)
+    x, y = project_seen(local, camera, nearest=camera.near)
     seen = local[2] > camera.near and 0 <= x < camera.width and 0 <= y < camera.height
     return (float(x), float(y), float(local[2])) if seen else None
 
@@ -229,7 +229,7 @@ def _outer_loops(mask: np.ndarray) -> list[np.ndarray]:
     """
     x, y, width, height = bounding_box(mask)
     inside = mask[y : y + height, x : x + width].astype(np.uint8)
-    fine = np.kron(inside, np.ones((FINE, FINE), np.uint8))
+    fine = inside.repeat(FINE, 0).repeat(FINE, 1)
     upper_left, upper_right = inside[:-1, :-1], inside[:-1, 1:]
     lower_left, lower_right = inside[1:, :-1], inside[1:, 1:]
     touching = (upper_left == lower_right) & (upper_right == lower_left) & (upper_left != upper_right)
@@ -397,7 +397,7 @@ def draw_labelled(scene: Drawable, state: State, camera: Camera, labels: bool = 
     method learns none.
     """
     if not labels:
-        rendering = scene.render(state, camera)
+        rendering = scene.render(state, scene.recorded.as_learned(camera))
         depth = torch.from_numpy(surface_depth(rendering)).float()
         return RGBDImage(rendering.color.clamp(0, 1).cpu(), depth)
     known = gaussian_scene(scene, "draw labels")

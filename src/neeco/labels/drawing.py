@@ -6,6 +6,7 @@ Whatever device draws, a drawing is on the CPU.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -71,8 +72,8 @@ class LayeredDrawing(Drawing):
 
 @torch.no_grad()
 def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
-    """Draw `state` as `camera` sees it, with the scene's own labels where it has any."""
-    rendering = scene.render(state, camera, labels=True)
+    """Draw `state` as `camera`, of any size and lens, sees it, with the scene's own labels where it has any."""
+    rendering = scene.render(state, scene.recorded.as_learned(camera), labels=True)
     parts = None if rendering.channels is None else composited_parts(rendering, threshold_of(scene)).cpu()
     return Drawing(rendering.color.clamp(0, 1).cpu(), parts)
 
@@ -81,11 +82,12 @@ def draw(scene: Drawable, state: State, camera: Camera) -> Drawing:
 def draw_layers(
     scene: Scene, labeller: Labeller, state: State, camera: Camera, min_component: float, tissue_image: bool = False
 ) -> LayeredDrawing:
-    """Draw `state` as `camera` sees it, labelled by `labeller`; tissue and instruments also alone, for their depth, and
-    with `tissue_image` for what the tissue looks like.
+    """Draw `state` as `camera`, of any size and lens, sees it, labelled by `labeller`; tissue and instruments also
+    alone, for their depth, and with `tissue_image` for what the tissue looks like.
 
     Components of an instrument's mask smaller than `min_component` of its largest are not labelled.
     """
+    camera = scene.recorded.as_learned(camera)
     gaussians = scene.at(state)
     owners = labeller.owners(state, gaussians)
     unobserved = scene.unobserved(gaussians, camera)
@@ -115,7 +117,7 @@ def draw_layers(
 
 def surface_depth(rendering: Rendering) -> np.ndarray:
     """Expected depth [H, W] mm where something opaque was drawn, 0 elsewhere."""
-    return to_numpy(torch.where(rendering.alpha > SURFACE_ALPHA, rendering.depth, 0.0))
+    return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
@@ -135,7 +137,13 @@ def uncertain_edge(share: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if not border.any():
         return border
     unclear = (share > CLEAR_SHARES[0]) & (share < CLEAR_SHARES[1])
-    return border | (unclear & (_distance_to(border) <= REACH * np.hypot(*mask.shape)))
+    reach = float(REACH * np.hypot(*mask.shape))
+    x, y, width, height = cv2.boundingRect(border.astype(np.uint8))
+    margin = math.ceil(reach)
+    near = slice(max(0, y - margin), y + height + margin), slice(max(0, x - margin), x + width + margin)
+    edge = border.copy()
+    edge[near] |= unclear[near] & (_distance_to(border[near]) <= reach)
+    return edge
 
 
 def without_small_components(mask: np.ndarray, share: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from torch import Tensor
 from neeco.errors import NeecoError
 from neeco.raster.devices import cuda_backend
 from neeco.raster.native import runs_native
+from neeco.raster.optics import draw_through, of_learned_size, widened
 from neeco.raster.shadow import shadowed
 from neeco.raster.triton.ready import require_triton
 from neeco.raster.types import Camera, Gaussians, Rendering
@@ -43,6 +44,7 @@ def rasterize(
     - alpha = min(0.999, opacity * exp(-distance^2 / 2)), nothing where it is below 1/255; a pixel is full, and takes
       nothing more, once its transmittance would fall to 1e-4 or less;
     - order is by depth, computed in float64 and rounded once to float32, equal depths by index;
+    - a camera with a lens, or with another size than the learned one, sees what `draw_through` makes of pinholes;
     - Gaussians nearer than `camera.near`, or with a NaN or an infinity in any parameter, or with a quaternion of length
       zero, draw nothing and get zero gradients.
 
@@ -57,6 +59,8 @@ def rasterize(
     if channels is not None and channels.shape[1] == 0:  # no kernel need know of none
         rendering = rasterize(gaussians, camera, background=background, backend=backend)
         return replace(rendering, channels=rendering.color.new_zeros((camera.height, camera.width, 0)))
+    if camera.is_resampled:
+        return draw_through(camera, partial(_rasterize_resized, gaussians, channels, background, backend))
     gaussians = shadowed(gaussians, camera, partial(rasterize, backend=backend))
     if backend == "auto":
         on_cpu = "cpu" if runs_native(gaussians.means) else "reference"
@@ -81,6 +85,16 @@ def rasterize(
 
         return rasterize_triton(gaussians, camera, channels, background)
     raise NeecoError(f"backend: {backend!r}: unknown; use one of {', '.join(BACKENDS)}")
+
+
+def _rasterize_resized(
+    gaussians: Gaussians, channels: Tensor | None, background: Tensor | None, backend: str, camera: Camera
+) -> Rendering:
+    """`rasterize` for a pinhole of the learned size or a larger one; shadows are as soft as they were learned."""
+    draw = partial(rasterize, backend=backend)
+    pinhole = replace(camera, learned_fx=None)
+    gaussians = shadowed(gaussians, replace(of_learned_size(camera), learned_fx=None), draw)
+    return draw(widened(gaussians, camera), pinhole, channels=channels, background=background)
 
 
 def _check(gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None) -> None:

@@ -1,4 +1,4 @@
-"""Where points fall in the image of a pinhole camera, for torch tensors and numpy arrays alike."""
+"""Where points fall in the image of a camera, for torch tensors and numpy arrays alike."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.raster.lens import pixels_of_rays, rays_of_pixels
 from neeco.raster.types import Camera
 
 Array = TypeVar("Array", Tensor, np.ndarray)
@@ -36,17 +37,22 @@ def project_world(points: Array, camera: Camera, nearest: float | None = None) -
     if isinstance(points, np.ndarray):
         pose = camera.world_from_camera.detach().cpu().double().numpy()
         local = (points - pose[:3, 3]) @ pose[:3, :3]
-        return np.stack(_intrinsic(local, camera, nearest), axis=-1), local[..., 2]
+        return np.stack(project_seen(local, camera, nearest), axis=-1), local[..., 2]
     view = camera.world_from_camera.to(points)
     seen = (points - view[:3, 3]) @ view[:3, :3]
-    return torch.stack(_intrinsic(seen, camera, nearest), dim=-1), seen[..., 2]
+    return torch.stack(project_seen(seen, camera, nearest), dim=-1), seen[..., 2]
 
 
 def unproject_world(pixels: Tensor, depths: Tensor, camera: Camera) -> Tensor:
     """Points [..., 3] mm of the world seen at pixels [..., 2] in depths [...] mm: what `project_world` takes back."""
     pose = camera.world_from_camera.to(depths)
     u, v = pixels.unbind(-1)
-    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], -1)
+    if camera.is_pinhole:
+        slopes = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
+    else:
+        given = pixels.detach().cpu().double().numpy()
+        slopes = torch.from_numpy(rays_of_pixels(given.reshape(-1, 2), camera).reshape(given.shape)).to(pixels)
+    rays = torch.cat([slopes, torch.ones_like(u)[..., None]], -1)
     return (rays * depths[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 
 
@@ -63,8 +69,17 @@ def in_image(points: Tensor, camera: Camera) -> Tensor:
     return (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > camera.near)
 
 
-def _intrinsic(points: Array, camera: Camera, nearest: float | None) -> tuple[Array, Array]:
-    return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
+def project_seen(points: Array, camera: Camera, nearest: float | None = None) -> tuple[Array, Array]:
+    """`project` of points [..., 3] mm in the camera's frame by its own numbers, through its lens: NaN where it does not
+    show them. No gradients through a lens."""
+    if camera.is_pinhole:
+        return project(points, camera.fx, camera.fy, camera.cx, camera.cy, nearest)
+    if isinstance(points, Tensor):
+        u, v = project_seen(points.detach().cpu().double().numpy(), camera, nearest)
+        return torch.from_numpy(u).to(points), torch.from_numpy(v).to(points)
+    slopes = np.stack(project(points, 1.0, 1.0, 0.0, 0.0, nearest), -1)
+    pixels = pixels_of_rays(slopes.reshape(-1, 2), camera).reshape(slopes.shape)
+    return pixels[..., 0], pixels[..., 1]
 
 
 def field_slopes(camera: Camera, camera_means: Tensor) -> Tensor:

@@ -98,10 +98,12 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose.
+    """A camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Gradients reach the pose.
 
-    The pose may also be given as an array or nested lists, which become float32 (`as_pose`). Raises NeecoError when it
-    is not 4x4, or given so and no rotation and translation.
+    A pinhole, unless it is given OpenCV's distortion or a round border, black beyond, as an endoscope has. `learned_fx`
+    asks that an image of another size than the learned one show the same picture, larger or smaller (see `draw_through`
+    in neeco.raster.optics); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
+    become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation.
 
         neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """
@@ -114,6 +116,9 @@ class Camera:
     width: int  # px
     height: int
     near: float = 0.01  # mm; Gaussians whose mean is nearer draw nothing
+    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2[, k3, ...]
+    border: tuple[float, float, float] | None = None  # px: centre x, y and radius of what the lens shows
+    learned_fx: float | None = None  # px, of the images that Gaussians were learned from; None: of ones like this
 
     if TYPE_CHECKING:  # what may be given
 
@@ -127,6 +132,9 @@ class Camera:
             width: int,
             height: int,
             near: float = ...,
+            distortion: tuple[float, ...] = ...,
+            border: tuple[float, float, float] | None = ...,
+            learned_fx: float | None = ...,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -137,11 +145,23 @@ class Camera:
         """The same camera, its pose on `device`."""
         return replace(self, world_from_camera=self.world_from_camera.to(device))
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines are straight, and the image has no border."""
+        return self.border is None and not any(self.distortion)
+
+    @property
+    def is_resampled(self) -> bool:
+        """Whether its image is made of that of another camera (see `draw_through` in neeco.raster.optics)."""
+        return self.learned_fx is not None or not self.is_pinhole
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view in an image of width x height px; pixel centres lie at +0.5, so scaling needs no offset."""
         across, down = width / self.width, height / self.height
+        border = self.border
         return replace(
             self,
+            border=None if border is None else (border[0] * across, border[1] * down, border[2] * across),
             fx=self.fx * across,
             fy=self.fy * down,
             cx=self.cx * across,

@@ -4,27 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from neeco.capture.lens import Lens
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.types import Rendering
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Every training frame's name, split, state and camera."""
+    """Every training frame's name, split, state and camera, and the lens through which all were recorded."""
 
     names: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
     states: tuple[State, ...] = ()
     cameras: tuple[Camera, ...] = ()
+    lens: Lens | None = None  # whose distortion is gone from the images; None: not known
+    scale: float = 1.0  # of the cameras' images, at which the scene was learned
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], instruments: tuple[Instrument, ...]) -> Recorded:
+    def of(
+        cls,
+        frames: Sequence[Frame],
+        instruments: tuple[Instrument, ...],
+        lens: Lens | None = None,
+        scale: float = 1.0,
+    ) -> Recorded:
         """What `frames` record of `instruments`: only these, and of each only the joints named."""
         states = []
         for frame in frames:
@@ -35,7 +44,16 @@ class Recorded:
                 chosen[instrument.name] = InstrumentState(given.pose, joints)
             states.append(State(chosen, frame.state.time))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
-        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames))
+        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens, scale)
+
+    def as_learned(self, camera: Camera) -> Camera:
+        """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs
+        that is nearest its own."""
+        if camera.learned_fx is not None:
+            return camera
+        focal = [self.scale * recorded.fx for recorded in self.cameras]
+        nearest = min(max(camera.fx, min(focal)), max(focal)) if focal else camera.fx
+        return camera if camera.fx == nearest else replace(camera, learned_fx=nearest)
 
 
 @dataclass(frozen=True)

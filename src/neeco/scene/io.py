@@ -13,6 +13,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neeco import __version__
+from neeco.capture.documents import Node, RaisingReport
+from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
@@ -116,6 +118,10 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
             )
         ],
     }
+    if recorded.lens is not None:
+        header["lens"] = recorded.lens.to_json()
+    if recorded.scale != 1:
+        header["scale"] = recorded.scale
     header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
     tensors, header = tensors | own_tensors, header | own_fields
@@ -166,7 +172,11 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, *map(_number, entry["intrinsics"])))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
-    return instruments, Recorded(names, splits, tuple(states), tuple(cameras))
+    lens = None if "lens" not in header else parse_lens(Node(header["lens"], "header", "lens", RaisingReport()))
+    scale = _number(header.get("scale", 1.0))
+    if not 0 < scale <= 1:
+        raise ValueError(f"its scale is {scale}, not a share of the images' size")
+    return instruments, Recorded(names, splits, tuple(states), tuple(cameras), lens, scale)
 
 
 def _number(value: Any) -> float:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import torch
 from scipy.ndimage import binary_opening, distance_transform_edt, uniform_filter
@@ -22,12 +23,15 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
-from neeco.labels.annotation import annotate
+from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
+from neeco.raster.lens import field_pinhole
+from neeco.raster.optics import resampled, supersampled
 from neeco.scene.scene import gaussian_scene
-from neeco.synthesis.dataset import DataSetFolder, check_output, description, with_image
-from neeco.synthesis.settings import MIN_TRUST, Format, Settings
+from neeco.synthesis.cameras import DrawnCameras
+from neeco.synthesis.dataset import DataSetFolder, check_formats, check_output, description, with_image
+from neeco.synthesis.settings import AS_RECORDED, MIN_TRUST, Format, ImageSettings, Settings
 from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
 if TYPE_CHECKING:
@@ -40,6 +44,7 @@ NOT_TRUSTED = "not trusted"
 BESIDE = 0.03  # of the image's diagonal: how far from the label a pixel is looked at that it may miss
 USUAL = 0.99  # share of the pixels of training frames that are explained as well
 HALF = 0.5  # of the error that the tissue alone would have: an instrument that explains more is there, if blurred
+NOT_RECORDED = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
 SMOOTH = 3  # px, side of the square over which a pixel's error is averaged
 
 
@@ -64,12 +69,14 @@ def annotate_capture(
     capture: Capture | None = None,
     min_trust: float = MIN_TRUST,
     formats: tuple[Format, ...] = ("coco", "yolo"),
+    images: ImageSettings = AS_RECORDED,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Annotated:
     """Label every frame of `capture`, a recording of the run's instruments over its tissue (None: the run's own), and
     write those that can be trusted as a data set: the recorded images with the labels that the scene draws at poses
-    fitted to them.
+    fitted to them. Both are resized and seen through the recording's lens as `images` ask for; what the recorded image
+    does not show of the lens's field, since undistorting left it out, is black and ignored.
 
     Frame k of the capture is image k of the data set, whichever are written. Interrupted (Ctrl-C) or failing, it keeps
     what is done, for `resume`. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError for
@@ -85,6 +92,10 @@ def annotate_capture(
     _check_instruments(scene, capture)
     settings = {"annotates": os.path.abspath(capture.root), "frames": len(capture.frames), "min_trust": min_trust}
     settings["captures_sha256"] = [fingerprint(recorded) for recorded in (capture, trained_on)]
+    check_formats(formats, images)
+    cameras = DrawnCameras.of(images, scene.recorded, (frame.camera for frame in capture.frames))
+    first = capture.frames[0].camera
+    settings |= images.image_identity(first.width, first.height)
     output = Path(output)
     info = description(run, settings)
     begun = check_output(output, info, resume)
@@ -92,7 +103,7 @@ def annotate_capture(
     with folder.being_written() as records:
         typical = typical_errors(scene, labeller, trained_on)
         info["usual_errors"] = asdict(typical)
-        annotator = _Annotator(scene, labeller, typical, min_trust, output)
+        annotator = _Annotator(scene, labeller, typical, min_trust, output, images, cameras)
         start: Tensor | None = None  # each fit starts from that of the frame before it in time
         in_time = sorted(range(len(capture.frames)), key=lambda k: capture.frames[k].state.time)
         for done, index in enumerate(in_time, 1):
@@ -117,6 +128,8 @@ class _Annotator:
     typical: TypicalErrors
     min_trust: float
     output: Path
+    images: ImageSettings
+    cameras: DrawnCameras
 
     def annotate(self, index: int, frame: Frame, start: Tensor | None) -> Record:
         """Write frame `index`, or that it is not trusted; `start`: a neighbour's increments."""
@@ -132,15 +145,55 @@ class _Annotator:
             "moved": pose_changes(frame, fit.state, fit.camera),
             "increments": fit.increments.tolist(),
         }
-        labels = annotate(self.scene, drawing, self.labeller.names)
         if trust.value < self.min_trust:
+            labels = annotate(self.scene, drawing, self.labeller.names)
             facts["labels"] = [label.to_json() for label in labels]
             return write_skipped(self.output, index, {NOT_TRUSTED: 1}, facts)
-        return write_sample(self.output, index, replace(drawing, image=image), labels, {}, facts)
+        drawing, missing = self._as_written(drawing, image)
+        labels = annotate(self.scene, drawing, self.labeller.names)
+        if missing is not None:
+            labels = [_without_keypoints_in(missing, label) for label in labels]
+        return write_sample(self.output, index, drawing, labels, {}, facts, self.images.jpeg_quality)
+
+    def _as_written(self, drawing: LayeredDrawing, image: Tensor) -> tuple[LayeredDrawing, Tensor | None]:
+        """The recorded `image` with the labels of `drawing`, as the images asked for, and where it shows nothing of a
+        lens's field, bool [H, W]."""
+        recorded = drawing.camera
+        wanted = self.cameras(recorded)
+        if wanted is recorded:
+            return replace(drawing, image=image), None
+        drawing = draw_layers(self.scene, self.labeller, drawing.state, wanted, Settings.min_component)
+        if wanted.is_pinhole:
+            method = cv2.INTER_AREA if wanted.width < recorded.width else cv2.INTER_CUBIC
+            pixels = cv2.resize(image.numpy(), (wanted.width, wanted.height), interpolation=method)
+            return replace(drawing, image=torch.from_numpy(pixels).clamp(0, 1)), None
+        fine = supersampled(drawing.camera)
+        field = field_pinhole(fine)
+        shown = resampled(torch.ones(field.height, field.width, 1), field, fine, wanted)[..., 0]
+        known = torch.cat([image, torch.ones_like(image[..., :1])], -1)
+        found = resampled(known, recorded, fine, wanted)
+        missing = found[..., 3] < shown - NOT_RECORDED
+        drawing = replace(
+            drawing,
+            image=found[..., :3],
+            parts=drawing.parts.masked_fill(missing, 0),
+            share=drawing.share.masked_fill(missing, 0.0),
+            unobserved=drawing.unobserved.masked_fill(missing, 1.0),
+        )
+        return drawing, missing
 
     def _fitted(self, frame: Frame, image: Tensor, start: Tensor | None) -> tuple[Fit, LayeredDrawing, Trust]:
         fit, drawing = fitted(self.scene, self.labeller, frame, image, start)
         return fit, drawing, estimate_trust(drawing, image, frame.load_mask(), self.typical)
+
+
+def _without_keypoints_in(missing: Tensor, label: InstrumentLabel) -> InstrumentLabel:
+    """The label without the keypoints in pixels that show nothing, bool [H, W]."""
+    keypoints = {
+        name: Keypoint(0.0, 0.0, OUTSIDE) if point.visibility and missing[int(point.y), int(point.x)] else point
+        for name, point in label.keypoints.items()
+    }
+    return replace(label, keypoints=keypoints)
 
 
 def fitted(

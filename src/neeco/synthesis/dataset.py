@@ -38,7 +38,7 @@ from neeco.synthesis.generator import (
 )
 from neeco.synthesis.preview import write_preview
 from neeco.synthesis.samplers import SIMILAR, states_fingerprint
-from neeco.synthesis.settings import Format, Settings
+from neeco.synthesis.settings import Format, ImageSettings, Settings
 from neeco.synthesis.workers import draw_in_processes, draw_on_cluster
 from neeco.synthesis.writers.bop import write_bop
 from neeco.synthesis.writers.coco import write_coco
@@ -112,7 +112,10 @@ def synthesize(
     runs = (run, *instrument_runs)
     scene, *instrument_scenes = (gaussian_scene(given.scene, VERB) for given in runs)
     effects = None if settings.camera_effects is None else read_effects(Path(settings.camera_effects)).to_json()
+    check_formats(formats, settings)
+    recorded = scene.recorded.cameras[0]
     identity = settings.identity() | {
+        **settings.image_identity(recorded.width, recorded.height),
         "states_sha256": states_fingerprint(settings.states),
         "similar_views": SIMILAR,
         "camera_effects": effects,
@@ -278,6 +281,12 @@ class DataSetFolder:
         }
         write_card(output, info)
         write_json(output / INFO, info)
+
+
+def check_formats(formats: Sequence[Format], settings: ImageSettings) -> None:
+    """Raises NeecoError for a format that cannot say what the images are."""
+    if settings.lens and "bop" in formats:
+        raise NeecoError("--formats: bop knows no distortion; leave out bop, or --lens")
 
 
 def part_ids(names: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:

@@ -35,6 +35,7 @@ from neeco.synthesis.camera_effects import (
     read_effects,
     subframes,
 )
+from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
 from neeco.synthesis.samplers import Sampler, make_sampler
 from neeco.synthesis.settings import Settings
@@ -123,11 +124,13 @@ class SampleGenerator:
     effects: CameraEffects | None = None
     motion: RecordedMotion | MixedMotion | None = None  # where effects open a shutter
     gains: tuple[tuple[float, float, float], ...] = ()  # by which the colours of each instrument scene were multiplied
+    cameras: DrawnCameras = RECORDED_CAMERAS
 
     @classmethod
     def of(cls, scene: Scene, settings: Settings, instrument_scenes: Sequence[Scene] = ()) -> SampleGenerator:
         """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `instrument_scenes`.
         Raises NeecoError where the scenes cannot give it."""
+        cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
         sampler: Sampler | MixedSampler
         groups: tuple[frozenset[str], ...] = ()
         gains: tuple[tuple[float, float, float], ...] = ()
@@ -152,7 +155,7 @@ class SampleGenerator:
         if settings.tissue_check and tolerance is None:
             tolerance = find_tolerance(scene, labeller)
         acceptance = Acceptance(settings.min_share, tolerance, settings.max_unobserved, groups)
-        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains)
+        return cls(scene, labeller, sampler, acceptance, settings, effects, motion, gains, cameras)
 
     def draw(self, index: int) -> LabelledSample:
         """Draw sample `index`.
@@ -173,6 +176,7 @@ class SampleGenerator:
         refused: Counter[str] = Counter()
         for _ in range(1 if self.sampler.fixed(index) else settings.max_attempts):
             state, camera = self.sampler(index, rng)
+            camera = self.cameras(camera)
             drawing = draw_layers(self.scene, self.labeller, state, camera, settings.min_component)
             if "field_of_view" in effects:
                 drawing = _within_circle(drawing, effects["field_of_view"])
@@ -248,7 +252,8 @@ def draw_to_folder(generator: SampleGenerator, output: Path, index: int) -> Reco
         if generator.sampler.prescribed:
             return write_skipped(output, index, error.refused)
         raise NeecoError(f"{output}: {error}") from None
-    return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts)
+    quality = generator.settings.jpeg_quality
+    return write_sample(output, index, sample.drawing, sample.labels, sample.refused, sample.facts, quality)
 
 
 def find_tolerance(scene: Scene, labeller: Labeller) -> float:

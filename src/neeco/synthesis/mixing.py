@@ -136,7 +136,7 @@ class Mixture:
             chosen.append(camera)
             states.append(State(placed, 0.0))
         names = tuple(f"{k:06d}" for k in range(count))
-        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen))
+        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen), self.tissue.recorded.lens)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import outline
 from neeco.files import write_atomically
 from neeco.labels.annotation import OCCLUDED, SKELETON
-from neeco.synthesis.writers.folder import Record
+from neeco.synthesis.writers.folder import Record, stem
 
 TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
 PART_COLORS = ("#4287f5", "#1cc8a0", "#ff7a45", "#d650c8", "#a0c83c", "#fac83c", "#786ef0", "#eb5569")
@@ -45,7 +45,7 @@ def draw_tile(root: Path, record: Record) -> Image.Image:
     """One image with its labels drawn over it, and a caption below."""
     with Image.open(root / record["image"]) as stored:
         pixels = np.asarray(stored.convert("RGB"), dtype=float)
-    with Image.open(root / record["image"].replace("images/", "parts/", 1)) as stored:
+    with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:
         parts = np.asarray(stored)
     scale = TILE_WIDTH / pixels.shape[1]
     size = (TILE_WIDTH, round(pixels.shape[0] * scale))

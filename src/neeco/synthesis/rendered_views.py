@@ -19,8 +19,10 @@ from neeco.evaluation.mask_folders import PARTS_FILE
 from neeco.files import write_json
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
+from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.dataset import part_ids
 from neeco.synthesis.samplers import moved_camera, states_file
+from neeco.synthesis.settings import AS_RECORDED, ImageSettings
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable
@@ -76,13 +78,18 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
 
 
 def render(
-    scene: Drawable, views: Sequence[View], folder: Path, on_progress: Callable[[int], None] = lambda done: None
+    scene: Drawable,
+    views: Sequence[View],
+    folder: Path,
+    on_progress: Callable[[int], None] = lambda done: None,
+    images: ImageSettings = AS_RECORDED,
 ) -> Rendered:
-    """Write NAME.png, NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json: what the ids
-    mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
+    """Write NAME.png (or .jpg), NAME_parts.png (part ids) and NAME_mask.png (0/255) for every view, and parts.json:
+    what the ids mean. How many threads torch takes is the caller's to set (`open_run`). Raises NeecoError."""
+    cameras = DrawnCameras.of(images, scene.recorded, (view.camera for view in views))
     for done, view in enumerate(views, 1):
-        drawing = draw(scene, view.state, view.camera)
-        write_image(folder / f"{view.name}.png", drawing.image)
+        drawing = draw(scene, view.state, cameras(view.camera))
+        write_image(folder / f"{view.name}.{images.image_format}", drawing.image, images.jpeg_quality)
         if drawing.parts is not None:
             write_labels(folder / f"{view.name}_parts.png", drawing.parts)
             write_labels(folder / f"{view.name}_mask.png", (drawing.parts > 0).to(torch.uint8) * 255)

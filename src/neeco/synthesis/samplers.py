@@ -23,6 +23,7 @@ from neeco.files import read_bytes
 from neeco.labels.annotation import any_in_image, working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
+from neeco.raster.lens import rays_of_pixels
 from neeco.raster.types import Camera
 from neeco.synthesis.settings import PATH_PREFIX, SAMPLERS, Views
 from neeco.synthesis.states import (
@@ -232,9 +233,12 @@ def surface_points(depth: np.ndarray, camera: Camera, step: int = 4) -> np.ndarr
     """World points [P, 3] mm under every `step`-th pixel of a depth image [H, W] mm; pixels of depth 0 give none."""
     rows, columns = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
     z = depth[rows, columns]
-    points = np.stack(
-        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z, np.ones_like(z)], -1
-    )[z > 0]
+    if camera.is_pinhole:
+        across, down = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    else:
+        pixels = np.stack([columns + 0.5, rows + 0.5], -1)
+        across, down = rays_of_pixels(pixels.reshape(-1, 2), camera).reshape(pixels.shape).transpose(2, 0, 1)
+    points = np.stack([across * z, down * z, z, np.ones_like(z)], -1)[z > 0]
     return (points @ to_numpy(camera.world_from_camera).T)[:, :3]
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal
 
 from neeco.errors import NeecoError
@@ -13,14 +15,96 @@ LabelWay = Literal["composited", "threshold"]
 Format = Literal["coco", "yolo", "webdataset", "bop", "imagefolder"]
 Views = Literal["recorded", "perturbed", "orbit"]
 PATH_PREFIX = "path:"
+SIZE = re.compile(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}")
 SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside a file
 RENAMED_SAMPLERS = {"inside": "interpolate", "beyond": "extrapolate"}
+
+MAX_PIXELS = 2**26  # of an image
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
 
+ImageFormat = Literal["png", "jpg"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizeSettings:
+    """How large the images are to be."""
+
+    size: str | None = None
+    """WIDTHxHEIGHT of the images, px, in the shape of the recorded ones; theirs when not given."""
+    scale: float | None = None
+    """Instead of --size: times the recorded width and height."""
+
+    def check(self) -> None:
+        """Raises NeecoError naming the option that makes no sense."""
+        if self.size is not None and self.scale is not None:
+            raise NeecoError("--size: given with --scale; give one of the two")
+        if self.size is not None and not SIZE.fullmatch(self.size):
+            raise NeecoError(f"--size: {self.size!r} is not WIDTHxHEIGHT; give both in px, such as 640x512")
+        if self.scale is not None and not (0 < self.scale < math.inf):
+            raise NeecoError(f"--scale: {self.scale} enlarges nothing; give a number above 0, such as 2")
+
+    def of(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height, px, of images that were recorded `width` x `height` px large. Raises NeecoError where these
+        have another shape than the size asked for, or no image can be so large."""
+        found = width, height
+        if self.scale is not None:
+            scale = min(self.scale, MAX_PIXELS)
+            found = max(1, round(width * scale)), max(1, round(height * scale))
+        elif self.size is not None:
+            wide, high = (int(side) for side in self.size.lower().split("x"))
+            fitting = (wide, max(1, round(wide * height / width))), (max(1, round(high * width / height)), high)
+            if (wide, high) not in fitting:
+                others = " or ".join(f"{across}x{down}" for across, down in fitting)
+                raise NeecoError(
+                    f"--size: {self.size} is another shape than the recorded {width}x{height}; give {others}"
+                )
+            found = wide, high
+        if found[0] * found[1] > MAX_PIXELS:
+            option = "--size" if self.scale is None else "--scale"
+            raise NeecoError(f"{option}: {found[0]}x{found[1]} is more than {MAX_PIXELS:,} pixels; give less")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSettings(SizeSettings):
+    """How images are drawn and stored, whatever they show."""
+
+    lens: bool = False
+    """Draw with the recording's own distortion and round border, labels too; else undistorted."""
+    image_format: ImageFormat = "png"
+    """Of the images; labels and depth are PNG always."""
+    quality: int = 95
+    """Of JPEG images, 1 to 100."""
+
+    def check(self) -> None:
+        """Raises NeecoError naming the option that makes no sense."""
+        super().check()
+        if not 1 <= self.quality <= 100:
+            raise NeecoError(f"--quality: {self.quality} is none of JPEG; give 1 to 100")
+
+    @property
+    def jpeg_quality(self) -> int | None:
+        """None: PNG."""
+        return self.quality if self.image_format == "jpg" else None
+
+    def image_identity(self, width: int, height: int) -> dict[str, Any]:
+        """Of images recorded `width` x `height` px large, what must stay the same for a data set to be continued: None
+        where it is as versions made them that could do nothing else."""
+        size = self.of(width, height)
+        return {
+            "size": None if size == (width, height) else "x".join(map(str, size)),
+            "lens": self.lens or None,
+            "quality": self.jpeg_quality,
+        }
+
+
+RECORDED_SIZE, AS_RECORDED = SizeSettings(), ImageSettings()
+
+
 @dataclass(frozen=True)
-class Settings:
+class Settings(ImageSettings):
     """What decides the pixels and labels of a data set, apart from the scene. Every field goes into dataset.json."""
 
     renamed: ClassVar[Mapping[str, str]] = {
@@ -68,6 +152,7 @@ class Settings:
 
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
+        super().check()
         if self.count < 1:
             raise NeecoError(f"--count: {self.count} images is nothing to make; give at least 1")
         if self.seed < 0:
@@ -84,9 +169,12 @@ class Settings:
             raise NeecoError(f"--min-component: {self.min_component} is not a share; give 0 or more and less than 1")
 
     def identity(self) -> dict[str, Any]:
-        """What must stay the same for a data set to be continued: all but the count, unless a path spreads over it."""
+        """What must stay the same for a data set to be continued: all but the count, unless a path spreads over it, and
+        beside `image_identity`."""
         values = asdict(self)
         del values["max_attempts"]  # more of them change no image that was made
+        for field in fields(ImageSettings):
+            del values[field.name]
         if not self.states.startswith(PATH_PREFIX):
             del values["count"]
         if self.delta_thresholds is not None:

@@ -38,7 +38,9 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.images import open_image, read_image, read_labels
+from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_json, require_inside, require_like
@@ -64,7 +66,7 @@ STACKED = ("image", "parts", "depth", "ignore")  # of one shape in a batch; the 
 RANDOM = ("interpolate", "extrapolate")  # samplers that draw anew what is refused
 MAX_REFUSED = 1000  # given states refused in a row, before a stream ends with an error
 ASKED_BY = "LabelledImages"  # in error messages
-READ = ("images", "parts", "ignore", "depth")  # folders of the files that a sample is made of
+READ = ("parts", "ignore", "depth")  # folders of the files that a sample is made of beside its image
 REMEDY = "give a folder that `neeco synthesize` wrote"
 INFO_LIKE = {
     "ids": [{"id": int, "part": str}],
@@ -156,8 +158,8 @@ class LabelledImages(_Generated, Dataset[Sample]):
     scene: a run (`neeco.load`), its folder, a scene, or its file. instruments: runs or scenes whose instruments are
     drawn over the scene's tissue, instead of its own. states: interpolate, extrapolate, grid, path:FILE.jsonl or
     FILE.jsonl; views: recorded, perturbed or orbit; labels: composited or threshold; camera_effects: a YAML file;
-    `settings`: any other field of `neeco.synthesis.settings.Settings`. transform: sample -> sample, such as an
-    augmentation. Samples are described in this module's docstring.
+    `settings`: any other field of `neeco.synthesis.settings.Settings`, such as size="1280x1024", scale=2.0 or
+    lens=True. transform: sample -> sample, such as an augmentation. Samples are described in this module's docstring.
 
     Sample `index` is what `neeco synthesize` draws as image `index` for the same settings and seed, before its pixels
     are rounded to 8 bits (depth: to 0.05 mm); it is the same in any worker of any DataLoader, forked or spawned. A
@@ -286,9 +288,10 @@ class StoredImages(Dataset[Sample]):
         record = self._records[index]
         name, size = f"{stem(record['index'])}.png", (record["width"], record["height"])
         files = {folder: require_inside(self.folder / folder / name, self.folder) for folder in READ}
+        image = require_inside(self.folder / record["image"], self.folder)
         depth = np.asarray(open_image(files["depth"], size), np.float32) * np.float32(self._mm_per_count)
         labelled = LabelledImage.of(
-            read_image(files["images"], size),
+            read_image(image, size),
             torch.from_numpy(depth),
             read_labels(files["parts"], size),
             read_labels(files["ignore"], size) == self._ignored,
@@ -299,9 +302,13 @@ class StoredImages(Dataset[Sample]):
         state = State(
             {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]}, record["time"]
         )
-        lens = record["intrinsics"]
         world_from_camera = torch.from_numpy(swap_camera_axes(np.array(record["camera"], np.float64)))
-        camera = Camera(world_from_camera, lens["fl_x"], lens["fl_y"], lens["cx"], lens["cy"], *size)
+        place = Node(
+            {"w": size[0], "h": size[1]} | record["intrinsics"], str(self.folder / "states.jsonl"), "", RaisingReport()
+        )
+        lens = parse_lens(place)
+        assert lens is not None
+        camera = lens.before(Camera(world_from_camera, *lens.intrinsics, *size))
         found = labelled.targets() | {"state": state, "camera": camera, "index": record["index"]}
         return found if self.transform is None else self.transform(found)
 

@@ -262,7 +262,7 @@ def _draw_remotely(packed: PackedSpec, indices: tuple[int, ...]) -> list[tuple[R
                 draw_to_folder(generator, Path(folder), index)
                 record = load_record(Path(folder), index)
                 assert record is not None
-                names = [record_path(Path(), index).as_posix(), *(() if record.get("skipped") else files_of(index))]
+                names = [record_path(Path(), index).as_posix(), *(() if record.get("skipped") else files_of(record))]
                 samples.append((record, {name: (Path(folder) / name).read_bytes() for name in names}))
             return samples
     except NeecoError as error:

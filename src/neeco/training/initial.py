@@ -74,7 +74,8 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
         Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
         for i in capture.instruments
     )
-    recorded = Recorded.of(capture.split("train"), instruments)  # at their recorded size, whatever is learned from
+    # at their recorded size, whatever is learned from
+    recorded = Recorded.of(capture.split("train"), instruments, capture.lens, config.scale)
     positions, colors = _thinned_points(capture, frames, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)

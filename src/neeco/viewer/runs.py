@@ -143,12 +143,14 @@ class WatchedRun:
         frames = () if capture is None else capture.frames
         known = scene.recorded if capture is None else Recorded.of(frames, scene.instruments)
         order = np.argsort([state.time for state in known.states], kind="stable")
-        columns = (known.names, known.splits, known.states, known.cameras)
+        names, splits, states, cameras = (
+            tuple(column[k] for k in order) for column in (known.names, known.splits, known.states, known.cameras)
+        )
         return LoadedRun(
             name=self.path.resolve().name,
             world=str(config["capture"]),
             scene=scene,
-            recorded=Recorded(*(tuple(column[k] for k in order) for column in columns)),
+            recorded=Recorded(names, splits, states, cameras),
             frames=tuple(frames[k] for k in order) if frames else (),
             capture=capture,
             shafts=shafts_of(scene),

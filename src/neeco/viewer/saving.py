@@ -17,8 +17,9 @@ from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers, to_numpy
 from neeco.labels.labellers import CompositedLabels
 from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.cameras import DrawnCameras
 from neeco.synthesis.samplers import moved_camera
-from neeco.synthesis.settings import Settings
+from neeco.synthesis.settings import RECORDED_SIZE, Settings, SizeSettings
 from neeco.synthesis.writers.folder import load_record, record_path, write_sample
 
 if TYPE_CHECKING:
@@ -29,9 +30,10 @@ STATES, SAMPLES = "states.jsonl", "samples"
 
 
 class SavedStates:
-    """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it."""
+    """Writes into one run's folder `kept/`, whoever of several users asks. Any thread may call it. size: of images."""
 
-    def __init__(self, run: Path) -> None:
+    def __init__(self, run: Path, size: SizeSettings = RECORDED_SIZE) -> None:
+        self.size = size
         self.folder = Path(run) / FOLDER
         self._lock = threading.Lock()
 
@@ -59,11 +61,11 @@ class SavedStates:
         return read_states(self.states_path, loaded.scene.instruments)
 
     def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
-        """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics and size; returns the
-        image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
+        """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics, as large as was asked;
+        returns the image's path. Raises NeecoError for a scene without labels, and where it cannot be written."""
         scene = gaussian_scene(loaded.scene, "save labelled image")
         labeller = CompositedLabels(scene)
-        camera = moved_camera(loaded.recorded.cameras[0], world_from_camera)
+        camera = DrawnCameras(self.size)(moved_camera(loaded.recorded.cameras[0], world_from_camera))
         with scene.torch_threads(), torch.no_grad():
             drawing = draw_layers(scene, labeller, state, camera, Settings.min_component)
             labels = annotate(scene, drawing, labeller.names)

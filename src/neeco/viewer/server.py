@@ -21,6 +21,7 @@ import torch
 
 from neeco.errors import NeecoError
 from neeco.labels.drawing import to_numpy
+from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
 from neeco.viewer.runs import ViewedRuns
 from neeco.viewer.saving import SavedStates
@@ -45,14 +46,23 @@ class ViewerServer:
     """A running server; `address` is what to open. Use as a context manager, or call `stop`."""
 
     def __init__(
-        self, runs: Sequence[Path], host: str = HOST, port: int = PORT, device: torch.device | None = None
+        self,
+        runs: Sequence[Path],
+        host: str = HOST,
+        port: int = PORT,
+        device: torch.device | None = None,
+        size: SizeSettings = RECORDED_SIZE,
     ) -> None:
-        """One run, or two to compare. port: or the next that is free. Raises NeecoError."""
+        """One run, or two to compare. port: or the next that is free. size: of saved images, and sharp pictures are as
+        high. Raises NeecoError."""
         if not 1 <= len(runs) <= MAX_RUNS:
             raise NeecoError(f"view: {len(runs)} runs given; give one, or two to compare")
         require_viser()
         self.runs = ViewedRuns(runs, device)
-        self.saved = SavedStates(runs[0])
+        camera = self.runs.loaded[0].recorded.cameras[0]
+        height = size.of(camera.width, camera.height)[1]
+        self._sharp_px = None if size == RECORDED_SIZE else height
+        self.saved = SavedStates(runs[0], size)
         self.render_thread = RenderThread(self.runs.advance_timelines)
         port = free_port(host, port)
         self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
@@ -98,7 +108,8 @@ class ViewerServer:
         def connected() -> bool:
             return client.client_id in self._server.get_clients()
 
-        self.render_thread.add(ClientSession(client, self.runs, self.saved, self.render_thread, connected))
+        session = ClientSession(client, self.runs, self.saved, self.render_thread, connected, self._sharp_px)
+        self.render_thread.add(session)
 
 
 def require_viser() -> None:

@@ -41,14 +41,18 @@ log = logging.getLogger(__name__)
 
 
 class AdaptiveResolution:
-    """Chooses heights of renderings so that they come in time, from what the last ones took."""
+    """Chooses heights of renderings so that they come in time, from what the last ones took. sharp_px: how high sharp
+    ones are whatever they take; None: as the constants say."""
 
-    def __init__(self) -> None:
+    def __init__(self, sharp_px: int | None = None) -> None:
+        self._sharp_px = sharp_px
         self._per_pixel: deque[float] = deque(maxlen=REMEMBERED)  # s
 
     def height(self, sharp: bool, window: int, aspect: float) -> int:
         """How many px high to render: as the constants say and the window shows, fewer where that would take too long.
         aspect: width of all that is rendered by its height."""
+        if sharp and self._sharp_px is not None:
+            return max(MIN_PX, min(self._sharp_px, window))
         most, seconds = (SHARP_PX, SHARP_S) if sharp else (MOVING_PX, MOVING_S)
         most = max(MIN_PX, min(most, window))
         if not self._per_pixel:
@@ -177,8 +181,8 @@ class RenderThread:
 class ClientSession:
     """One browser: its panel, what is drawn over its picture, its picture.
 
-    Made when the browser connects. `render` and `tick` belong to the render thread, the rest to any. connected: is it
-    still there?
+    Made when the browser connects. sharp_px: height of sharp pictures, where a user asked for one. `render` and `tick`
+    belong to the render thread, the rest to any. connected: is it still there?
     """
 
     def __init__(
@@ -188,11 +192,12 @@ class ClientSession:
         saved: SavedStates,
         thread: RenderThread,
         connected: Callable[[], bool],
+        sharp_px: int | None = None,
     ) -> None:
         self.key = client.client_id
         self.status_at = 0.0  # time.perf_counter() of the last status; 0: no picture was sent yet
         self._client, self._runs, self._saved, self._thread, self._connected = client, runs, saved, thread, connected
-        self._resolution = AdaptiveResolution()
+        self._resolution = AdaptiveResolution(sharp_px)
         self._saving = False
         self._played_at: float | None = None
         self._shape = 0.0  # of a run's part of the window, width by height

@@ -185,6 +185,9 @@ def scored(shown: RunPicture) -> RunPicture:
 
 
 def _rendering(scene: Drawable, state: State, camera: Camera, view: str, labels: Tensor | None) -> Rendering:
+    learned = scene.recorded.as_learned(camera)
+    if learned.learned_fx is not None and camera.fx > learned.learned_fx:  # averaging smaller ones would take too long
+        camera = learned
     if view in LABELLED and labels is None:
         return scene.render(state, camera, labels=True)
     if view not in (*LABELLED, UNOBSERVED):

@@ -26,6 +26,7 @@ import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -34,6 +35,7 @@ from torch import Tensor, nn
 from neeco.capture.model import Camera, Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
+from neeco.raster.optics import draw_through
 from neeco.raster.types import Rendering
 from neeco.scene.deformations.base import octave_angles
 from neeco.scene.drawable import Recorded
@@ -422,6 +424,9 @@ class NerfScene(nn.Module):
     @torch.no_grad()
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """The image at `state.time`, `settings.chunk` rays at once, without gradients. The field has no labels."""
+        if camera.is_resampled:
+            plain = partial(dataclasses.replace, learned_fx=None)
+            return draw_through(camera, lambda pinhole: self.render(state, plain(pinhole)))
         rays = camera_rays(camera, state.time, self.bounds.device)
         parts = []
         for start in range(0, len(rays), self.settings.chunk):

@@ -37,7 +37,7 @@ def write_bop(root: Path, records: Sequence[Record], names: Sequence[tuple[str, 
             if record["split"] != split:
                 continue
             name, key = stem(record["index"]), str(record["index"])
-            link(root / record["image"], folder / "rgb" / f"{name}.png")
+            link(root / record["image"], folder / "rgb" / Path(record["image"]).name)
             link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
             cameras[key] = _camera(record)
             poses[key] = [_pose(label, instruments.index(label["name"]) + 1) for label in record["labels"]]

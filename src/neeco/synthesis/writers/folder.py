@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from neeco.capture.images import write_image, write_labels, write_png
+from neeco.capture.lens import Lens
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.errors import NeecoError
 from neeco.files import read_text, require_like, write_atomically, write_text
@@ -31,11 +32,12 @@ SHARE_PER_COUNT = 1 / 255
 IGNORED = 255
 RECORDS = ".records"
 CHECKSUM = "sha256"  # of the rest of a record
-PIXELS = ("images", "masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
+LABELS = ("masks", "soft", "ignore", "parts", "depth", "silhouettes")  # folders with a PNG of every image
 MAX_INSTRUMENTS = 8  # in `silhouettes`, whose bit k is set where instrument k would be seen if nothing else were there
-FOLDERS = (*PIXELS, RECORDS)
+FOLDERS = ("images", *LABELS, RECORDS)
 PUBLIC = {  # what every line of states.jsonl holds, among others
     "index": int,
+    "image": str,
     "split": str,
     "width": int,
     "height": int,
@@ -60,14 +62,16 @@ def write_sample(
     labels: list[InstrumentLabel],
     refused: Mapping[str, int],
     facts: Mapping[str, Any] = MappingProxyType({}),
+    quality: int | None = None,
 ) -> Record:
-    """Write one image with all that its pixels say, then its record, to which `facts` are added; returns the record.
-    Raises NeecoError."""
+    """Write one image, as JPEG of `quality` or as PNG, with all that its pixels say, then its record, to which `facts`
+    are added; returns the record. Raises NeecoError."""
     name = f"{stem(index)}.png"
     silhouettes = np.zeros(drawing.depth.shape, np.uint8)
     for k, layer in enumerate(list(drawing.layers.values())[:MAX_INSTRUMENTS]):
         silhouettes |= layer.mask.astype(np.uint8) << k
-    write_image(root / "images" / name, drawing.image)
+    image = f"images/{stem(index)}{'.png' if quality is None else '.jpg'}"
+    write_image(root / image, drawing.image, quality)
     write_labels(root / "masks" / name, (drawing.parts > 0).to(torch.uint8) * 255)
     write_labels(root / "soft" / name, (drawing.share / SHARE_PER_COUNT).round().to(torch.uint8))
     write_labels(root / "ignore" / name, drawing.ignored.to(torch.uint8) * IGNORED)
@@ -77,19 +81,19 @@ def write_sample(
     camera = drawing.camera
     record = {
         "index": index,
-        "image": f"images/{name}",
+        "image": image,
         "split": "val" if index % VALIDATION_EVERY == VALIDATION_EVERY - 1 else "train",
         "width": camera.width,
         "height": camera.height,
         **state_to_json(drawing.state),
         "camera": camera_to_json(to_numpy(camera.world_from_camera)),
-        "intrinsics": {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        "intrinsics": Lens.of(camera).intrinsics_json(),
         "made_up": round(float(drawing.unobserved.mean()), 4),
         "labels": [label.to_json() for label in labels],
         **facts,
         "refused": dict(sorted(refused.items())),
-        "files": {file: (root / file).stat().st_size for file in files_of(index)},
     }
+    record["files"] = {file: (root / file).stat().st_size for file in files_of(record)}
     _write_record(root, record)
     return record
 
@@ -125,7 +129,7 @@ def load_record(root: Path, index: int) -> Record | None:
         record = json.loads(read_text(record_path(root, index), "the record of an image"))
         if record.pop(CHECKSUM, None) != _digest(record):
             return None
-        files = () if record.get("skipped") else files_of(index)
+        files = () if record.get("skipped") else files_of(record)
         sizes = {name: (root / name).stat().st_size for name in files}
     except (NeecoError, OSError, ValueError, AttributeError, TypeError, RecursionError):
         return None
@@ -146,9 +150,9 @@ def link(source: Path, target: Path) -> None:
         write_atomically(target, lambda temporary: temporary.write_bytes(source.read_bytes()))
 
 
-def files_of(index: int) -> list[str]:
-    """The files of image `index` beside its record, relative to the data set."""
-    return [f"{folder}/{stem(index)}.png" for folder in PIXELS]
+def files_of(record: Record) -> list[str]:
+    """The files of an image beside its record, relative to the data set."""
+    return [record["image"], *(f"{folder}/{stem(record['index'])}.png" for folder in LABELS)]
 
 
 def write_states(root: Path, records: list[Record]) -> None:

@@ -3,8 +3,8 @@
 README.md                                    the card: YAML front matter (Hugging Face's), then how the set was made
 imagefolder/{train,validation}/metadata.jsonl beside the images and their masks:
                                              datasets.load_dataset("imagefolder", data_dir="DATASET/imagefolder")
-webdataset/{train,val}-NNNNNN.tar            samples read in a row, a sample's files with its number as key: .png
-                                             (image), .mask.png, .parts.png, .ignore.png, .depth.png and .json
+webdataset/{train,val}-NNNNNN.tar            samples read in a row, a sample's files with its number as key: .png or
+                                             .jpg (image), .mask.png, .parts.png, .ignore.png, .depth.png and .json
                                              (its record: state, camera, labels)
 """
 
@@ -23,13 +23,13 @@ from typing import Any
 import yaml
 
 from neeco.files import write_atomically, write_text
-from neeco.synthesis.settings import Settings
+from neeco.synthesis.settings import ImageSettings, Settings
 from neeco.synthesis.writers.folder import Record, link, public_record, stem
 
 IMAGEFOLDER, WEBDATASET = "imagefolder", "webdataset"
 SPLITS = {"train": "train", "val": "validation"}  # ours, and what the hub calls them
 SHARD_SIZE = 1000  # samples in a tar file
-SHARDED = {"images": "png", "masks": "mask.png", "parts": "parts.png", "ignore": "ignore.png", "depth": "depth.png"}
+SHARDED = {"masks": "mask.png", "parts": "parts.png", "ignore": "ignore.png", "depth": "depth.png"}
 
 CARD = "README.md"
 MARK = "<!-- Written by neeco, which writes it anew with --resume. Remove this line to keep your own text. -->"
@@ -98,7 +98,11 @@ def write_card(root: Path, info: Mapping[str, Any]) -> None:
         return
     annotated = "annotates" in info["settings"]
     title = f"{'Recorded' if annotated else 'Synthetic'} images of surgical instruments, labelled"
-    config: dict[str, Any] = {"config_name": "default", "data_files": "images/*.png"}  # what the hub's viewer shows
+    suffix = "png" if info["settings"].get("quality") is None else "jpg"
+    config: dict[str, Any] = {
+        "config_name": "default",
+        "data_files": f"images/*.{suffix}",
+    }  # what the hub's viewer shows
     if IMAGEFOLDER in info["formats"]:
         config = {"config_name": "default", "data_dir": IMAGEFOLDER}
     elif WEBDATASET in info["formats"]:
@@ -139,9 +143,13 @@ def _command(info: Mapping[str, Any]) -> str:
     else:
         words = ["synthesize", info["scene"]]
     given = {"count": info["images"] + len(info["skipped"])} | settings
-    for field in fields(Settings) if "seed" in settings else ():
-        value, flag = given.get(field.name, field.default), f"--{field.name.replace('_', '-')}"
-        if value is False:
+    given |= {"image_format": "png" if given.get("quality") is None else "jpg"}
+    for field in fields(Settings if "seed" in settings else ImageSettings):
+        value, flag = given.get(field.name), f"--{field.name.replace('_', '-')}"
+        value = field.default if value is None else value
+        if value is True and field.name == "lens":
+            words.append(flag)
+        elif value is False and field.default is True:
             words.append(f"--no-{flag[2:]}")
         elif value != field.default or field.name == "seed":
             words += [flag, *(value if isinstance(value, list) else ["FILE"] if isinstance(value, dict) else [value])]
@@ -155,11 +163,12 @@ def write_imagefolder(root: Path, records: Sequence[Record], instruments: Sequen
     lines: dict[str, list[str]] = {}
     for record in records:
         split, name = SPLITS[record["split"]], stem(record["index"])
-        link(root / record["image"], root / IMAGEFOLDER / split / f"{name}.png")
+        image = Path(record["image"]).name
+        link(root / record["image"], root / IMAGEFOLDER / split / image)
         link(root / "masks" / f"{name}.png", root / IMAGEFOLDER / split / f"{name}_mask.png")
         seen = [label for label in record["labels"] if label["area"] > 0]
         line = {
-            "file_name": f"{name}.png",
+            "file_name": image,
             "mask_file_name": f"{name}_mask.png",
             "objects": {
                 "bbox": [label["box"] for label in seen],
@@ -188,7 +197,9 @@ def _write_shard(root: Path, records: Sequence[Record], path: Path) -> None:
     with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as tar:
         for record in records:
             key = stem(record["index"])
-            contents = {ending: (root / folder / f"{key}.png").read_bytes() for folder, ending in SHARDED.items()}
+            image = root / record["image"]
+            contents = {image.suffix[1:]: image.read_bytes()}
+            contents |= {ending: (root / folder / f"{key}.png").read_bytes() for folder, ending in SHARDED.items()}
             contents["json"] = json.dumps(public_record(record), allow_nan=False).encode()
             for ending, content in contents.items():
                 entry = tarfile.TarInfo(f"{key}.{ending}")  # dated 1970 and nobody's: bytes depend on content alone

@@ -92,7 +92,7 @@ def _write_variant(
             if label["area"] > 0
         ]
         write_text(folder / "labels" / split / f"{name}.txt", "".join(f"{line}\n" for line in lines))
-        link(root / record["image"], folder / "images" / split / f"{name}.png")
+        link(root / record["image"], folder / "images" / split / Path(record["image"]).name)
     has_validation = any(record["split"] == "val" for record in records)
     # without "path", tools take the folder of data.yaml itself, wherever the data set is moved
     data = {

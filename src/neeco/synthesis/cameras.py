@@ -1,0 +1,45 @@
+"""The cameras that images are drawn with: the recorded ones, of the size asked for, through the recording's lens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from neeco.capture.lens import Lens
+from neeco.errors import NeecoError
+from neeco.raster.types import Camera
+from neeco.scene.drawable import Recorded
+from neeco.synthesis.settings import RECORDED_SIZE, ImageSettings, SizeSettings
+
+
+@dataclass(frozen=True)
+class DrawnCameras:
+    """Makes of a camera with recorded intrinsics the one that is drawn with. `lens`: the recording's, where it is to be
+    seen."""
+
+    size: SizeSettings
+    lens: Lens | None = None
+
+    @classmethod
+    def of(cls, images: ImageSettings, recorded: Recorded, cameras: Iterable[Camera]) -> DrawnCameras:
+        """What `images` ask for. Raises NeecoError where they make no sense, the recording tells of no lens, or what
+        one of `cameras` recorded has another shape."""
+        images.check()
+        if images.lens and recorded.lens is None:
+            raise NeecoError(
+                "--lens: the scene's capture does not tell of its lens; ingest the recording again and train on it, or "
+                "leave --lens out"
+            )
+        found = cls(images, recorded.lens if images.lens else None)
+        for camera in cameras:
+            found(camera)
+        return found
+
+    def __call__(self, camera: Camera) -> Camera:
+        """The camera in the place of `camera`, a pinhole."""
+        seen = camera if self.lens is None else self.lens.before(camera)
+        size = self.size.of(seen.width, seen.height)
+        return seen if size == (seen.width, seen.height) else seen.resized(*size)
+
+
+RECORDED_CAMERAS = DrawnCameras(RECORDED_SIZE)
