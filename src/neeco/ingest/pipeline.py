@@ -46,6 +46,7 @@ class IngestResult:
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
+    search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""
@@ -75,6 +76,7 @@ class IngestResult:
             "points": self.points,
             "split_rule": self.split_rule,
             "notes": list(self.notes),
+            "search": list(self.search),
         }
 
 
@@ -109,24 +111,26 @@ class _Ingest:
         self.names = [f"{frame:06d}.png" for frame in self.selected]
         self._write_images()
         (folder / "sfm").mkdir()
+        self.border = self._find_border()
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
-            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.pinhole, self.visible, self.settings
-        )
+            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.size, self.pinhole, self.visible,
+            self.settings,
+        )  # fmt: skip
 
     def run(self, output: Path) -> IngestResult:
         """Find cameras, registration and states, and write the capture."""
         sfm = self.motion.reconstruct(self.progress)
         if self.pinhole is None:
-            fl_x, fl_y, cx, cy, *distortion = (float(value) for value in sfm.camera_params)
-            self.lens = Lens(fl_x, fl_y, cx, cy, tuple(distortion))
-            self.pinhole = self.lens.pinhole(self.size)
+            assert sfm.lens is not None
+            self.lens, self.pinhole = sfm.lens, sfm.lens.pinhole(self.size)
             self.data.note(
-                f"intrinsics were estimated by structure from motion (focal lengths {fl_x:.1f} x {fl_y:.1f} "
-                "px); a calibration is better"
+                f"intrinsics were estimated by structure from motion (focal length {self.lens.fl_x:.1f} px, radial "
+                f"distortion {self.lens.distortion[0]:.3f}); a calibration is better"
             )
             self._write_images()
+            self._write_visible()
         registration = self._register(sfm)
         self._find_instrument_clocks(sfm, self.pinhole)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
@@ -185,22 +189,26 @@ class _Ingest:
             straight = self.lens.undistort(image) if self.lens else image
             write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
 
-    def _write_visible(self) -> Path | None:
-        """Masks of the endoscope's dark border, one file per frame as SfM wants them; None without a border."""
+    def _find_border(self) -> np.ndarray | None:
+        """bool [H, W], False on the endoscope's dark border in the images as recorded; None without one."""
         count = len(self.names)
         sample = self.selected[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
         seen = visible_mask(image for _, image in self.data.video.read(np.unique(sample).tolist()))
-        if seen is None:
+        if seen is not None:
+            self.data.note(f"the endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked")
+        return seen
+
+    def _write_visible(self) -> Path | None:
+        """Masks of the border, one file per frame as SfM wants them, undistorted as the images are; None without."""
+        if self.border is None:
             return None
-        if self.lens is not None:
-            seen = self.lens.undistort_mask(seen)
+        seen = self.border if self.lens is None else self.lens.undistort_mask(self.border)
         folder = self.folder / "visible"
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         first, *others = (folder / f"{name}.png" for name in self.names)
         write_labels(first, torch.from_numpy(seen.astype(np.uint8) * 255))
         for other in others:
             shutil.copyfile(first, other)
-        self.data.note(f"the endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked")
         return folder
 
     def _times(self, sfm: SfmResult) -> np.ndarray:
@@ -340,6 +348,7 @@ class _Ingest:
             shapes,
             rule,
             tuple(data.notes),
+            self.motion.search,
         )
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:
