@@ -167,9 +167,10 @@ class Recorded:
         cameras[:, :3, 3] = self.scale * cameras[:, :3, 3] @ turned.T + [1.0, 2.0, -3.0]
         points = self.scale * self.points @ turned.T + [1.0, 2.0, -3.0]
         count = len(points)
+        lens = None if params else Lens(fl_x, fl_y, cx, cy, (0.0,) * 4)
         return SfmResult(
             indices, cameras, points, np.full((count, 3), 120, dtype=np.uint8), np.full(count, 0.5), np.full(count, 9),
-            np.array(seen, dtype=np.float64).reshape(-1, 5), None if params else Lens(fl_x, fl_y, cx, cy, (0.0,) * 4), 0.4,
+            np.array(seen, dtype=np.float64).reshape(-1, 5), lens, 0.4,
         )  # fmt: skip
 
 
@@ -187,9 +188,7 @@ def recorded(tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch) -> Rec
     made = Recorded(World(tmp_path / "rec"))
     made.write()
 
-    def run(
-        self: StructureFromMotion, job: dict[str, Any], progress: StageProgress, best: Attempt | None
-    ) -> SfmResult:
+    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress, best: Attempt | None) -> SfmResult:
         progress("cameras: mapping", 1, 2)
         return made.reconstruct(self.names, self.job["camera_params"])
 

@@ -164,7 +164,9 @@ class StructureFromMotion:
 
     def _parameters(self, strategy: Strategy) -> dict[str, Any]:
         """What the worker has to know of a strategy."""
-        number = next((i for i, attempt in enumerate(self.attempts) if attempt.strategy == strategy), len(self.attempts))
+        number = next(
+            (i for i, attempt in enumerate(self.attempts) if attempt.strategy == strategy), len(self.attempts)
+        )
         return {
             "focal": strategy.focal,
             "free_lens": strategy.free_lens,
@@ -200,7 +202,10 @@ class StructureFromMotion:
         self._work(self.job | job, progress)
 
     def _try(self, strategy: Strategy, parameters: dict[str, Any], progress: StageProgress) -> Attempt:
-        self._work(self.job | parameters | {"task": "map"}, progress)
+        try:
+            self._work(self.job | parameters | {"task": "map"}, progress)
+        except NeecoError as error:  # the others may do with less memory
+            return Attempt(strategy, len(self.keys), fault=str(error).removeprefix(f"{self.source}: "))
         found = read_json(Path(parameters["model"]) / "attempt.json")
         found["models"] = tuple(found["models"])
         return judge(Attempt(strategy, len(self.keys), **found), self.size, self._least)
@@ -209,18 +214,20 @@ class StructureFromMotion:
         """Why no strategy was of use, and what to do."""
         apart = max(1, len(self.keys) // MOTION_PAIRS)
         pairs = [(self.keys[i], self.keys[i + step]) for step in (2, 8) for i in range(0, len(self.keys) - step, apart)]
-        names = [(self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(image_pairs(len(self.names), self.keys))]
+        names = [
+            (self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(image_pairs(len(self.names), self.keys))
+        ]
         self._work(self.job | {"task": "matches", "pairs": names, "database": str(self.work / "database.db")}, progress)
         with np.load(self.work / "matches.npz") as saved:
             fault = motion_fault(saved["matches"], self.size[0])
         if fault:
             return (
-                f"{self.source}: no cameras could be found: {fault}, and cameras come from parallax; record with a scope "
-                "that moves sideways, or give cameras as a folder of another format; see docs/recording.md"
+                f"{self.source}: no cameras could be found: {fault}, and cameras come from parallax; record with a "
+                "scope that moves sideways, or give cameras as a folder of another format; see docs/recording.md"
             )
         return (
-            f"{self.source}: no cameras could be found in {len(self.attempts)} ways ({'; '.join(self.search)}): too few "
-            "features match between the frames (dark, blurred or textureless images), or nothing keeps its shape; see "
+            f"{self.source}: no cameras could be found in {len(self.attempts)} ways ({'; '.join(self.search)}): too "
+            "few features match between the frames (dark, blurred or textureless images), or nothing keeps its shape; see "
             "docs/recording.md"
         )
 

@@ -1,4 +1,4 @@
-"""Ways to find cameras of a video, tried in turn; which of their results is kept, and what to say when none is any good."""
+"""Ways to find cameras of a video, tried in turn; which result is kept, and what is said when none is good."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Strategy:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What became of a strategy. models: keyframes in each model, the largest first, of which all else speaks; error px;
-    parallax: median degrees between the views of a point; fault: why it is not used, in words, or nothing."""
+    """What became of a strategy. models: keyframes in each model, the largest first, of which all else speaks; error:
+    px; parallax: median degrees between the views of a point; fault: why it is not used, in words, or nothing."""
 
     strategy: Strategy
     keyframes: int
