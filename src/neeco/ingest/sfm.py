@@ -227,8 +227,8 @@ class StructureFromMotion:
             )
         return (
             f"{self.source}: no cameras could be found in {len(self.attempts)} ways ({'; '.join(self.search)}): too "
-            "few features match between the frames (dark, blurred or textureless images), or nothing keeps its shape; see "
-            "docs/recording.md"
+            "few features match between the frames (dark, blurred or textureless images), or nothing keeps its shape; "
+            "see docs/recording.md"
         )
 
     def _work(self, job: dict[str, Any], progress: StageProgress) -> None:
