@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.lens import Lens
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
+from neeco.ingest.sfm_strategies import Attempt, strategies
 
 POSE_HEADER = "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz"
 RECORDING = """\
@@ -165,9 +167,10 @@ class Recorded:
         cameras[:, :3, 3] = self.scale * cameras[:, :3, 3] @ turned.T + [1.0, 2.0, -3.0]
         points = self.scale * self.points @ turned.T + [1.0, 2.0, -3.0]
         count = len(points)
+        lens = None if params else Lens(fl_x, fl_y, cx, cy, (0.0,) * 4)
         return SfmResult(
             indices, cameras, points, np.full((count, 3), 120, dtype=np.uint8), np.full(count, 0.5), np.full(count, 9),
-            np.array(seen, dtype=np.float64).reshape(-1, 5), np.array(params or [fl_x, fl_y, cx, cy, *[0.0] * 4]), 0.4,
+            np.array(seen, dtype=np.float64).reshape(-1, 5), lens, 0.4,
         )  # fmt: skip
 
 
@@ -185,9 +188,10 @@ def recorded(tmp_path: Path, film: Path, monkeypatch: pytest.MonkeyPatch) -> Rec
     made = Recorded(World(tmp_path / "rec"))
     made.write()
 
-    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress) -> SfmResult:
+    def run(self: StructureFromMotion, job: dict[str, Any], progress: StageProgress, best: Attempt | None) -> SfmResult:
         progress("cameras: mapping", 1, 2)
         return made.reconstruct(self.names, self.job["camera_params"])
 
+    monkeypatch.setattr(StructureFromMotion, "_search", lambda self, progress: Attempt(strategies(None)[0], 1))
     monkeypatch.setattr(StructureFromMotion, "_run", run)
     return made

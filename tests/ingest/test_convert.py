@@ -90,6 +90,30 @@ def test_tool_masks_become_loss_masks_that_ignore_the_tool(endonerf, tmp_path):
     assert not errors_only(check_capture(tmp_path / "capture"))
 
 
+def test_the_round_border_of_a_colmap_folder_is_masked(tmp_path):
+    generator, (width, height) = np.random.default_rng(0), (80, 60)
+    (tmp_path / "colmap/images").mkdir(parents=True)
+    (tmp_path / "colmap/sparse/0").mkdir(parents=True)
+    rows, columns = np.indices((height, width))
+    disc = np.hypot(columns - 40, rows - 30) < 33
+    lines = []
+    for index in range(12):
+        image = generator.integers(60, 250, (height, width, 3)) * disc[..., None]
+        Image.fromarray(image.astype(np.uint8)).save(tmp_path / f"colmap/images/{index:03d}.png")
+        lines += [f"{index + 1} 1 0 0 0 {index} 0 0 1 {index:03d}.png", ""]
+    model = tmp_path / "colmap/sparse/0"
+    (model / "cameras.txt").write_text(f"1 PINHOLE {width} {height} 60 60 40 30\n")
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "points3D.txt").write_text("1 0 0 9 255 0 0 0.5 1 0 2 0\n2 3 4 9 255 0 0 0.5 1 0 2 0\n")
+    told = " ".join(convert_folder(tmp_path / "colmap", tmp_path / "capture"))
+    assert "dark border (" in told
+    for frame in read_capture(tmp_path / "capture").frames:
+        counted = frame.load_mask().numpy()
+        assert not (counted & ~disc).any()
+        assert (disc & ~counted).sum() < 0.1 * disc.sum()
+    assert not errors_only(check_capture(tmp_path / "capture"))
+
+
 def test_a_missing_tool_mask_is_named(endonerf, tmp_path):
     (endonerf / "masks/004.png").unlink()
     with pytest.raises(NeecoError, match="masks/: has 8 masks for 9 images"):

@@ -59,6 +59,7 @@ def made(folder: Path, **changes) -> IngestResult:
         {"em": clock, "jaw_angle": ClockOffset(-0.0097, 0.0, "given")}, registration, np.arange(count), 0.36,
         len(capture.points.positions), {capture.instruments[0].name: shaft()} if capture.instruments else {},
         "unseen: jaw_angle above 59 deg", ("12 rows dropped: <NaN>",),
+        ("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
     )  # fmt: skip
     return replace(result, **changes)
 
@@ -96,6 +97,10 @@ def test_the_page_says_the_numbers(text):
         assert piece in text
     assert "rms 0.5, largest 0.5" in text
     assert "unseen: jaw_angle above 59 deg" in text
+
+
+def test_the_ways_tried_to_find_cameras_are_listed(text):
+    assert "<li>with the lens given: ends after 2 of 80 keyframes</li><li>taken: all frames at once</li>" in text
 
 
 def test_what_was_dropped_is_grouped_by_reason_with_frame_numbers(text):

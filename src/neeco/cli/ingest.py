@@ -178,5 +178,7 @@ def _print(result: IngestResult) -> None:
     for name, clock in result.clocks.items():
         spread = f" +- {1000 * clock.sd:.1f}" if clock.sd > 0 else ""
         print(f"clock {name}: {1000 * clock.seconds:.1f}{spread} ms ({clock.source})")
+    for sentence in result.search:
+        print(f"cameras: {sentence}")
     for note in result.notes:
         print(f"note: {note}")

@@ -11,6 +11,8 @@ import json
 import os
 import sys
 import threading
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,9 @@ import pycolmap
 
 SWEEPS = 4  # over frames that have no camera yet
 MISFIT_PX = 3.0
+STEPS = (15, 30)  # of the adjustment, before and after misfits are dropped
+LENS_STEPS = (30, 100)
+PARALLAX_POINTS = 500  # points looked at
 
 
 def say(stage: str, **facts: Any) -> None:
@@ -33,7 +38,8 @@ def extract_and_match(job: dict[str, Any], database: Path) -> None:
     options.use_gpu = False
     options.num_threads = job["threads"]
     options.sift.max_num_features = job["features"]
-    options.sift.peak_threshold = 0.004  # tissue is smooth: COLMAP's 0.0067 leaves too few
+    options.sift.peak_threshold = job["peak"]
+    options.sift.first_octave = job["first_octave"]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["camera_model"]
     if job["camera_params"]:
@@ -63,8 +69,8 @@ def extract_and_match(job: dict[str, Any], database: Path) -> None:
 
 def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    options.ba_refine_focal_length = options.ba_refine_extra_params = not job["camera_params"]
-    options.multiple_models = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = job["free_lens"]
+    options.multiple_models = job["several_models"]
     options.num_threads = job["threads"]
     options.random_seed = 0
     # the last adjustment is ours, after the instrument's features are gone; until then rough is enough
@@ -72,16 +78,56 @@ def pipeline_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions
     options.ba_global_max_num_iterations, options.ba_global_max_refinements = 20, 2
     options.ba_local_max_num_iterations, options.ba_local_max_refinements = 10, 1
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
-    options.mapper.init_min_tri_angle = 6.0  # a laparoscope moves little
+    options.mapper.init_min_tri_angle = job["first_angle"]
     options.mapper.init_min_num_inliers = 50
     options.mapper.abs_pose_min_num_inliers = 15
     return options
 
 
-def map_keyframes(job: dict[str, Any], database: Path, work: Path) -> pycolmap.Reconstruction | None:
-    """Incremental mapping of the keyframes; the largest model, or None."""
+def set_focal_length(database: Path, focal: float) -> None:
+    """One focal length, px, as where every estimate begins; no distortion."""
+    with pycolmap.Database.open(str(database)) as opened:
+        (camera,) = opened.read_all_cameras()
+        camera.params = [focal, camera.width / 2, camera.height / 2, 0.0]
+        camera.has_prior_focal_length = True
+        opened.update_camera(camera)
+
+
+def map_keyframes(job: dict[str, Any], database: Path) -> None:
+    """One attempt at the keyframes: the largest model goes to the folder `model`, what is to be said of it to
+    `attempt.json`."""
+    folder = Path(job["model"])
+    folder.mkdir()
+    if job["focal"]:
+        set_focal_length(database, job["focal"])
+    say("mapping", done=0, total=len(job["names"]))
+    models = global_mapping(job, database, folder) if job["global"] else incremental_mapping(job, database, folder)
+    found: dict[str, Any] = {"models": [], "focal": 0.0, "distortion": 0.0, "points": 0, "error": 0.0, "parallax": 0.0}
+    if models:
+        model = max(models.values(), key=lambda model: model.num_reg_images())
+        if job["focal"] and model.num_reg_images() >= job["least"]:
+            model = estimate_lens(job, database, folder, model)
+        model.write(str(folder))
+        camera = next(iter(model.cameras.values()))
+        found = {
+            "models": sorted((other.num_reg_images() for other in models.values()), reverse=True),
+            "focal": float(camera.params[0]),
+            "distortion": float(camera.params[3]) if job["focal"] else 0.0,
+            "points": model.num_points3D(),
+            "error": float(model.compute_mean_reprojection_error()),
+            "parallax": parallax(model),
+        }
+        found["models"][0] = model.num_reg_images()
+    folder.joinpath("attempt.json").write_text(json.dumps(found))
+
+
+def incremental_mapping(
+    job: dict[str, Any], database: Path, folder: Path, start: Path | None = None
+) -> dict[int, pycolmap.Reconstruction]:
     options = pipeline_options(job)
     options.image_names = job["keyframes"]
+    if job["focal"] and not job["free_lens"]:
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     count = 2
 
     def on_image() -> None:
@@ -89,10 +135,74 @@ def map_keyframes(job: dict[str, Any], database: Path, work: Path) -> pycolmap.R
         count += 1
         say("mapping", done=count, total=len(job["names"]))
 
-    models = pycolmap.incremental_mapping(
-        str(database), job["images"], str(work), options=options, next_image_callback=on_image
+    models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+        str(database),
+        job["images"],
+        str(folder),
+        options=options,
+        next_image_callback=on_image,
+        input_path=str(start) if start else "",
     )
-    return max(models.values(), key=lambda model: model.num_reg_images()) if models else None
+    return models
+
+
+def global_mapping(job: dict[str, Any], database: Path, folder: Path) -> dict[int, pycolmap.Reconstruction]:
+    """All keyframes at once, rotations first (GLOMAP, Pan et al. 2024): needs no first pair."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.image_names = job["keyframes"]
+    options.num_threads = job["threads"]
+    options.random_seed = 0
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    options.mapper.bundle_adjustment.refine_focal_length = False
+    options.mapper.bundle_adjustment.refine_extra_params = False
+    models: dict[int, pycolmap.Reconstruction] = pycolmap.global_mapping(
+        str(database), job["images"], str(folder), options=options
+    )
+    return models
+
+
+def estimate_lens(
+    job: dict[str, Any], database: Path, folder: Path, model: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """Focal length and distortion by adjusting a whole model. Where it was mapped with others held, its points are
+    found again through the new lens, and it is adjusted again."""
+    say("estimating the lens")
+    adjust(model, job, LENS_STEPS, free=True)
+    if job["free_lens"]:
+        return model
+    start = folder / "start"
+    start.mkdir()
+    model.write(str(start))
+    continued = incremental_mapping(job | {"several_models": False}, database, start, start)
+    model = max(continued.values(), key=lambda model: model.num_reg_images())
+    adjust(model, job, LENS_STEPS, free=True)
+    return model
+
+
+def parallax(model: pycolmap.Reconstruction) -> float:
+    """Median over points of the widest angle, degrees, between the first view of a point and its others."""
+    places = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
+    angles = []
+    points = list(model.points3D.values())
+    for point in points[:: max(1, len(points) // PARALLAX_POINTS)]:
+        rays = np.array([places[view.image_id] - point.xyz for view in point.track.elements])
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(np.degrees(np.arccos(np.clip(rays @ rays[0], -1, 1).min())))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def save_matches(job: dict[str, Any], database: Path, path: Path) -> None:
+    """Where features of pairs of images that were matched lie in both: rows of pair, x, y, x', y' px."""
+    opened = pycolmap.Database.open(str(database))
+    number = {image.name: image.image_id for image in opened.read_all_images()}
+    rows = []
+    for pair, (a, b) in enumerate(job["pairs"]):
+        matches = opened.read_matches(number[a], number[b])
+        first, second = opened.read_keypoints(number[a]), opened.read_keypoints(number[b])
+        places = np.hstack([first[matches[:, 0], :2], second[matches[:, 1], :2]])
+        rows.append(np.column_stack([np.full(len(places), pair), places]))
+    np.savez(path, matches=np.concatenate(rows) if rows else np.zeros((0, 5)))
 
 
 def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconstruction) -> None:
@@ -122,15 +232,16 @@ def register_others(job: dict[str, Any], database: Path, model: pycolmap.Reconst
     mapper.end_reconstruction(False)
 
 
-def adjust(model: pycolmap.Reconstruction, job: dict[str, Any]) -> None:
-    """Bundle adjustment under a robust loss, misfits dropped, and again: highlights and edges make outliers."""
+def adjust(model: pycolmap.Reconstruction, job: dict[str, Any], steps: Sequence[int], *, free: bool = False) -> None:
+    """Bundle adjustment under a robust loss, misfits dropped, and again: highlights and edges make outliers. free: of
+    the lens, too."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = not job["camera_params"]
+    options.refine_focal_length = options.refine_extra_params = free
     options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = job["threads"]
     options.ceres.solver_options.function_tolerance = 1e-5
-    for iterations in (15, 30):
+    for iterations in steps:
         options.ceres.solver_options.max_num_iterations = iterations
         pycolmap.bundle_adjustment(model, options)
         observations = pycolmap.ObservationManager(model)
@@ -152,7 +263,6 @@ def save(model: pycolmap.Reconstruction, path: Path) -> None:
             if spot.has_point3D()
         ]
     points = [model.points3D[point] for point in point_ids]
-    camera = next(iter(model.cameras.values()))
     np.savez(
         path,
         names=np.array([image.name for image in images]),
@@ -162,7 +272,6 @@ def save(model: pycolmap.Reconstruction, path: Path) -> None:
         errors=np.array([point.error for point in points]),
         lengths=np.array([point.track.length() for point in points]),
         observations=np.array(seen, dtype=np.float64).reshape(-1, 5),
-        camera_params=np.array(camera.params),
         reprojection=model.compute_mean_reprojection_error(),
     )
 
@@ -172,27 +281,30 @@ def main(job_file: str) -> int:
     work = Path(job["work"])
     pycolmap.set_random_seed(0)
     pycolmap.logging.minloglevel = 3
-    if "drop" in job:
-        say("adjusting")
-        model = pycolmap.Reconstruction(str(work / "model"))
-        by_name = {image.name: image.image_id for image in model.images.values()}
-        for name, number in job["drop"]:  # observations: an image's name and its feature's number
-            if model.images[by_name[name]].points2D[number].has_point3D():
-                model.delete_observation(by_name[name], number)
-        adjust(model, job)
-    else:
-        database = work / "database.db"
-        extract_and_match(job, database)
-        say("mapping", done=0, total=len(job["names"]))
-        found = map_keyframes(job, database, work)
-        if found is None:
-            return 0
-        model = found
-        register_others(job, database, model)
-        (work / "model").mkdir()
-        model.write(str(work / "model"))
-    save(model, work / "result.npz")
-    say("done", images=model.num_reg_images(), points=model.num_points3D())
+    database = Path(job["database"])
+    match job["task"]:
+        case "match":
+            extract_and_match(job, database)
+        case "map":
+            map_keyframes(job, database)
+        case "matches":
+            save_matches(job, database, work / "matches.npz")
+        case "register":
+            model = pycolmap.Reconstruction(job["model"])
+            register_others(job, database, model)
+            (work / "model").mkdir()
+            model.write(str(work / "model"))
+            save(model, work / "result.npz")
+        case "adjust":
+            say("adjusting")
+            model = pycolmap.Reconstruction(str(work / "model"))
+            by_name = {image.name: image.image_id for image in model.images.values()}
+            for name, number in job["drop"]:  # observations: an image's name and its feature's number
+                if model.images[by_name[name]].points2D[number].has_point3D():
+                    model.delete_observation(by_name[name], number)
+            adjust(model, job, STEPS)
+            save(model, work / "result.npz")
+    say("done", cpu=time.process_time())
     return 0
 
 

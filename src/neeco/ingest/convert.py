@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from neeco.capture.documents import Parsed, ProblemReport
@@ -20,12 +21,14 @@ from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
+from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
 
-    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool. The capture appears
+    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a
+    mask, an endoscope's round border is looked for, and masked. The capture appears
     whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output`
     exists already, and when the disk refuses.
     """
@@ -41,11 +44,28 @@ def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
         if tool_masks:
             pairs = zip(frames, tool_masks, strict=True)
             frames = [_with_tool_mask(frame, mask, work / "tool") for frame, mask in pairs]
+        border = None if any(frame.mask_path for frame in frames) else _shared_border(frames)
+        if border is not None:
+            write_labels(work / "border.png", torch.from_numpy(border.astype(np.uint8) * 255))
+            frames = [replace(frame, mask_path=work / "border.png") for frame in frames]
         write_capture(replace(capture_of(parsed), frames=tuple(frames)), work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
     others = [str(problem) for problem in warnings if problem.field not in settled]
+    if border is not None:
+        others.append(f"The endoscope's dark border ({1 - border.mean():.0%} of the image) is masked.")
     return (*_lacking(parsed, masked=bool(tool_masks)), *others)
+
+
+def _shared_border(frames: Sequence[Frame]) -> np.ndarray | None:
+    """bool [H, W], False on the endoscope's dark border that all frames share; None where there is none or they differ
+    in size. Raises NeecoError when an image cannot be read."""
+    if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
+        return None
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(BORDER_SAMPLES, len(frames))).astype(int))
+    images = ((frames[i].load_image().numpy() * 255).round().astype(np.uint8) for i in chosen.tolist())
+    border = find_border(images)
+    return None if border is None else visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:

@@ -47,6 +47,7 @@ class IngestResult:
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
+    search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""
@@ -76,6 +77,7 @@ class IngestResult:
             "points": self.points,
             "split_rule": self.split_rule,
             "notes": list(self.notes),
+            "search": list(self.search),
         }
 
 
@@ -111,24 +113,25 @@ class _Ingest:
         self._write_images()
         (folder / "sfm").mkdir()
         self.border = self._find_border()
-        self.visible = None if self.border is None else self._write_visible(self.border)
+        self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
-            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.pinhole, self.visible, self.settings
-        )
+            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.size, self.pinhole, self.visible,
+            self.settings,
+        )  # fmt: skip
 
     def run(self, output: Path) -> IngestResult:
         """Find cameras, registration and states, and write the capture."""
         sfm = self.motion.reconstruct(self.progress)
         if self.pinhole is None:
-            fl_x, fl_y, cx, cy, *distortion = (float(value) for value in sfm.camera_params)
-            self.lens = Lens(fl_x, fl_y, cx, cy, tuple(distortion))
-            self.pinhole = self.lens.pinhole(self.size)
+            assert sfm.lens is not None
+            self.lens, self.pinhole = sfm.lens, sfm.lens.pinhole(self.size)
             self.data.note(
-                f"intrinsics were estimated by structure from motion (focal lengths {fl_x:.1f} x {fl_y:.1f} "
-                "px); a calibration is better"
+                f"intrinsics were estimated by structure from motion (focal length {self.lens.fl_x:.1f} px, radial "
+                f"distortion {self.lens.distortion[0]:.3f}); a calibration is better"
             )
             self._write_images()
+            self._write_visible()
         registration = self._register(sfm)
         self._find_instrument_clocks(sfm, self.pinhole)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
@@ -191,20 +194,25 @@ class _Ingest:
         """The endoscope's dark border, in the frames as recorded."""
         count = len(self.names)
         sample = self.selected[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
-        return find_border(image for _, image in self.data.video.read(np.unique(sample).tolist()))
+        border = find_border(image for _, image in self.data.video.read(np.unique(sample).tolist()))
+        if border is not None:
+            dark = 1 - visible_mask(border, self.size).mean()
+            self.data.note(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
+        return border
 
-    def _write_visible(self, border: Border) -> Path:
-        """Masks of the endoscope's dark border, one file per frame as SfM wants them."""
-        seen = visible_mask(border, self.size)
+    def _write_visible(self) -> Path | None:
+        """Masks of the border, one file per frame as SfM wants them, undistorted as the images are; None without."""
+        if self.border is None:
+            return None
+        seen = visible_mask(self.border, self.size)
         if self.lens is not None:
             seen = self.lens.undistort_mask(seen)
         folder = self.folder / "visible"
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         first, *others = (folder / f"{name}.png" for name in self.names)
         write_labels(first, torch.from_numpy(seen.astype(np.uint8) * 255))
         for other in others:
             shutil.copyfile(first, other)
-        self.data.note(f"the endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked")
         return folder
 
     def _times(self, sfm: SfmResult) -> np.ndarray:
@@ -346,6 +354,7 @@ class _Ingest:
             shapes,
             rule,
             tuple(data.notes),
+            self.motion.search,
         )
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:

@@ -53,6 +53,7 @@ class IngestSettings:
     min_sharpness: float = 0.5  # of the neighbouring frames' sharpness: a frame below is dropped as blurred
     sfm_features: int = 1200  # SIFT features per image
     sfm_keyframes: int = 80  # about so many frames are mapped; the others are placed among their points
+    sfm_minutes: float = 20.0  # of processor time looking for cameras, after which no further way is tried
     shape_frames: int = 60  # from which an instrument's rough shape is carved
     moving_px: float = 1.5  # optical flow that the still scene does not explain: the pixel moves
     tracker_noise_mm: float = 0.25  # of a tracker's samples: where the robust loss begins to doubt one
