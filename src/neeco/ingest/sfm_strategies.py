@@ -1,4 +1,4 @@
-"""Ways to find cameras of a video, tried in turn; which result is kept, and what is said when none is good."""
+"""Ways to find cameras of a video, tried in turn; which result is taken, and what is said when none is good."""
 
 from __future__ import annotations
 
@@ -162,11 +162,11 @@ def motion_fault(matches: np.ndarray, width: int) -> str:
             continue
         _, by_homography = cv2.findHomography(first, second, cv2.RANSAC, FIT * width)
         _, by_any = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, FIT * width / 2)
-        kept, counted = (np.zeros(len(first)) if fit is None else fit.ravel() for fit in (by_homography, by_any))
-        if max(kept.sum(), counted.sum()) < FEW_MATCHES / 2:
+        rotated, counted = (np.zeros(len(first)) if fit is None else fit.ravel() for fit in (by_homography, by_any))
+        if max(rotated.sum(), counted.sum()) < FEW_MATCHES / 2:
             continue
-        explained.append(kept.sum() / max(kept.sum(), counted.sum()))
-        moved.append(np.median(np.linalg.norm(second - first, axis=1)[kept > 0]) if kept.any() else math.inf)
+        explained.append(rotated.sum() / max(rotated.sum(), counted.sum()))
+        moved.append(np.median(np.linalg.norm(second - first, axis=1)[rotated > 0]) if rotated.any() else math.inf)
     if len(moved) < FEW_PAIRS:
         return ""
     if np.quantile(moved, 0.9) < STILL * width:
