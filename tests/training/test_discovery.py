@@ -179,7 +179,7 @@ def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path) -> N
 
 
 def test_without_instruments_there_is_nothing_to_look_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "tissue_evidence", lambda *_: pytest.fail("fitted the tissue for nothing"))
+    monkeypatch.setattr(discovery, "fit_tissue", lambda *_: pytest.fail("fitted the tissue for nothing"))
     capture = read_capture(write_capture(tmp_path / "capture", instruments=False))
     views = TrainingViews.read(capture.split("train"))
     session = begin_session(capture, views, training_config("kinematic", {}), print)

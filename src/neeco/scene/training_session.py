@@ -157,6 +157,7 @@ class GaussianTraining(Session):
     views: TrainingViews
     report: Report
     batch_size: int  # frames per step
+    timed: bool = field(default=True, init=False)  # `State.time` is in seconds
     instruments: InstrumentSearch = field(init=False)
 
     def reached(self, iteration: int) -> bool:

@@ -39,6 +39,7 @@ def begin_session(
         scene = initial_scene(capture, views.frames, config, report)
     assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
+    session.timed = capture.timed
     session.instruments = InstrumentSearch(
         find=_searching(session, find_instruments),
         bound=_searching(session, bound_volume),

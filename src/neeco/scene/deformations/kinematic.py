@@ -1,7 +1,8 @@
 """Rigid parts on learned hinges, method `kinematic`.
 
-Tissue is static. Each instrument's Gaussians live in its own tracked frame and move rigidly with its pose; joints turn
-parts about hinges that are learned from the images, with soft part assignment per Gaussian.
+Tissue is static, or moves with the breath where that was found. Each instrument's Gaussians live in its own tracked
+frame and move rigidly with its pose; joints turn parts about hinges that are learned from the images, with soft part
+assignment per Gaussian.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.raster.posing import HingedBody, pose_bodies
 from neeco.raster.types import Camera, Rendering
+from neeco.scene.breathing import RATES as BREATHING_RATES
+from neeco.scene.breathing import BreathingTissue
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
     UNPERTURBED,
@@ -45,6 +48,7 @@ RATES = {  # of the hinges' parameters, at the start
     "offsets": 6e-3,
     "share": 6e-3,
     "scale": 2e-4,
+    **BREATHING_RATES,
 }
 
 
@@ -58,7 +62,9 @@ class KinematicSettings:
     wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
     looked for and drawn (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`: whether
     tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`: whether
-    Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours."""
+    Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours;
+    `breathing`: whether a period is looked for with which the tissue moves, and its motion learned (see
+    `neeco.scene.breathing`)."""
 
     renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
 
@@ -76,6 +82,7 @@ class KinematicSettings:
     shadow_at: tuple[int, ...] = (1000, 1500)  # instruments have shape, and no shadow is learned yet as a part of them
     extrapolate_tissue: bool = True
     label_shares: bool = True
+    breathing: bool = True
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,7 @@ class Spin(Perturbation):
     shaft_roll: float = 0.0
 
 
-class Kinematic(HingedInstruments, Deformation):
+class Kinematic(BreathingTissue, HingedInstruments, Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
     method = "kinematic"
@@ -108,6 +115,7 @@ class Kinematic(HingedInstruments, Deformation):
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
         super().__init__(instruments, settings)
+        self.may_breathe = self.settings.breathing
         self.start_iteration = self.settings.hinge_start
         self.hinges = nn.ModuleList(Hinges(tuple(instrument.joints)) for instrument in instruments)
         self.label_names = tuple(
@@ -116,14 +124,13 @@ class Kinematic(HingedInstruments, Deformation):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
-        bodies: list[HingedBody | None] = [None]  # tissue stands still
+        bodies: list[HingedBody | None] = [None]  # tissue does not turn
         for index, instrument in enumerate(self.instruments):
             given = state_of(instrument, state)
             bodies.append(self.hinges_of(index).body(given.pose.to(canonical.means), given.joints, roll))
         logits = canonical.extras.get(PART_LOGITS)
-        return Posed(
-            *pose_bodies(canonical.means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies)
-        )
+        means = self.breathed(canonical.means, canonical.counts[0], state.time)
+        return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
@@ -262,6 +269,8 @@ class Kinematic(HingedInstruments, Deformation):
         if self.settings.label_shares and self.label_names:
             training.instruments.weigh_labels()
         training.instruments.conclude(self)
+        if self.breathing is not None:
+            training.scene.diagnostics["breathing"] |= self.breathing.describe()
         if self.settings.extrapolate_tissue:
             scene = training.scene
             scene.canonical = extrapolate_tissue(scene.canonical, scene.recorded.cameras)

@@ -12,20 +12,22 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from neeco.capture.model import State
+from neeco.scene.breathing import BreathingTissue
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
 from neeco.scene.drawable import HingeMotion
 from neeco.scene.method import PLAIN_TRAINING
 
 
-class Static(Deformation):
-    """The canonical Gaussians as they are, in every state."""
+class Static(BreathingTissue, Deformation):
+    """The canonical Gaussians as they are, in every state; training may let them breathe to see what else moves."""
 
     method = "3dgs"
     training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2}
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
-        return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
+        means = self.breathed(canonical.means, len(canonical), state.time)
+        return Posed(means, canonical.quats, canonical.log_scales.exp())
 
     def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
         return HingeMotion(canonical.log_scales, canonical.means.new_zeros(len(canonical), 0, 2), ())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.errors import NeecoError
+from neeco.scene.breathing import Breathing, BreathingTissue
 from neeco.scene.canonical import join_bodies, seed_gaussians
 from neeco.scene.deformations.static import Static
 from neeco.scene.drawable import Recorded
@@ -17,6 +18,7 @@ from neeco.scene.instruments import PART_LOGITS, HingedInstruments, Hinges, Swep
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import RefineConfig, SearchConfig, TrainConfig, method_defaults
+from neeco.training.instruments.breathing import find_breathing
 from neeco.training.instruments.evidence import (
     CarvedShape,
     Evidence,
@@ -51,7 +53,10 @@ def find_instruments(session: GaussianSession, hinged: HingedInstruments) -> Non
     if not scene.instruments:
         return
     report("looking for the instruments: fitting the tissue alone")
-    evidence = tissue_evidence(scene, session.views, session.config)
+    tissue = fit_tissue(scene, session.views, session.config)
+    if isinstance(hinged, BreathingTissue) and hinged.may_breathe and session.timed:
+        tissue = _learn_breathing(session, hinged, tissue)
+    evidence = tissue_evidence(scene, session.views, session.config, tissue)
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
@@ -137,24 +142,56 @@ def shape_around_frame(shape: CarvedShape, distance: float, count: int, generato
     return replace(shape, instrument_from_shaft=frame, near=-spread, tip=spread, radius=0.1 * spread, seeds=seeds)
 
 
-def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig) -> Evidence:
-    """Fit a copy of the tissue without motion; the residual is the evidence.
+def _learn_breathing(session: GaussianSession, hinged: BreathingTissue, tissue: Scene) -> Scene:
+    """`tissue`, a fit of still tissue, or where that breathes one that was fitted anew with its breathing, with which
+    `hinged` begins then."""
+    scene, views, config = session.scene, session.views, session.config
+    begun = find_breathing(tissue, views)
+    if begun is None:
+        return tissue
+    breathing, found = begun
+    session.report(f"the tissue breathes with a period of {found.period:.2f} s: fitting it again")
+    tissue = fit_tissue(scene, views, config, breathing=breathing)
+    deformation = tissue.deformation
+    assert isinstance(deformation, BreathingTissue)
+    assert deformation.breathing is not None
+    hinged.start_breathing(deformation.breathing)
+    scene.diagnostics["breathing"] = deformation.breathing.describe() | {"explained": round(found.explained, 3)}
+    return tissue
+
+
+def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig, tissue: Scene | None = None) -> Evidence:
+    """Fit a copy of the tissue without motion but that of breathing; the residual is the evidence. `tissue`: that fit,
+    where it was made before.
 
     A few hundred steps suffice on textured tissue with enough sparse points. Where the residual is large, a longer fit
     may add Gaussians.
     """
-    evidence = _evidence_after(config.search.tissue_steps, 10**9, scene, views, config)
+    tissue = tissue or fit_tissue(scene, views, config)
+    evidence = gather_evidence(tissue, views, config.search)
     if float(evidence.hits.mean()) <= config.search.max_evidence:
         return evidence
-    return _evidence_after(config.search.long_tissue_steps, 200, scene, views, config)
+    breathing = tissue.deformation.breathing if isinstance(tissue.deformation, BreathingTissue) else None
+    longer = fit_tissue(scene, views, config, config.search.long_tissue_steps, 200, breathing)
+    return gather_evidence(longer, views, config.search)
 
 
-def _evidence_after(
-    steps: int, density_start: int, scene: Scene, views: TrainingViews, config: TrainConfig
-) -> Evidence:
-    """Evidence left by a static fit of `steps` steps, with density control from `density_start` on."""
+def fit_tissue(
+    scene: Scene,
+    views: TrainingViews,
+    config: TrainConfig,
+    steps: int | None = None,
+    density_start: int = 10**9,
+    breathing: Breathing | None = None,
+) -> Scene:
+    """A copy of the tissue of `scene`, which holds it alone, after `steps` steps (None: `tissue_steps`), with density
+    control from `density_start` on; still, or breathing as it begins to with `breathing`."""
+    steps = config.search.tissue_steps if steps is None else steps
     canonical = scene.canonical.map(lambda tensor: tensor.clone())
-    tissue = Scene(Static.method, canonical, Static(), (), Recorded(), scene.center)
+    deformation = Static()
+    if breathing is not None:
+        deformation.start_breathing(breathing)
+    tissue = Scene(Static.method, canonical, deformation, (), Recorded(), scene.center)
     tissue.background = scene.background  # or the background of transparent images would be evidence
     short = replace(
         config,
@@ -170,7 +207,7 @@ def _evidence_after(
     while session.iteration < steps:
         session.step()
     tissue.requires_grad_(False)
-    return gather_evidence(tissue, views, config.search)
+    return tissue
 
 
 def start_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape) -> None:
