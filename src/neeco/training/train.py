@@ -108,6 +108,7 @@ def train(
             raise KeyboardInterrupt("before the first step; run the same command again") from None
         if not (output / "config.yaml").exists():
             write_config(output, capture_path, config, digest)
+        log.note(_size_note(frames, config))
         with deferred_interrupts() as stop:
             _run(session, output, config, log, stop, go_on)
         try:
@@ -141,7 +142,6 @@ def _begin(
     log: _Log,
 ) -> Session:
     """The session before its first step, or as the checkpoint in `output` holds it."""
-    log.note(_size_note(frames, config))
     views = TrainingViews.read(frames, config.scale).to(device)
     started = log.clock()
     torch.manual_seed(config.seed)
