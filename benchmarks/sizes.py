@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 from neeco.capture import read_capture
-from neeco.evaluation.image_metrics import psnr, resize_image
+from neeco.capture.images import area_averaged
+from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster import Camera, Gaussians, rasterize
@@ -56,7 +57,7 @@ def main() -> None:
             areas: dict[str, list[float]] = {}
             for frame in frames:
                 camera = frame.camera.resized(round(learned.width * scale), round(learned.height * scale))
-                truth = resize_image(frame.load_image(), camera)
+                truth = area_averaged(frame.load_image(), camera.width, camera.height)
                 gaussians = scene.at(frame.state)
                 plain = draw(scene, frame.state, replace(camera, learned_fx=camera.fx))
                 drawing = draw(scene, frame.state, camera)

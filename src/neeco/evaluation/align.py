@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, State
-from neeco.evaluation.image_metrics import resize_camera, resize_image
 from neeco.raster import rasterize
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.shadow import shadowed
@@ -148,11 +148,12 @@ def _level(
     camera: Camera, image: Tensor, mask: Tensor | None, factor: float, largest: float, config: AlignConfig
 ) -> _Level:
     """The level of `factor` times the size of the last one, which has `largest` times the image's."""
-    small = resize_camera(camera, factor * largest)
+    small = camera.scaled(factor * largest)
     counted = torch.ones(camera.height, camera.width) if mask is None else mask.float()
-    weight = resize_image(counted[..., None], small)[..., 0]
+    weight = area_averaged(counted[..., None], small.width, small.height)[..., 0]
     step = torch.tensor([config.step_deg * torch.pi / 180] * 3 + [config.step_mm] * 3, dtype=torch.float64)
-    return _Level(small, resize_image(image, small), torch.where(weight > 0.99, 1.0, 0.0), step / factor)
+    target = area_averaged(image, small.width, small.height)
+    return _Level(small, target, torch.where(weight > 0.99, 1.0, 0.0), step / factor)
 
 
 def _fit_level(problem: _Problem, level: _Level, parameters: Tensor, steps: int) -> Tensor:

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
-from neeco.evaluation.image_metrics import resize_camera, resize_mask
+from neeco.evaluation.image_metrics import resize_mask
 from neeco.labels.labellers import composited_parts, threshold_of
 from neeco.raster.pinhole import pixel_centers, project, unproject_world
 from neeco.raster.types import Camera, Rendering
@@ -108,7 +108,7 @@ def unobserved_tissue(coverage: Coverage, scene: Drawable, frame: Frame) -> tupl
 
 def _small(camera: Camera) -> Camera:
     """The camera at the resolution coverage is judged at."""
-    return resize_camera(camera, min(1.0, max(FACTOR, MIN_SIDE / min(camera.width, camera.height))))
+    return camera.scaled(min(1.0, max(FACTOR, MIN_SIDE / min(camera.width, camera.height))))
 
 
 def _filled(rendering: Rendering) -> Tensor:

@@ -21,7 +21,6 @@ from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_po
 
 from neeco.errors import NeecoError
 from neeco.raster.native import torch_threads
-from neeco.raster.types import Camera
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]
 
@@ -257,17 +256,6 @@ def _legend(width: int, full_scale: float) -> Pixels:
 
 def _to_uint8(pixels: np.ndarray) -> Pixels:
     return np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
-
-
-def resize_camera(camera: Camera, factor: float) -> Camera:
-    """The same pinhole with `factor` times the pixels along each side (rounded to whole pixels, at least one)."""
-    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
-
-
-def resize_image(image: Tensor, camera: Camera) -> Tensor:
-    """Area-average an image [H, W, C] to the camera's size."""
-    planes = image.permute(2, 0, 1)[None]
-    return interpolate(planes, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
 
 
 def resize_mask(mask: Tensor, width: int, height: int) -> Tensor:

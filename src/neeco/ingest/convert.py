@@ -15,8 +15,8 @@ import torch
 
 from neeco.capture.documents import Parsed, ProblemReport
 from neeco.capture.endonerf import MASKS, folder_images
-from neeco.capture.images import read_mask, write_labels
-from neeco.capture.model import Frame
+from neeco.capture.images import read_mask, to_bytes, write_labels
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
@@ -62,9 +62,8 @@ def _shared_border(frames: Sequence[Frame]) -> np.ndarray | None:
     in size. Raises NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(BORDER_SAMPLES, len(frames))).astype(int))
-    images = ((frames[i].load_image().numpy() * 255).round().astype(np.uint8) for i in chosen.tolist())
-    border = find_border(images)
+    chosen = evenly_spaced(len(frames), BORDER_SAMPLES, floor=True)
+    border = find_border(to_bytes(frames[index].load_image()).numpy() for index in chosen)
     return None if border is None else visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
 
 

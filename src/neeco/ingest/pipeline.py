@@ -14,7 +14,7 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Border, Lens
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.convert import staged
@@ -192,9 +192,8 @@ class _Ingest:
 
     def _find_border(self) -> Border | None:
         """The endoscope's dark border, in the frames as recorded."""
-        count = len(self.names)
-        sample = self.selected[np.linspace(0, count - 1, min(BORDER_SAMPLES, count)).astype(int)]
-        border = find_border(image for _, image in self.data.video.read(np.unique(sample).tolist()))
+        sample = self.selected[evenly_spaced(len(self.selected), BORDER_SAMPLES, floor=True)]
+        border = find_border(image for _, image in self.data.video.read(sample.tolist()))
         if border is not None:
             dark = 1 - visible_mask(border, self.size).mean()
             self.data.note(f"the endoscope's dark border ({dark:.0%} of the image) is masked")

@@ -170,6 +170,15 @@ class Camera:
             height=height,
         )
 
+    def scaled(self, factor: float) -> Camera:
+        """The same view with `factor` times the pixels along each side (rounded to whole pixels, at least one)."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def within(self, pixels: int) -> Camera:
+        """The same view with at most about so many pixels."""
+        factor = (pixels / (self.width * self.height)) ** 0.5
+        return self if factor >= 1 else self.scaled(factor)
+
 
 def differentiable(
     gaussians: Gaussians, camera: Camera, channels: Tensor | None, background: Tensor | None

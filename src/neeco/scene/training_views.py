@@ -10,7 +10,8 @@ import cv2
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Frame
+from neeco.capture.images import to_bytes
+from neeco.capture.model import Camera, Frame
 
 MAX_MEMORY_SHARE = 0.5  # of a CUDA device's free memory that all pixels may take
 
@@ -32,17 +33,12 @@ class TrainingViews:
     def read(cls, frames: Sequence[Frame], scale: float = 1.0) -> TrainingViews:
         """Load every frame's pixels, at `scale` times their size (see `scaled`). Raises NeecoError where a file cannot
         be read."""
-        read = [cls._read_frame(frame).scaled(scale) for frame in frames]
+        read = [cls((frame,), (to_bytes(frame.load_image()),), (frame.load_mask(),)).scaled(scale) for frame in frames]
         return cls(
             tuple(view.frames[0] for view in read),
             tuple(view.images[0] for view in read),
             tuple(view.masks[0] for view in read),
         )
-
-    @classmethod
-    def _read_frame(cls, frame: Frame) -> TrainingViews:
-        image = (frame.load_image() * 255).round().to(torch.uint8)
-        return cls((frame,), (image,), (frame.load_mask(),))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -77,10 +73,10 @@ class TrainingViews:
             return self
         frames, images, masks = [], [], []
         for frame, image, mask in zip(self.frames, self.images, self.masks, strict=True):
-            width, height = (max(1, round(scale * side)) for side in (frame.camera.width, frame.camera.height))
-            frames.append(replace(frame, camera=frame.camera.resized(width, height)))
-            images.append(_area_averaged(image, width, height))
-            masks.append(None if mask is None else _area_averaged(mask.to(torch.uint8) * 255, width, height) == 255)
+            camera = frame.camera.scaled(scale)
+            frames.append(replace(frame, camera=camera))
+            images.append(_resized(image, camera))
+            masks.append(None if mask is None else _resized(mask.to(torch.uint8) * 255, camera) == 255)
         prefetcher = None if self.prefetcher is None else PixelPrefetcher(self.prefetcher.device)
         return TrainingViews(tuple(frames), tuple(images), tuple(masks), prefetcher)
 
@@ -107,9 +103,9 @@ def mean_pixels(frames: Sequence[Frame]) -> float:
     return sum(frame.camera.width * frame.camera.height for frame in frames) / len(frames)
 
 
-def _area_averaged(pixels: Tensor, width: int, height: int) -> Tensor:
-    """uint8 [H, W, ...] at another size, where it was."""
-    resized = cv2.resize(pixels.cpu().numpy(), (width, height), interpolation=cv2.INTER_AREA)
+def _resized(pixels: Tensor, camera: Camera) -> Tensor:
+    """Bytes [H, W, ...] area-averaged to the camera's size, on the device or in the memory where they were."""
+    resized = cv2.resize(pixels.cpu().numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     found = torch.from_numpy(resized)
     return found.pin_memory() if pixels.is_pinned() else found.to(pixels.device)
 

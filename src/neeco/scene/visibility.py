@@ -60,7 +60,7 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
     for index in evenly_spaced(len(recorded.cameras), MAX_FRAMES):
-        camera = reduced(recorded.cameras[index])
+        camera = recorded.cameras[index].within(MAX_PIXELS)
         with torch.no_grad():
             posed = at(recorded.states[index])
             toward = _toward(posed, camera)
@@ -89,12 +89,6 @@ def _toward(posed: Gaussians, camera: Camera) -> Tensor:
         outward = torch.einsum("nji,nj->ni", quat_to_matrix(posed.sh_frames), outward)
     directions = constant(tuple(value for corner in DIRECTIONS for value in corner), outward.device).view(-1, 3)
     return (outward @ directions.T).clamp_min(0) ** SHARPNESS
-
-
-def reduced(camera: Camera) -> Camera:
-    """The same view with at most MAX_PIXELS pixels: as many tell what it shows."""
-    scale = (MAX_PIXELS / (camera.width * camera.height)) ** 0.5
-    return camera if scale >= 1 else camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
 def visible_pixels(posed: Gaussians, camera: Camera, weight: Tensor | None = None) -> Tensor:

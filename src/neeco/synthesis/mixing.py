@@ -18,7 +18,6 @@ from torch import Tensor
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.evaluation.image_metrics import resize_camera
 from neeco.labels.annotation import working_ends_or_origins
 from neeco.labels.drawing import surface_depth, to_numpy
 from neeco.raster import rasterize
@@ -189,7 +188,7 @@ def tissue_depth(tissue: Gaussians, camera: Camera, point: np.ndarray) -> float:
 
     Beyond the image's border, that of the nearest pixel.
     """
-    coarse = resize_camera(camera, DEPTH_SCALE)
+    coarse = camera.scaled(DEPTH_SCALE)
     rendering = rasterize(tissue, coarse)
     x, y = project(point, coarse.fx, coarse.fy, coarse.cx, coarse.cy, nearest=camera.near)
     row, column = (int(np.clip(value, 0, size - 1)) for value, size in ((y, coarse.height), (x, coarse.width)))

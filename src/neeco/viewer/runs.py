@@ -19,7 +19,7 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.image_metrics import psnr, resize_camera
+from neeco.evaluation.image_metrics import psnr
 from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.labels.drawing import draw
@@ -256,7 +256,7 @@ def coarse_psnr(loaded: LoadedRun, index: int) -> float:
 
 def narrowed(camera: Camera, width: int) -> Camera:
     """The same view in an image of at most `width` px."""
-    return camera if camera.width <= width else resize_camera(camera, width / camera.width)
+    return camera if camera.width <= width else camera.scaled(width / camera.width)
 
 
 def spread_order(count: int) -> list[int]:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 
+from neeco.capture.images import area_averaged
 from neeco.raster import rasterize
 from neeco.scene.breathing import HARMONICS, Breathing
 from neeco.scene.scene import Scene
@@ -102,14 +103,13 @@ def tissue_shift(tissue: Scene, views: TrainingViews, index: int) -> Tensor:
     """[3] mm, world frame: the displacement of all the tissue that best explains frame `index`, to first order, beside
     a change of each colour's gain; pixels that neither explains count little."""
     frame, target, mask = views.frames[index], views.target(index), views.mask(index)
-    scale = min(1.0, (PIXELS / (frame.camera.width * frame.camera.height)) ** 0.5)
-    width, height = round(scale * frame.camera.width), round(scale * frame.camera.height)
-    camera = frame.camera.resized(width, height)
+    camera = frame.camera.within(PIXELS)
+    width, height = camera.width, camera.height
     rendering = rasterize(tissue.at(frame.state), camera)
-    target, color = _reduced(target, height, width), rendering.color
+    target, color = area_averaged(target, width, height), rendering.color
     counts = (rendering.alpha > 0.5) & (rendering.depth > 0)
     if mask is not None:
-        counts &= _reduced(mask[..., None].float(), height, width)[..., 0] > 0.99
+        counts &= area_averaged(mask[..., None].float(), width, height)[..., 0] > 0.99
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     x, y = (columns.to(color) - camera.cx) / camera.fx, (rows.to(color) - camera.cy) / camera.fy
     across, down = _slopes((color + target) / 2)  # [H, W, 3] per px
@@ -131,11 +131,6 @@ def tissue_shift(tissue: Scene, views: TrainingViews, index: int) -> Tensor:
         fitted = torch.linalg.solve(normal, weighted.T @ residual.reshape(-1))
     rotation = frame.camera.world_from_camera[:3, :3].to(fitted)
     return rotation @ fitted[:3]
-
-
-def _reduced(image: Tensor, height: int, width: int) -> Tensor:
-    """`image` [H, W, C], area-averaged."""
-    return interpolate(image.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
 
 
 def _slopes(image: Tensor) -> tuple[Tensor, Tensor]:
