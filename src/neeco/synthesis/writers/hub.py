@@ -147,10 +147,8 @@ def _command(info: Mapping[str, Any]) -> str:
     for field in fields(Settings if "seed" in settings else ImageSettings):
         value, flag = given.get(field.name), f"--{field.name.replace('_', '-')}"
         value = field.default if value is None else value
-        if value is True and field.name == "lens":
-            words.append(flag)
-        elif value is False and field.default is True:
-            words.append(f"--no-{flag[2:]}")
+        if isinstance(field.default, bool):
+            words += [] if value == field.default else [flag if value else f"--no-{flag[2:]}"]
         elif value != field.default or field.name == "seed":
             words += [flag, *(value if isinstance(value, list) else ["FILE"] if isinstance(value, dict) else [value])]
     formats = ["--formats", *info["formats"]] if info["formats"] else []
