@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import torch
@@ -51,9 +53,15 @@ class Recorded:
         that is nearest its own."""
         if camera.learned_fx is not None:
             return camera
-        focal = [self.scale * recorded.fx for recorded in self.cameras]
-        nearest = min(max(camera.fx, min(focal)), max(focal)) if focal else camera.fx
+        least, most = self._learned_focal
+        nearest = min(max(camera.fx, least), most)
         return camera if camera.fx == nearest else replace(camera, learned_fx=nearest)
+
+    @cached_property
+    def _learned_focal(self) -> tuple[float, float]:
+        """Least and largest focal length, px, of the images that were learned from; without any, all lie between."""
+        focal = [self.scale * camera.fx for camera in self.cameras]
+        return min(focal, default=0.0), max(focal, default=math.inf)
 
 
 @dataclass(frozen=True)

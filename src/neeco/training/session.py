@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -70,12 +71,17 @@ class GaussianSession(GaussianTraining):
     @contextmanager
     def searching(self) -> Iterator[None]:
         """Within the block, `views` have the size at which instruments, joints and shadows are searched."""
-        views, scale, wanted = self.views, self.scale, self.resolution.search_scale
-        if wanted != scale:
-            self._use_views(self.full_views.scaled(wanted), wanted)
-        yield
-        if wanted != scale:
+        views, scale = self.views, self.scale
+        self._use_views(self.search_views, self.resolution.search_scale)
+        try:
+            yield
+        finally:
             self._use_views(views, scale)
+
+    @cached_property
+    def search_views(self) -> TrainingViews:
+        """The views of the size that searches take; made once, as a run searches some ten times."""
+        return self.full_views.scaled(self.resolution.search_scale)
 
     def start(self) -> None:
         """Make the scene's tensors leaves of autograd and clear the statistics; once the canonical Gaussians exist."""

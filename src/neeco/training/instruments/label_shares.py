@@ -85,24 +85,17 @@ def _label_shares(session: GaussianSession, views: list[_View], probable: list[n
 
 
 @torch.no_grad()
-def _drawn_share(session: GaussianSession, index: int, channel: Tensor) -> np.ndarray:
-    """[H, W] a channel [N, 1] drawn as training frame `index` shows the scene."""
-    state, camera = session.corrected(index)
-    channels = rasterize(session.scene.at(state), camera, channels=channel).channels
-    assert channels is not None
-    found: np.ndarray = channels[..., 0].cpu().numpy()
-    return found
-
-
-@torch.no_grad()
 def _view(session: GaussianSession, index: int) -> _View:
     scene = session.scene
     state, camera = session.corrected(index)
     instrument = scene.canonical.of_instruments
-    share = _drawn_share(session, index, instrument.float()[:, None])
+    posed = scene.at(state)
+    channels = rasterize(posed, camera, channels=instrument.float()[:, None]).channels
+    assert channels is not None
+    share = channels[..., 0].cpu().numpy()
     reach = 2 * max(1, math.ceil(EDGE * min(share.shape))) + 1
     inside = cv2.erode((share > INSIDE).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
-    tissue = rasterize(scene.at(state).select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
+    tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
     image, mask = session.views.target(index).cpu().numpy(), session.views.mask(index)
     counted = np.ones(share.shape, bool) if mask is None else mask.cpu().numpy()
     return _View(index, image, tissue, inside & counted, counted)
