@@ -15,7 +15,7 @@ from neeco.raster.pinhole import project_world
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
-from neeco.training.resolution import Resolution, ResolutionConfig, amplitude_shares, reduced_scales
+from neeco.training.resolution import Resolution, ResolutionConfig, amplitude_shares, reduced_scales, size_factor
 from neeco.training.train import train
 
 CONFIG = ResolutionConfig(min_side=16, step=2.0, full_size_at=0.5)
@@ -60,6 +60,28 @@ def test_sizes_grow_over_the_coarse_part_of_the_run_as_the_spectrum_says(capture
     assert resolution.limit_at(0.9, 1000) == 1000
 
 
+def test_gaussians_of_larger_images_grow_from_smaller_gradients(capture: Path) -> None:
+    small = Resolution(ResolutionConfig(), views_of(capture, noise(256)))
+    assert small.threshold_at(0.5, 2e-4) == 2e-4
+    large = Resolution(replace(CONFIG, min_side=512), views_of(capture, noise(1024)))
+    more = size_factor(1024**2, CONFIG)
+    assert large.threshold_at(1.0, 2e-4) == pytest.approx(2e-4 / more**0.5)
+    assert large.threshold_at(0.0, 2e-4) == pytest.approx(2e-4 / size_factor(512**2, CONFIG) ** 0.5)
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "stop"),
+    [
+        ("kinematic", [], 0.8),
+        ("3dgs", [], 0.5),
+        ("3dgs", ["resolution.full_size_at=0.6"], 0.8),
+        ("kinematic", ["density_stop=0.3"], 0.3),
+    ],
+)
+def test_gaussians_grow_until_half_of_what_is_left_at_full_size(method: str, changes: list[str], stop: float) -> None:
+    assert training_config(method, {}, changes).growth_stop == pytest.approx(stop)
+
+
 def test_without_a_coarse_part_images_always_have_their_size(capture: Path) -> None:
     assert Resolution(ResolutionConfig(), views_of(capture, noise(512))).scale(0.0) == 1.0
 
@@ -83,7 +105,7 @@ def test_reduced_views_are_averages_under_cameras_that_see_the_same(capture: Pat
 def test_limits_follow_the_number_of_pixels_unless_given() -> None:
     config = training_config("kinematic", {})
     assert config.gaussian_limits(100) == config.gaussian_limits(320 * 256) == (20_000, 4_000)
-    assert config.gaussian_limits(16 * 320 * 256) == (160_000, 32_000)
+    assert config.gaussian_limits(16 * 320 * 256) == (80_000, 16_000)
     assert training_config("kinematic", {"max_tissue_gaussians": 70}).gaussian_limits(1e6)[0] == 70
 
 

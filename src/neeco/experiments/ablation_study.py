@@ -257,7 +257,7 @@ def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
             f"phase-1 PSNR: not known, phase 1 of {steps} steps ends before the first row of metrics.jsonl "
             f"({log_interval} steps); give --iterations {math.ceil(log_interval / PHASE_1_SHARE)} or more"
         )
-    if method == "neeco" and TrainConfig().density_stop * steps <= MIN_RESET_INTERVAL:
+    if method == "neeco" and TrainConfig().growth_stop * steps <= MIN_RESET_INTERVAL:
         notes.append(
             f"opacity reset: none comes in {steps} steps (intervals do not scale below {MIN_RESET_INTERVAL}, and "
             "density control ends half-way), so P_oi changes nothing here"

@@ -127,7 +127,7 @@ class TrainConfig:
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     density_start: int = 500
-    density_stop: float = 0.5  # share of the run
+    density_stop: float | None = None  # share of the run; None: half of what is left once images have their full size
     deformation: Any = None  # the method's own settings, an instance of its `Settings`; None: its defaults
     joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -146,6 +146,11 @@ class TrainConfig:
         factor = size_factor(pixels, self.resolution)
         tissue, instrument = self.max_tissue_gaussians, self.max_instrument_gaussians
         return tissue or round(TISSUE_GAUSSIANS * factor), instrument or round(INSTRUMENT_GAUSSIANS * factor)
+
+    @property
+    def growth_stop(self) -> float:
+        """Share of the run from which Gaussians are no longer cloned or split."""
+        return (1 + self.resolution.full_size_at) / 2 if self.density_stop is None else self.density_stop
 
     @property
     def length(self) -> RunLength:

@@ -28,7 +28,7 @@ class ResolutionConfig:
     step: float = 1.414  # between a size and the next
     full_size_at: float = 0.0  # share of the run from which images have their full size; 0: all along
     growth_power: float = 1.0  # most Gaussians while images are reduced: scale^growth_power times those of the run
-    limit_power: float = 0.75  # most Gaussians for images of N times the pixels of 320x256: N^limit_power as many
+    limit_power: float = 0.5  # most Gaussians for images of N times the pixels of 320x256: N^limit_power as many
     search_pixels: int = REFERENCE_PIXELS  # to which images are reduced where instruments and shadows are searched
 
 
@@ -39,7 +39,8 @@ class Resolution:
     def __init__(self, config: ResolutionConfig, views: TrainingViews) -> None:
         self.config = config
         sizes = np.array([image.shape[:2] for image in views.images])
-        self.search_scale = min(1.0, math.sqrt(config.search_pixels / float(sizes.prod(1).mean())))
+        self.pixels = float(sizes.prod(1).mean())
+        self.search_scale = min(1.0, math.sqrt(config.search_pixels / self.pixels))
         self.scales = reduced_scales(int(sizes.min()), config) if config.full_size_at > 0 else []
         retained = amplitude_shares(views, self.scales)
         self.ends = [
@@ -53,6 +54,14 @@ class Resolution:
     def limit_at(self, progress: float, limit: int) -> int:
         """How many Gaussians a body may have at `progress`, of at most `limit`."""
         return math.ceil(limit * self.scale(progress) ** self.config.growth_power)
+
+    def threshold_at(self, progress: float, threshold: float) -> float:
+        """The gradient above which Gaussians grow at `progress`, of `threshold` for images of 320x256.
+
+        The gradient (NDC) of a Gaussian whose error stays the same is proportional to its radius as a share of the
+        image, so that n times as many grow from thresholds of 1 / sqrt(n).
+        """
+        return threshold / math.sqrt(size_factor(self.pixels * self.scale(progress) ** 2, self.config))
 
 
 def size_factor(pixels: float, config: ResolutionConfig) -> float:

@@ -69,10 +69,12 @@ class GaussianSession(GaussianTraining):
         self.given = [(frame.state.to(views.device), frame.camera.to(views.device)) for frame in views.frames]
 
     @contextmanager
-    def searching(self) -> Iterator[None]:
-        """Within the block, `views` have the size at which instruments, joints and shadows are searched."""
+    def searching(self, as_learned: bool = False) -> Iterator[None]:
+        """Within the block, `views` have the size at which instruments, joints and shadows are searched; `as_learned`:
+        at most the size learned from so far, where what the scene cannot draw yet would hide what is searched."""
         views, scale = self.views, self.scale
-        self._use_views(self.search_views, self.resolution.search_scale)
+        if not (as_learned and scale < self.resolution.search_scale):
+            self._use_views(self.search_views, self.resolution.search_scale)
         try:
             yield
         finally:
@@ -241,7 +243,7 @@ class GaussianSession(GaussianTraining):
             self.refinement.center()
         if self.iteration < self.schedule.scaled(config.density_start):
             return
-        grows = self._due(settings.interval) and progress < config.density_stop
+        grows = self._due(settings.interval) and progress < config.growth_stop
         if grows or (prunes and progress < config.density.prune_stop):
             instruments = len(scene.canonical.counts) - 1
             tissue, instrument = self.limits
@@ -251,14 +253,14 @@ class GaussianSession(GaussianTraining):
                 self.statistics,
                 [self.resolution.limit_at(progress, limit) for limit in (tissue, *[instrument] * instruments)],
                 config.density.dense_size * self.extent,
-                settings.threshold if grows else math.inf,
+                self.resolution.threshold_at(progress, settings.threshold) if grows else math.inf,
                 self.generator,
                 config.density,
                 scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
-        if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.density_stop:
+        if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
 
     def _due(self, interval: int) -> bool:

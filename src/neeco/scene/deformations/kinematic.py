@@ -108,7 +108,6 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
         "refine.latency": True,
         "refine.frame_poses": True,
         "density_start": 400,
-        "density_stop": 0.8,
         "resolution.full_size_at": 0.6,
     }
     extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
