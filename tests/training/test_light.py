@@ -130,3 +130,13 @@ def test_what_was_found_is_learned_on() -> None:
         training.step()
     assert float((scene.shadow_offsets[0].detach() - torch.tensor(OFFSET)).norm()) < 0.8 * before
     assert float(scene.shadow_strengths[0].detach()) == pytest.approx(STRENGTH, abs=0.15)
+
+
+def test_shadows_are_looked_for_in_images_no_larger_than_those_learned_from() -> None:
+    learning = session(STRENGTH)
+    learning._use_views(learning.full_views.scaled(0.5), 0.5)
+    with learning.searching(as_learned=True):
+        assert learning.scale == 0.5
+    with learning.searching():
+        assert learning.scale == 1.0
+    assert learning.scale == 0.5

@@ -45,7 +45,7 @@ def begin_session(
         bound=_searching(session, bound_volume),
         place_wrists=_searching(session, place_wrists),
         replace_wrists=_searching(session, replace_wrists),
-        find_shadow=_searching(session, find_shadow),
+        find_shadow=_searching(session, find_shadow, as_learned=True),
         weigh_labels=_searching(session, store_label_shares),
         conclude=partial(conclude, session),
     )
@@ -55,11 +55,11 @@ def begin_session(
     return session
 
 
-def _searching(session: GaussianSession, search: Callable[..., None]) -> Callable[..., None]:
-    """`search` of this session, on images of the size that searches take."""
+def _searching(session: GaussianSession, search: Callable[..., None], as_learned: bool = False) -> Callable[..., None]:
+    """`search` of this session, on images of the size that searches take, or `as_learned` so far."""
 
     def run(*arguments: object) -> None:
-        with session.searching():
+        with session.searching(as_learned):
             search(session, *arguments)
 
     return run
