@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("cv2")
 
 from neeco.capture.lens import Lens
-from neeco.ingest.motion import STEP, carve_shape, observations_on, project_mask
+from neeco.ingest.motion import STEP, ResidualFlow, carve_shape, observations_on, project_mask
+from neeco.ingest.sfm import SfmResult
 
 PINHOLE = Lens(60.0, 60.0, 32.0, 24.0, (), (64, 48))
 ROWS = np.arange(14)
@@ -54,3 +55,42 @@ def test_only_features_on_the_instrument_are_marked(recorded) -> None:
     inside = mask[sfm.observations[mine, 3].astype(int), sfm.observations[mine, 2].astype(int)]
     np.testing.assert_array_equal(on[mine], inside)
     assert 0 < inside.sum() < mine.sum()
+
+
+@pytest.mark.parametrize("times", [1, 4])
+def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
+    """A patch that moves by 4 px of 320x256 moves, and the tissue beside it, by .6 px, does not: in any size."""
+    import cv2
+
+    width, height = 320, 256
+    wall = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (height, width, 3)), (0, 0), 2.0)
+    wall = np.clip((wall - 128) * 8 + 128, 0, 255)
+
+    def load(row: int) -> np.ndarray:
+        shifted = cv2.warpAffine(wall, np.array([[1, 0, 0.6 * (row > 0)], [0, 1, 0]]), (width, height), borderMode=1)
+        column = 100 + 4 * (row > 0)
+        shifted[100:164, column : column + 80] = wall[20:84, 20:100]
+        return cv2.resize(shifted.astype(np.uint8), (times * width, times * height), interpolation=cv2.INTER_CUBIC)
+
+    rows, columns = np.mgrid[8:height:16, 8:width:16]
+    points = np.stack([(columns - width / 2) / 3, (rows - height / 2) / 3, np.full(rows.shape, 100.0)], -1).reshape(
+        -1, 3
+    )
+    seen = [[frame, point, 0, 0, point] for frame in range(4) for point in range(len(points))]
+    count = np.zeros(len(points))
+    sfm = SfmResult(
+        np.arange(4), np.tile(np.eye(4), (4, 1, 1)), points, count[:, None], count, count, np.array(seen), None, 0.0
+    )
+    visible = np.ones((times * height, times * width), bool)
+    visible[:, : 40 * times] = False
+    lens = Lens(
+        300.0 * times, 300.0 * times, width * times / 2, height * times / 2, (), (times * width, times * height)
+    )
+    evidence = ResidualFlow(load, sfm, np.arange(4) / 25, lens, visible).moving_pixels(np.array([0]), 1.5)[0]
+    assert evidence.shape == (height // STEP, width // STEP)
+    assert np.isnan(evidence[:, : 40 // STEP]).all()
+    assert not np.isnan(evidence[:, 60 // STEP :]).any()
+    inside = np.zeros(evidence.shape, bool)
+    inside[110 // STEP : 150 // STEP, 115 // STEP : 165 // STEP] = True
+    assert evidence[inside].mean() > 0.8
+    assert np.nanmean(evidence[:20]) < 0.05

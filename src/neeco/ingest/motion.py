@@ -22,8 +22,10 @@ from neeco.ingest.sfm import SfmResult
 from neeco.raster.pinhole import project, project_world
 from neeco.raster.types import Camera
 
+PIXELS = 320 * 256  # of the images whose flow is looked at: a pixel of them is as much of the scene in any recording
 STEP = 4  # px between the places where flow is compared
-NEIGHBOURS = (-6, -3, 3, 6)  # rows of the sequence a frame is compared with
+INTERVAL = 0.12  # s between frames that are compared: one and two intervals before and after
+BLEEDING = 2  # places by which flow bleeds over the border of the field of view
 PATCH = 0.04  # of the image: about what an instrument's front takes
 CELLS = 48  # of the carving grid, per side
 REACH = 0.4  # of the distance to the camera: half a side of that grid
@@ -43,35 +45,58 @@ class RoughShape:
 
 
 class ResidualFlow:
-    """Optical flow between frames at every STEP-th pixel, less what a still scene explains.
+    """Optical flow between frames, reduced to PIXELS, at every STEP-th pixel, less what a still scene explains.
 
-    load(row): image [H, W, 3] uint8 of a row of `sfm`.
+    load(row): image [H, W, 3] uint8 of a row of `sfm`, as `pinhole` sees it; times [M] s of the rows; visible: bool
+    [H, W], the field of view, where it has a border. `self.pinhole` is that of the reduced images.
     """
 
-    def __init__(self, load: Callable[[int], np.ndarray], sfm: SfmResult, pinhole: Lens) -> None:
-        self.sfm, self.pinhole = sfm, pinhole
+    def __init__(
+        self,
+        load: Callable[[int], np.ndarray],
+        sfm: SfmResult,
+        times: np.ndarray,
+        pinhole: Lens,
+        visible: np.ndarray | None = None,
+    ) -> None:
+        camera = pinhole.camera(np.eye(4)).within(PIXELS)
+        self.sfm, self.pinhole = sfm, Lens.of(camera)
         self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
-        self.grey = lru_cache(maxsize=16)(lambda row: cv2.cvtColor(load(row), cv2.COLOR_RGB2GRAY))
-        height, width = self.grey(0).shape
+        height, width = camera.height, camera.width
+
+        @lru_cache(maxsize=16)
+        def grey(row: int) -> np.ndarray:
+            image = cv2.resize(load(row), (width, height), interpolation=cv2.INTER_AREA)
+            return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+        self.grey = grey
         self.v, self.u = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+        self.step = max(1, round(INTERVAL / float(np.median(np.diff(times))))) if len(times) > 1 else 1  # rows
+        self.hidden = np.zeros(self.u.shape, dtype=bool)
+        if visible is not None:
+            size = self.u.shape[::-1]
+            shown = cv2.resize(visible.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            self.hidden = binary_dilation(shown < 1, iterations=BLEEDING)
 
     def moving_pixels(self, rows: np.ndarray, moving_px: float) -> np.ndarray:
         """[R, h, w] share of the neighbours of rows [R] against which a pixel moved by more than tissue would and
-        `moving_px`."""
+        `moving_px`; NaN beyond the field of view."""
         evidence = []
         for row in rows.tolist():
-            others = [row + step for step in NEIGHBOURS if 0 <= row + step < len(self.sfm.indices)]
+            near = [row + steps * self.step for steps in (-2, -1, 1, 2)]
+            others = [other for other in near if 0 <= other < len(self.sfm.indices)]
             moved = sum((motion > moving_px for motion in self._residuals(row, others)), np.zeros(self.u.shape))
-            evidence.append(moved / max(len(others), 1))
+            evidence.append(np.where(self.hidden, np.nan, moved / max(len(others), 1)))
         return np.stack(evidence)
 
     def fastest_motion(self) -> np.ndarray:
         """[M-1] px by which the fastest patch of each frame moves to the next one, beyond what a still scene would."""
-        patch = max(1, round(PATCH * self.u.size))
+        shown = ~self.hidden
+        patch = max(1, round(PATCH * shown.sum()))
         motion = np.zeros(len(self.sfm.indices) - 1)
         for row in range(len(motion)):
             (residual,) = self._residuals(row, [row + 1])
-            motion[row] = np.sort(residual, axis=None)[-patch:].mean()
+            motion[row] = np.sort(residual[shown])[-patch:].mean()
         return motion
 
     def _residuals(self, row: int, others: list[int]) -> Iterator[np.ndarray]:
@@ -110,8 +135,8 @@ class ResidualFlow:
 def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhole: Lens) -> RoughShape | None:
     """The points of a grid about the tracked frame that lie on moving pixels most of the time they are in view.
 
-    evidence [R, h, w] from `ResidualFlow.moving_pixels`, camera_from_instrument [R, 4, 4] mm. None when no point stands
-    out: the instrument hardly moves, or its poses do not fit the cameras.
+    evidence [R, h, w] from `ResidualFlow.moving_pixels` (NaN: not seen), camera_from_instrument [R, 4, 4] mm. None when
+    no point stands out: the instrument hardly moves, or its poses do not fit the cameras.
     """
     distance = float(np.median(camera_from_instrument[:, 2, 3])) if len(evidence) else 0.0
     if distance <= 0:
@@ -121,11 +146,12 @@ def carve_shape(evidence: np.ndarray, camera_from_instrument: np.ndarray, pinhol
     total, seen = np.zeros(len(grid)), np.zeros(len(grid))
     for pixels, pose in zip(evidence, camera_from_instrument, strict=True):
         x, y, inside = _raster_cells(grid, pose, pinhole.intrinsics, pixels.shape)
+        inside &= ~np.isnan(pixels[y, x])
         total[inside] += pixels[y[inside], x[inside]]
         seen += inside
     enough = seen > 0.3 * len(evidence)
     share = np.where(enough, total / np.maximum(seen, 1), 0.0)
-    background = float(evidence.mean())
+    background = float(np.nanmean(evidence)) if not np.isnan(evidence).all() else 0.0
     best = float(np.quantile(share[enough], 0.999)) if enough.any() else 0.0
     if best < 2 * background or best < 0.3:
         return None

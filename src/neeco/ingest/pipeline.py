@@ -113,6 +113,7 @@ class _Ingest:
         self._write_images()
         (folder / "sfm").mkdir()
         self.border = self._find_border()
+        self.field: np.ndarray | None = None  # bool [H, W] within the border, undistorted as the images are
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
@@ -206,6 +207,7 @@ class _Ingest:
         seen = visible_mask(self.border, self.size)
         if self.lens is not None:
             seen = self.lens.undistort_mask(seen)
+        self.field = seen
         folder = self.folder / "visible"
         folder.mkdir(exist_ok=True)
         first, *others = (folder / f"{name}.png" for name in self.names)
@@ -244,7 +246,7 @@ class _Ingest:
         def load(row: int) -> np.ndarray:
             return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
 
-        return ResidualFlow(load, sfm, pinhole)
+        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self.field)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
@@ -268,14 +270,15 @@ class _Ingest:
             return on_instruments, {}
         self.progress("finding the instrument", 0, 0)
         rows = np.unique(np.linspace(0, len(sfm.indices) - 1, self.settings.shape_frames).astype(int))
-        evidence = self._residual_flow(sfm, pinhole).moving_pixels(rows, self.settings.moving_px)
+        flow = self._residual_flow(sfm, pinhole)
+        evidence = flow.moving_pixels(rows, self.settings.moving_px)
         cameras, points = registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         shapes = {}
         for name, log in self.data.poses.items():
             poses, valid = self.data.instrument_poses(log, self._times(sfm))
             camera_from_instrument = np.linalg.inv(cameras) @ np.where(valid[:, None, None], poses, np.eye(4))
             usable = valid[rows]
-            shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], pinhole)
+            shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
             if shape is None:
                 self.data.note(
                     f"instrument {name!r}: nothing in the images moves with its tracked pose; check its log and clock"
@@ -284,7 +287,7 @@ class _Ingest:
             shapes[name] = shape
             for row in np.flatnonzero(valid):
                 on_instruments |= observations_on(
-                    shape, camera_from_instrument[row], sfm, int(row), points, pinhole.camera(cameras[row])
+                    shape, camera_from_instrument[row], sfm, int(row), points, flow.pinhole.camera(cameras[row])
                 )
         return on_instruments, shapes
 
