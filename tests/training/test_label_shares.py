@@ -35,15 +35,15 @@ def flat(
 
 @dataclass
 class StillScene:
-    """Tissue behind an instrument of two stripes: metal, and at its side what models its shadow."""
+    """Tissue behind an instrument of two stripes: metal, and at its side what models its shadow, or its dark side."""
 
     metal: tuple[float, float, float] = METAL
+    side: tuple[float, ...] = tuple(SHADE * value for value in TISSUE)
     diagnostics: dict[str, Any] = field(default_factory=dict)
     label_threshold: float | None = None
 
     def __post_init__(self) -> None:
-        shadow = tuple(SHADE * value for value in TISSUE)
-        stripes = [flat((-14.0, 4.0), 58.0, self.metal), flat((4.0, 6.0), 58.0, shadow)]  # type: ignore[arg-type]
+        stripes = [flat((-14.0, 4.0), 58.0, self.metal), flat((4.0, 6.0), 58.0, self.side)]  # type: ignore[arg-type]
         self.metal_count = len(stripes[0])
         self.canonical = join_bodies([flat((-36.0, 36.0), 60.0, TISSUE), self.joined(stripes)])
 
@@ -90,6 +90,15 @@ def test_what_looks_like_tissue_in_another_shade_is_no_instrument() -> None:
     assert float(shadow[in_view].max()) < 0.1
     assert bool((share[tissue] == 1).all())
     assert scene.label_threshold == 0.5
+
+
+def test_the_dark_side_of_a_dark_shaft_is_instrument() -> None:
+    scene = StillScene((0.22, 0.22, 0.24), (0.04, 0.03, 0.03))
+    store_label_shares(session_of(scene))
+    instrument = scene.canonical.body(1)
+    in_view = scene.canonical.means[instrument][:, 1].abs() < 25
+    assert scene.label_threshold == 0.5
+    assert float(scene.canonical.extras[LABEL_SHARE][instrument][in_view].min()) > 0.9
 
 
 @pytest.mark.parametrize("metal", [tuple(0.5 * value for value in TISSUE)])

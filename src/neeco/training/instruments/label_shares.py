@@ -25,12 +25,12 @@ BINS = 12  # of each colour in the histogram of the instruments' colours
 SMOOTHING = 0.7  # bins, standard deviation
 INSIDE = 0.9  # share of a pixel that is instrument, from which it may be inside one
 EDGE = 0.012  # of the images' shorter side: within it of pixels that are less, colours are asked (3 px of 256)
-SHADES = 0.15, 1.05  # of the tissue's colour as drawn, that shadows and errors of the light make
+SHADES = 0.5, 1.05  # of the drawn tissue that contact shadows and errors of the light leave; a dark shaft has less
 COLOR_ERROR = 0.02, 0.06  # standard deviation of a tissue pixel across its shades: constant, and times its brightness
 OTHER_DENSITY = 0.02  # of colours that neither explains
 MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
 LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
-MIN_INSIDE = 0.75  # mean probability inside the instruments, below which colours do not tell them from the tissue
+MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not tell them from the tissue
 MIN_PIXELS = 1e-3  # that frames show of a Gaussian; one with less counts as instrument
 THRESHOLD = 0.5  # of the labels then: half of a pixel
 
