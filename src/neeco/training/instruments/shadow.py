@@ -20,7 +20,7 @@ from neeco.training.session import GaussianSession
 
 RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
 MAX_COVERAGE = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
-MARGIN = 7  # px, side of the square about a pixel that may be covered no more
+MARGIN = 7  # px of images of 320x256, side of the square about a pixel that may be covered no more
 MAX_BRIGHTNESS = 0.8  # of white: errors at highlights exceed any shadow
 MIN_BRIGHTNESS = 0.05  # of white, to which rendered colours are clamped
 MAX_RESIDUAL = 0.1  # of white, to which residuals are clamped
@@ -132,10 +132,11 @@ def _cosine(a: Tensor, b: Tensor) -> float:
 def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
     """Of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
     gram, moment, total = [], [], 0.0
+    margin = max(1, round((MARGIN // 2) * session.scale / session.resolution.search_scale))
     for index in session.frames_along_poses(session.config.search.lamp_frames):
         color, shade, instrument = _render_candidates(session, index, offsets)
         target, mask = session.views.target(index), session.views.mask(index)
-        counts = _clear_of_instruments(instrument) & (torch.maximum(color, target).amax(-1) < MAX_BRIGHTNESS)
+        counts = _clear_of_instruments(instrument, margin) & (torch.maximum(color, target).amax(-1) < MAX_BRIGHTNESS)
         if mask is not None:
             counts &= mask
         color, target = color[counts].clamp(MIN_BRIGHTNESS, 1), target[counts]  # [P, 3]
@@ -167,6 +168,7 @@ def _render_candidates(session: GaussianSession, index: int, offsets: Tensor) ->
     return rendering.color, rendering.channels[..., 1:], rendering.channels[..., 0]
 
 
-def _clear_of_instruments(instrument: Tensor) -> Tensor:
-    """[H, W] bool: pixels without instrument near them; `instrument` [H, W]: the share of each pixel that is one."""
-    return max_pool2d(instrument[None, None], MARGIN, 1, MARGIN // 2)[0, 0] < MAX_COVERAGE
+def _clear_of_instruments(instrument: Tensor, margin: int) -> Tensor:
+    """[H, W] bool: pixels without instrument within `margin` px; `instrument` [H, W]: the share of each pixel that is
+    one."""
+    return max_pool2d(instrument[None, None], 2 * margin + 1, 1, margin)[0, 0] < MAX_COVERAGE
