@@ -12,7 +12,7 @@ from PIL import Image
 
 CHROMIUM = "/usr/bin/chromium"
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-PATIENCE_S = 30.0
+PATIENCE_S = 90.0
 QUIET_S = 1.2  # without another picture: what is shown is sharp, on a busy machine too
 
 # pictures arrive as blobs of JPEG; what was counted and kept is asked for from outside

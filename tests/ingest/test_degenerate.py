@@ -17,7 +17,6 @@ from neeco.errors import NeecoError
 from neeco.ingest.pipeline import IngestResult, ingest
 from neeco.ingest.recording import read_recording
 
-pytest.importorskip("cv2")
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")
 

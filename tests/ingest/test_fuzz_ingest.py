@@ -17,7 +17,6 @@ from neeco.capture import check_capture
 from neeco.capture.check import errors_only
 from neeco.cli import main
 
-pytest.importorskip("cv2")
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")
 

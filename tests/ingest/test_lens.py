@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -91,7 +92,6 @@ def test_a_lens_of_another_video_is_refused():
 
 
 def test_undistorting_moves_points_to_where_the_pinhole_sees_them():
-    cv2 = pytest.importorskip("cv2")
     points = np.array([[-40.0, -30, 100], [35, 25, 100], [0, 20, 100], [30, -28, 100]])
     camera = LENS._matrix()
     seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera, np.array(LENS.distortion))
@@ -110,7 +110,6 @@ def test_undistorting_moves_points_to_where_the_pinhole_sees_them():
 
 
 def test_every_undistorted_pixel_shows_something():
-    pytest.importorskip("cv2")
     assert LENS.undistort(np.full((240, 320, 3), 200, dtype=np.uint8)).min() > 150
     assert LENS.undistort_mask(np.ones((240, 320), dtype=bool)).mean() > 0.99
 
@@ -123,6 +122,5 @@ def test_a_pinhole_changes_nothing():
 
 
 def test_distortion_that_folds_the_image_is_refused():
-    pytest.importorskip("cv2")
     with pytest.raises(NeecoError, match="folds the image over"):
         Lens(300, 300, 160, 120, (-9.0, -40.0, 0.0, 0.0)).pinhole((320, 240))

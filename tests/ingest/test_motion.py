@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
-
-pytest.importorskip("cv2")
 
 from neeco.capture.lens import Lens
 from neeco.ingest.motion import STEP, ResidualFlow, carve_shape, observations_on, project_mask
@@ -60,8 +59,6 @@ def test_only_features_on_the_instrument_are_marked(recorded) -> None:
 @pytest.mark.parametrize("times", [1, 4])
 def test_what_moves_is_told_alike_in_small_and_large_images(times: int) -> None:
     """A patch that moves by 4 px of 320x256 moves, and the tissue beside it, by .6 px, does not: in any size."""
-    import cv2
-
     width, height = 320, 256
     wall = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (height, width, 3)), (0, 0), 2.0)
     wall = np.clip((wall - 128) * 8 + 128, 0, 255)

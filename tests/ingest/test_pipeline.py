@@ -21,7 +21,6 @@ from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording import read_recording
 from neeco.ingest.synchronized import SynchronizedRecording
 
-pytest.importorskip("cv2")
 pytest.importorskip("pycolmap")
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
-pytest.importorskip("cv2")
 
 from neeco.ingest.frame_selection import choose_frames, frame_features
 

@@ -324,7 +324,7 @@ def test_a_run_that_changes_is_shown_anew(serve: Serve, context: Any, made_run: 
 
 @pytest.mark.parametrize("method", ["neeco", "3dgs", "deformable-3dgs", "4dgs", "nerfies"])
 def test_every_method_is_shown_in_all_its_views(method: str, serve: Serve, context: Any, tmp_path: Path) -> None:
-    scene = make_nerf() if method == "nerfies" else make_scene(method)
+    scene = make_nerf(chunk=4096) if method == "nerfies" else make_scene(method)  # 7 rays at a time take half a minute
     with torch.no_grad():
         run = write_run(scene, tmp_path / "run", write_recorded_images(scene, tmp_path / "capture"))
     page = ViewerPage(context, serve(run).address)

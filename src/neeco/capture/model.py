@@ -22,6 +22,7 @@ from neeco.capture.points import PointCloud
 from neeco.raster.rotations import as_pose
 from neeco.raster.types import Camera
 
+REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
 STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
 _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 

@@ -18,11 +18,11 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import QhullError
 
 from neeco.capture.lens import Lens
+from neeco.capture.model import REFERENCE_PIXELS
 from neeco.ingest.sfm import SfmResult
 from neeco.raster.pinhole import project, project_world
 from neeco.raster.types import Camera
 
-PIXELS = 320 * 256  # of the images whose flow is looked at: a pixel of them is as much of the scene in any recording
 STEP = 4  # px between the places where flow is compared
 INTERVAL = 0.12  # s between frames that are compared: one and two intervals before and after
 BLEEDING = 2  # places by which flow bleeds over the border of the field of view
@@ -45,7 +45,9 @@ class RoughShape:
 
 
 class ResidualFlow:
-    """Optical flow between frames, reduced to PIXELS, at every STEP-th pixel, less what a still scene explains.
+    """Optical flow between frames at every STEP-th pixel, less what a still scene explains.
+
+    Frames are reduced to REFERENCE_PIXELS: one pixel is as much of the scene whatever was recorded.
 
     load(row): image [H, W, 3] uint8 of a row of `sfm`, as `pinhole` sees it; times [M] s of the rows; visible: bool
     [H, W], the field of view, where it has a border. `self.pinhole` is that of the reduced images.
@@ -59,7 +61,7 @@ class ResidualFlow:
         pinhole: Lens,
         visible: np.ndarray | None = None,
     ) -> None:
-        camera = pinhole.camera(np.eye(4)).within(PIXELS)
+        camera = pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS)
         self.sfm, self.pinhole = sfm, Lens.of(camera)
         self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
         height, width = camera.height, camera.width

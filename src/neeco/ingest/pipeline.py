@@ -113,7 +113,6 @@ class _Ingest:
         self._write_images()
         (folder / "sfm").mkdir()
         self.border = self._find_border()
-        self.field: np.ndarray | None = None  # bool [H, W] within the border, undistorted as the images are
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
         self.motion = StructureFromMotion(
@@ -200,14 +199,18 @@ class _Ingest:
             self.data.note(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
         return border
 
-    def _write_visible(self) -> Path | None:
-        """Masks of the border, one file per frame as SfM wants them, undistorted as the images are; None without."""
+    def _field_of_view(self) -> np.ndarray | None:
+        """bool [H, W]: what lies within the border, undistorted as the images are; None without a border."""
         if self.border is None:
             return None
         seen = visible_mask(self.border, self.size)
-        if self.lens is not None:
-            seen = self.lens.undistort_mask(seen)
-        self.field = seen
+        return seen if self.lens is None else self.lens.undistort_mask(seen)
+
+    def _write_visible(self) -> Path | None:
+        """Masks of the border, one file per frame as SfM wants them, undistorted as the images are; None without."""
+        seen = self._field_of_view()
+        if seen is None:
+            return None
         folder = self.folder / "visible"
         folder.mkdir(exist_ok=True)
         first, *others = (folder / f"{name}.png" for name in self.names)
@@ -246,7 +249,7 @@ class _Ingest:
         def load(row: int) -> np.ndarray:
             return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
 
-        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self.field)
+        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view())
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""

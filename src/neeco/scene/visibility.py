@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from neeco.capture.model import State, evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, State, evenly_spaced
 from neeco.raster import rasterize
 from neeco.raster.devices import constant
 from neeco.raster.pinhole import in_image, pixel_centers, project_world, unproject_world
@@ -40,8 +40,7 @@ DIRECTIONS = tuple(  # the corners of an icosahedron, unit
 SHARPNESS = 4  # power of the cosine by which a view counts for a direction: half at 33 degrees
 HALF_OBSERVED = 0.002  # share of the average Gaussian's visibility at which one is half unobserved
 MIN_PIXELS = 1e-6  # visibility of the average Gaussian where frames show nothing
-MAX_FRAMES = 128  # frames looked at, evenly spaced; neighbours observe the same
-MAX_PIXELS = 320 * 256  # of each of them, to which larger ones are reduced
+MAX_FRAMES = 128  # frames looked at, evenly spaced and reduced to REFERENCE_PIXELS; neighbours observe the same
 
 CELL = 1 / 40  # of the image's width: spacing of extrapolated Gaussians
 REACH = 0.4  # of the image's width: how far tissue is extrapolated beyond the recorded border
@@ -60,7 +59,7 @@ def measure_visibility(canonical: CanonicalGaussians, recorded: Recorded, at: Ca
     pixels = canonical.means.new_zeros((), dtype=torch.float64)
     visibility = canonical.means.new_zeros(len(canonical), len(DIRECTIONS))
     for index in evenly_spaced(len(recorded.cameras), MAX_FRAMES):
-        camera = recorded.cameras[index].within(MAX_PIXELS)
+        camera = recorded.cameras[index].within(REFERENCE_PIXELS)
         with torch.no_grad():
             posed = at(recorded.states[index])
             toward = _toward(posed, camera)

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neeco.capture.model import evenly_spaced
-from neeco.scene.training_views import TrainingViews
+from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.scene.training_views import TrainingViews, mean_pixels
 
-REFERENCE_PIXELS = 320 * 256  # of the images for which limits of Gaussians are stated
 SPECTRUM_FRAMES = 12  # whose spectra are looked at
 
 
@@ -38,10 +37,10 @@ class Resolution:
 
     def __init__(self, config: ResolutionConfig, views: TrainingViews) -> None:
         self.config = config
-        sizes = np.array([image.shape[:2] for image in views.images])
-        self.pixels = float(sizes.prod(1).mean())
+        self.pixels = mean_pixels(views.frames)
         self.search_scale = min(1.0, math.sqrt(config.search_pixels / self.pixels))
-        self.scales = reduced_scales(int(sizes.min()), config) if config.full_size_at > 0 else []
+        shortest = min(min(image.shape[:2]) for image in views.images)
+        self.scales = reduced_scales(shortest, config) if config.full_size_at > 0 else []
         retained = amplitude_shares(views, self.scales)
         self.ends = [
             config.full_size_at * share / retained[-1] for share in retained

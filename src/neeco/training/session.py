@@ -22,7 +22,7 @@ from neeco.raster.optimizer import Adam
 from neeco.scene.deformations.base import FINAL_RATE, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
-from neeco.scene.training_views import TrainingViews, mean_pixels
+from neeco.scene.training_views import TrainingViews
 from neeco.training.config import TrainConfig
 from neeco.training.density import GradientStatistics, control_density, reset_opacity
 from neeco.training.refinement import Refinement
@@ -60,7 +60,7 @@ class GaussianSession(GaussianTraining):
         self.schedule = Schedule(config.schedule, config.iterations)
         self.full_views = self.views
         self.resolution = Resolution(config.resolution, self.views)
-        self.limits = config.gaussian_limits(mean_pixels(frames))
+        self.limits = config.gaussian_limits(self.resolution.pixels)
         self._use_views(self.full_views, 1.0)
 
     def _use_views(self, views: TrainingViews, scale: float) -> None:

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neeco.capture.model import InstrumentState, State, evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.raster import rasterize
 from neeco.raster.pinhole import in_image
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.scene.scene import Scene
-from neeco.scene.visibility import MAX_PIXELS, visible_pixels
+from neeco.scene.visibility import visible_pixels
 from neeco.training.instruments.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
 from neeco.training.session import GaussianSession
 
@@ -134,7 +134,7 @@ def drop_occluded(scene: Scene) -> CanonicalGaussians:
     instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
     visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
     for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
-        camera = recorded.cameras[index].within(MAX_PIXELS)
+        camera = recorded.cameras[index].within(REFERENCE_PIXELS)
         with torch.no_grad():
             posed = scene.at(recorded.states[index])
         visible += visible_pixels(posed, camera)

@@ -20,7 +20,7 @@ from neeco.training.session import GaussianSession
 
 RADII = (0.04, 0.08)  # of the tissue's distance: a lamp nearer the lens would explain any dark edge
 MAX_COVERAGE = 0.05  # share of a pixel that is solid instrument, where the tissue is compared
-MARGIN = 7  # px of images of 320x256, side of the square about a pixel that may be covered no more
+MARGIN = 3  # px of the images that searches take: nothing as near to a pixel may be covered more
 MAX_BRIGHTNESS = 0.8  # of white: errors at highlights exceed any shadow
 MIN_BRIGHTNESS = 0.05  # of white, to which rendered colours are clamped
 MAX_RESIDUAL = 0.1  # of white, to which residuals are clamped
@@ -132,7 +132,7 @@ def _cosine(a: Tensor, b: Tensor) -> float:
 def _normal_equations(session: GaussianSession, offsets: Tensor) -> _NormalEquations:
     """Of candidate lamps at `offsets` [C, 3] mm, from some of the training frames."""
     gram, moment, total = [], [], 0.0
-    margin = max(1, round((MARGIN // 2) * session.scale / session.resolution.search_scale))
+    margin = max(1, round(MARGIN * session.scale / session.resolution.search_scale))
     for index in session.frames_along_poses(session.config.search.lamp_frames):
         color, shade, instrument = _render_candidates(session, index, offsets)
         target, mask = session.views.target(index), session.views.mask(index)
