@@ -1,7 +1,9 @@
-// neeco._native: posing bodies whose parts turn about hinges.
+// neeco._native: posing bodies of links that joints move.
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <tuple>
 #include <vector>
 
 #include "arrays.hpp"
@@ -10,13 +12,14 @@
 namespace neeco {
 namespace {
 
-// What is posed. Bodies follow each other in the rows, `counts` long; where a body's numbers are None it stands still.
+// What is posed. Bodies follow each other in the rows, `counts` long; where a body's numbers are None it stands still. `how` says
+// of each how many links it has, which joints slide (bits) and by how much it rolls.
 class Posing {
 public:
     Posing(Array means, Array quats, Array log_scales, MaybeArray logits, const std::vector<int>& counts,
-           const std::vector<MaybeArray>& numbers, const std::vector<float>& rolls)
+           const std::vector<MaybeArray>& numbers, const std::vector<std::tuple<int, unsigned, float>>& how)
         : arrays_{means, quats, log_scales}, total_(means.size() / 3) {
-        if (numbers.size() != counts.size() || rolls.size() != counts.size()) throw std::invalid_argument("bodies: one count, numbers and roll each");
+        if (numbers.size() != counts.size() || how.size() != counts.size()) throw std::invalid_argument("bodies: one count, numbers and how each");
         const size_t n = total_;
         Body body{};
         body.total = static_cast<int>(n);
@@ -33,15 +36,18 @@ public:
         for (size_t i = 0; i < counts.size(); i++) {
             body.count = counts[i];
             body.numbers = data_of(numbers[i]);
-            body.roll = rolls[i];
+            std::tie(body.links, body.slides, body.roll) = how[i];
             body.joints = 0;
             if (numbers[i]) {
                 const size_t size = numbers[i]->size();
-                if (size < kBodyNumbers || (size - kBodyNumbers) % kHingeNumbers) throw std::invalid_argument("numbers: of another length");
-                body.joints = static_cast<int>((size - kBodyNumbers) / kHingeNumbers);
+                if (body.links < 1 || body.links > kMostLinks) throw std::invalid_argument("links: too few or too many");
+                const size_t each = joint_numbers(body.links);
+                if (size < kBodyNumbers || (size - kBodyNumbers) % each) throw std::invalid_argument("numbers: of another length");
+                if ((size - kBodyNumbers) / each > kMostJoints) throw std::invalid_argument("joints: too many");
+                body.joints = static_cast<int>((size - kBodyNumbers) / each);
                 arrays_.push_back(*numbers[i]);
             }
-            if (body.joints && body.logit_count < 1 + 2 * body.joints) throw std::invalid_argument("logits: too few columns");
+            if (body.joints && body.logit_count < body.links) throw std::invalid_argument("logits: too few columns");
             bodies_.push_back(body);
             body.first += counts[i];
         }
@@ -79,7 +85,8 @@ private:
 
 void bind_posing(nb::module_& m) {
     nb::class_<Posing>(m, "Posing")
-        .def(nb::init<Array, Array, Array, MaybeArray, const std::vector<int>&, const std::vector<MaybeArray>&, const std::vector<float>&>(),
+        .def(nb::init<Array, Array, Array, MaybeArray, const std::vector<int>&, const std::vector<MaybeArray>&,
+                      const std::vector<std::tuple<int, unsigned, float>>&>(),
              nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg())
         .def("forward", &Posing::forward)
         .def("backward", &Posing::backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg());

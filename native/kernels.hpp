@@ -39,24 +39,27 @@ struct AdamStep {
     float lr, beta1, beta2, eps, correction1, correction2_root;
 };
 
-// The rows [first, first + count) of the Gaussians: one body, its parts turned about hinges, then moved to the world.
+// The rows [first, first + count) of the Gaussians: one body, its links moved by joints, then all of it to the world.
 struct Body {
     int total;                  // Gaussians in all
     int first, count;
-    int joints, logit_count;    // two parts turn with every joint, part 0 with none: 1 + 2 * joints <= logit_count
+    int joints, links;          // link 0 moves with no joint; links <= logit_count where there are joints
+    int logit_count;
+    unsigned slides;            // bit j: joint j slides along its axis, the others turn about theirs
     const float* means;         // [N, 3]
     const float* quats;         // [N, 4]
     const float* log_scales;    // [N, 3]
     const float* logits;        // [N, logit_count], with joints
-    const float* numbers;       // kBodyNumbers and kHingeNumbers for every joint, or null: the body stands still
+    const float* numbers;       // kBodyNumbers and joint_numbers() for every joint, or null: the body stands still
     float roll;                 // rad about the shaft, of what lies before kSpinEnd
 };
 
 // Where the numbers of a body begin.
 constexpr int kPose = 0, kShaftOrigin = 12, kShaftDirection = 15, kSpinEnd = 18, kGateStart = 19, kGateWidth = 20, kLongest = 21,
               kBodyNumbers = 22;
-// and of a hinge
-constexpr int kPivot = 0, kAxis = 3, kAngles = 6, kHingeNumbers = 8;
+// and of a joint
+constexpr int kOrigin = 0, kAxis = 3, kValues = 6, kMostJoints = 31, kMostLinks = 32;
+inline int joint_numbers(int links) { return kValues + links - 1; }
 
 // Of all Gaussians; as gradients, dL/d of what goes into or comes out of posing.
 struct PosedRows {

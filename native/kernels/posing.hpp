@@ -1,6 +1,6 @@
-// Posing of bodies whose parts turn about hinges (raster/posing.py defines it), and its gradient: W Gaussians at a time.
+// Posing of bodies of links that joints move (raster/posing.py defines it), and its gradient: W Gaussians at a time.
 //
-// The gradient undoes one turn after the other instead of remembering what lay between them.
+// The gradient undoes one joint after the other instead of remembering what lay between them.
 #pragma once
 
 #include "geometry.hpp"
@@ -18,14 +18,14 @@ struct Resting {
     int index[W], live;
     vi lanes;                 // which are of the body: at its end some are not
     vf point[3], norm, quat[4];
-    vf greatest, inverse_sum; // of the part logits, for the softmax
-    vf gate;                  // share of its turning part that turns
+    vf greatest, inverse_sum; // of the link logits, for the softmax
+    vf gate;                  // of its shares of moving links, what moves
 };
 
-NEECO_INLINE vf logit_of(const Body& b, const Resting& r, int part) { return gather(b.logits + part, r.index, b.logit_count); }
+NEECO_INLINE vf logit_of(const Body& b, const Resting& r, int link) { return gather(b.logits + link, r.index, b.logit_count); }
 
-NEECO_INLINE vf share_of(const Body& b, const Resting& r, int part) {
-    const vf logit = logit_of(b, r, part);
+NEECO_INLINE vf share_of(const Body& b, const Resting& r, int link) {
+    const vf logit = logit_of(b, r, link);
     return select(finite(logit), exponential(logit - r.greatest) * r.inverse_sum, logit);
 }
 
@@ -49,32 +49,51 @@ NEECO_INLINE Resting rest_lanes(const Body& b, int row) {
     for (int k = 0; k < 4; k++) r.quat[k] = r.quat[k] / r.norm;
     if (b.joints) {
         r.greatest = logit_of(b, r, 0);
-        for (int p = 1; p <= 2 * b.joints; p++) r.greatest = higher(logit_of(b, r, p), r.greatest);
+        for (int l = 1; l < b.links; l++) r.greatest = higher(logit_of(b, r, l), r.greatest);
         vf total = all(0.f);
-        for (int p = 0; p <= 2 * b.joints; p++) total += exponential(logit_of(b, r, p) - r.greatest);
+        for (int l = 0; l < b.links; l++) total += exponential(logit_of(b, r, l) - r.greatest);
         r.inverse_sum = 1.f / total;
         r.gate = 1.f / (1.f + exponential((b.numbers[kGateStart] - along_shaft(b, r.point)) / b.numbers[kGateWidth]));
     }
     return r;
 }
 
-// The two parts' shares of turning, and the angle they come to.
-struct Pull {
-    vf first, second, angle;
+// The numbers of a joint.
+NEECO_INLINE const float* joint_of(const Body& b, int joint) { return b.numbers + kBodyNumbers + joint * joint_numbers(b.links); }
+
+// How far a Gaussian moves with every link but the first, and with all of them.
+struct Shares {
+    vf of[kMostLinks], moving;  // of[0] is not set
 };
 
-NEECO_INLINE Pull pull_of(const Body& b, const Resting& r, int joint) {
-    const float* angles = b.numbers + kBodyNumbers + joint * kHingeNumbers + kAngles;
-    Pull p;
-    p.first = share_of(b, r, 1 + 2 * joint) * r.gate;
-    p.second = share_of(b, r, 2 + 2 * joint) * r.gate;
-    p.angle = p.first * angles[0] + p.second * angles[1];
-    return p;
+NEECO_INLINE Shares shares_of(const Body& b, const Resting& r) {
+    Shares s;
+    s.moving = all(0.f);
+    for (int l = 1; l < b.links; l++) {
+        s.of[l] = share_of(b, r, l) * r.gate;
+        s.moving += s.of[l];
+    }
+    return s;
 }
 
-NEECO_INLINE Turn hinge_turn(const Body& b, int joint, vf angle) {
-    const float* hinge = b.numbers + kBodyNumbers + joint * kHingeNumbers;
-    return turn_by(hinge + kPivot, hinge + kAxis, angle);
+// By how much a joint turns or slides a Gaussian.
+NEECO_INLINE vf amount_of(const Body& b, const Shares& shares, int joint) {
+    const float* values = joint_of(b, joint) + kValues;
+    vf amount = all(0.f);
+    for (int l = b.links - 1; l > 0; l--) amount += shares.of[l] * values[l - 1];
+    return amount;
+}
+
+NEECO_INLINE bool slides(const Body& b, int joint) { return b.slides >> joint & 1; }
+
+NEECO_INLINE Turn joint_turn(const Body& b, int joint, vf angle) {
+    const float* numbers = joint_of(b, joint);
+    return turn_by(numbers + kOrigin, numbers + kAxis, angle);
+}
+
+NEECO_INLINE void slide_point(const Body& b, int joint, vf amount, vf* point) {
+    const float* axis = joint_of(b, joint) + kAxis;
+    for (int k = 0; k < 3; k++) point[k] += amount * axis[k];
 }
 
 NEECO_INLINE Turn spin_turn(const Body& b, const Resting& r) {
@@ -82,8 +101,8 @@ NEECO_INLINE Turn spin_turn(const Body& b, const Resting& r) {
     return turn_by(b.numbers + kShaftOrigin, b.numbers + kShaftDirection, select(before, all(b.roll), all(0.f)));
 }
 
-// The longest that each Gaussian may be, by how much of it turns.
-NEECO_INLINE vf longest_of(const Body& b, vf turning) { return b.numbers[kLongest] / higher(turning, all(1e-6f)); }
+// The longest that each Gaussian may be, by how much of it moves.
+NEECO_INLINE vf longest_of(const Body& b, vf moving) { return b.numbers[kLongest] / higher(moving, all(1e-6f)); }
 
 NEECO_INLINE void store_rows(float* base, int columns, const Resting& r, const vf* values) {
     for (int i = 0; i < r.live; i++)
@@ -92,17 +111,18 @@ NEECO_INLINE void store_rows(float* base, int columns, const Resting& r, const v
 
 NEECO_INLINE void pose_lanes(const Body& b, const PoseTurn& posed, const PosedRows& out, int row) {
     Resting r = rest_lanes(b, row);
-    vf frame[4] = {all(1.f), all(0.f), all(0.f), all(0.f)}, turning = all(0.f), turned[4];
+    vf frame[4] = {all(1.f), all(0.f), all(0.f), all(0.f)}, turned[4];
     auto apply = [&](const Turn& t) {
         turn_forward(t, r.point, r.quat);
         quat_product(t.quat, frame, turned);
         for (int k = 0; k < 4; k++) frame[k] = turned[k];
     };
+    const Shares shares = b.joints ? shares_of(b, r) : Shares{};
     if (b.roll != 0) apply(spin_turn(b, r));
     for (int joint = 0; joint < b.joints; joint++) {
-        const Pull pull = pull_of(b, r, joint);
-        turning += pull.first + pull.second;
-        apply(hinge_turn(b, joint, pull.angle));
+        const vf amount = amount_of(b, shares, joint);
+        if (slides(b, joint)) slide_point(b, joint, amount, r.point);
+        else apply(joint_turn(b, joint, amount));
     }
     vf world[3], turn[4], scales[3];
     const float* pose = b.numbers + kPose;
@@ -112,7 +132,7 @@ NEECO_INLINE void pose_lanes(const Body& b, const PoseTurn& posed, const PosedRo
     load_triples(b.log_scales, b.total, r.index, scales);
     for (int k = 0; k < 3; k++) {
         scales[k] = exponential(scales[k]);
-        if (b.joints) scales[k] = lower(longest_of(b, turning), scales[k]);
+        if (b.joints) scales[k] = lower(longest_of(b, shares.moving), scales[k]);
     }
     store_rows(out.means, 3, r, world);
     store_rows(out.scales, 3, r, scales);
@@ -148,13 +168,13 @@ NEECO_INLINE void add_sums(double* to, const Resting& r, const vf* values, int c
 NEECO_INLINE void pose_lanes_backward(const Body& b, const PoseTurn& posed, const PosedRows& from, const PosedRows& to, int row, double* sums) {
     Resting r = rest_lanes(b, row);
     const vf resting_norm = r.norm, resting_quat[4] = {r.quat[0], r.quat[1], r.quat[2], r.quat[3]};
+    const Shares shares = b.joints ? shares_of(b, r) : Shares{};
     const Turn spin = b.roll != 0 ? spin_turn(b, r) : Turn{};
     if (b.roll != 0) turn_forward(spin, r.point, r.quat);
-    vf turning = all(0.f);
     for (int joint = 0; joint < b.joints; joint++) {
-        const Pull pull = pull_of(b, r, joint);
-        turning += pull.first + pull.second;
-        turn_forward(hinge_turn(b, joint, pull.angle), r.point, r.quat);
+        const vf amount = amount_of(b, shares, joint);
+        if (slides(b, joint)) slide_point(b, joint, amount, r.point);
+        else turn_forward(joint_turn(b, joint, amount), r.point, r.quat);
     }
     vf to_world[3], to_posed[4], scales[3], to_scales[3];
     load_triples(from.means, b.total, r.index, to_world);
@@ -164,7 +184,7 @@ NEECO_INLINE void pose_lanes_backward(const Body& b, const PoseTurn& posed, cons
     for (int k = 0; k < 3; k++) {
         const vf scale = exponential(scales[k]);
         to_scales[k] *= scale;
-        if (b.joints) to_scales[k] = select(scale < longest_of(b, turning), to_scales[k], all(0.f));
+        if (b.joints) to_scales[k] = select(scale < longest_of(b, shares.moving), to_scales[k], all(0.f));
     }
     store_rows(to.scales, 3, r, to_scales);
 
@@ -181,31 +201,38 @@ NEECO_INLINE void pose_lanes_backward(const Body& b, const PoseTurn& posed, cons
     add_sums(sums + kPose, r, to_pose, 12);
     add_sums(sums + kSpinEnd, r, to_turn, 4);  // no gradient is wanted of what stands there
 
-    vf to_pivot[3], to_axis[3], along_shares = all(0.f);
+    vf to_origin[3], to_axis[3], to_share[kMostLinks], along_shares = all(0.f);
+    for (int l = 0; l < b.links; l++) to_share[l] = all(0.f);
     for (int joint = b.joints - 1; joint >= 0; joint--) {
-        const float* angles = b.numbers + kBodyNumbers + joint * kHingeNumbers + kAngles;
-        double* hinge_sums = sums + kBodyNumbers + joint * kHingeNumbers;
-        const Pull pull = pull_of(b, r, joint);
-        const vf to_angle = turn_backward(hinge_turn(b, joint, pull.angle), r.point, r.quat, to_point, to_quat, to_pivot, to_axis);
-        const vf to_angles[2] = {to_angle * pull.first, to_angle * pull.second};
-        add_sums(hinge_sums + kPivot, r, to_pivot, 3);
-        add_sums(hinge_sums + kAxis, r, to_axis, 3);
-        add_sums(hinge_sums + kAngles, r, to_angles, 2);
-        along_shares += to_angle * pull.angle;
-        for (int side = 0; side < 2; side++)  // dL/d share; the softmax's own part follows when all of them are known
-            for (int i = 0; i < r.live; i++)
-                to.logits[(size_t)b.logit_count * r.index[i] + 1 + 2 * joint + side] = to_angle[i] * angles[side] * r.gate[i];
-    }
-    for (int part = 0; part <= 2 * b.joints && b.joints; part++) {
-        const vf share = share_of(b, r, part);
-        for (int i = 0; i < r.live; i++) {
-            float* logit = to.logits + (size_t)b.logit_count * r.index[i] + part;
-            *logit = share[i] * ((part ? *logit : 0.f) - along_shares[i]);
+        const float* numbers = joint_of(b, joint);
+        double* own = sums + (numbers - b.numbers);
+        const vf amount = amount_of(b, shares, joint);
+        vf to_amount;
+        if (slides(b, joint)) {
+            slide_point(b, joint, -amount, r.point);
+            vf axis[3];
+            all3(numbers + kAxis, axis);
+            to_amount = dot3(axis, to_point);
+            for (int k = 0; k < 3; k++) to_axis[k] = amount * to_point[k];
+        } else {
+            to_amount = turn_backward(joint_turn(b, joint, amount), r.point, r.quat, to_point, to_quat, to_origin, to_axis);
+            add_sums(own + kOrigin, r, to_origin, 3);
         }
+        add_sums(own + kAxis, r, to_axis, 3);
+        for (int l = 1; l < b.links; l++) {
+            const vf to_value = to_amount * shares.of[l];
+            add_sums(own + kValues + l - 1, r, &to_value, 1);
+            to_share[l] += to_amount * numbers[kValues + l - 1] * r.gate;
+        }
+        along_shares += to_amount * amount;
+    }
+    for (int l = 0; l < b.links && b.joints; l++) {
+        const vf to_logit = share_of(b, r, l) * (to_share[l] - along_shares);
+        for (int i = 0; i < r.live; i++) to.logits[(size_t)b.logit_count * r.index[i] + l] = to_logit[i];
     }
     if (b.roll != 0) {
-        turn_backward(spin, r.point, r.quat, to_point, to_quat, to_pivot, to_axis);
-        add_sums(sums + kShaftOrigin, r, to_pivot, 3);
+        turn_backward(spin, r.point, r.quat, to_point, to_quat, to_origin, to_axis);
+        add_sums(sums + kShaftOrigin, r, to_origin, 3);
         add_sums(sums + kShaftDirection, r, to_axis, 3);
     }
     const vf radial = resting_quat[0] * to_quat[0] + resting_quat[1] * to_quat[1] + resting_quat[2] * to_quat[2] + resting_quat[3] * to_quat[3];
@@ -216,7 +243,7 @@ NEECO_INLINE void pose_lanes_backward(const Body& b, const PoseTurn& posed, cons
 
 static void pose_backward(const Body& b, const PosedRows& from, const PosedRows& to, Buffer<double>& partial, float* to_numbers) {
     const int end = b.first + b.count, chunks = (b.count + kPosingChunk - 1) / kPosingChunk;
-    const size_t numbers = kBodyNumbers + (size_t)b.joints * kHingeNumbers;
+    const size_t numbers = kBodyNumbers + (size_t)b.joints * joint_numbers(b.links);
     double* sums = b.numbers ? partial.reserve((chunks + 1) * numbers) : nullptr;
     const PoseTurn posed = b.numbers ? turn_of_pose(b.numbers + kPose) : PoseTurn{};
     auto chunk = [&](int number) {

@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from hypothesis import strategies as st
 from torch import Tensor
 
-from neeco.raster.posing import HingedBody, pose_bodies
+from neeco.raster.posing import ArticulatedBody, pose_bodies
 from neeco.raster.rotations import rigid_from_vector
 
 GAUSSIANS = ("means", "quats", "log_scales", "logits")
-LEARNED = ("world_from_body", "pivots", "axes", "angles", "shaft_origin", "shaft_direction")
+LEARNED = ("world_from_body", "origins", "axes", "values", "shaft_origin", "shaft_direction")
 ENDS = ("spin_end", "gate_start", "gate_width", "longest")
 
 
 @dataclass
 class World:
-    """float64; `bodies` are None or a dict of `HingedBody`'s tensors and roll."""
+    """float64; `bodies` are None or a dict of `ArticulatedBody`'s tensors and roll."""
 
     gaussians: dict[str, Tensor | None]
     counts: tuple[int, ...]
@@ -25,7 +26,41 @@ class World:
     weights: list[Tensor]  # of the loss, for means, quats and scales
 
 
-def make_world(counts: tuple[int, ...], joints: tuple[int | None, ...], seed: int = 0, roll: float = 0.0) -> World:
+@dataclass(frozen=True)
+class Tree:
+    """The joints of one body, each of which joins a link to its parent: the joint that joins that (-1: it is link 0),
+    and which of them slide."""
+
+    parents: tuple[int, ...] = ()
+    slides: tuple[bool, ...] = ()
+
+    def beyond(self) -> Tensor:
+        """[J, J] 1 where link 1 + column lies beyond joint row, the outermost joint first."""
+        count = len(self.parents)
+        found = torch.zeros(count, count, dtype=torch.float64)
+        for link in range(count):
+            joint = link
+            while joint >= 0:
+                found[joint, link] = 1
+                joint = self.parents[joint]
+        return found.flip(0)  # parents come before their children
+
+
+def hinges(count: int | None) -> Tree | None:
+    """Joints that follow each other on no chain: each moves a link of its own about link 0."""
+    return None if count is None else Tree((-1,) * count, (False,) * count)
+
+
+@st.composite
+def trees(draw: st.DrawFn, most: int = 6) -> Tree:
+    """Any tree, of joints of any kind."""
+    count = draw(st.integers(0, most))
+    parents = tuple(draw(st.integers(-1, joint - 1)) for joint in range(count))
+    kinds = draw(st.lists(st.booleans(), min_size=count, max_size=count))
+    return Tree(parents, tuple(kinds))
+
+
+def make_world(counts: tuple[int, ...], joints: tuple[Tree | None, ...], seed: int = 0, roll: float = 0.0) -> World:
     """`joints` of every body; None: it stands still."""
     g = torch.Generator().manual_seed(seed)
 
@@ -37,15 +72,16 @@ def make_world(counts: tuple[int, ...], joints: tuple[int | None, ...], seed: in
         return torch.nn.functional.normalize(normal(*shape), dim=-1).float().double()
 
     count = sum(counts)
-    most = max((1 + 2 * j for j in joints if j), default=0)
+    most = max((1 + len(tree.parents) for tree in joints if tree and tree.parents), default=0)
     bodies = [
         None
-        if j is None
+        if tree is None
         else {
             "world_from_body": rigid_from_vector(normal(6)).float().double(),
-            "pivots": normal(j, 3),
-            "axes": unit(j, 3),
-            "angles": normal(j, 2),
+            "origins": normal(len(tree.parents), 3),
+            "axes": unit(len(tree.parents), 3),
+            # links that a joint moves may do so by different values, as two jaws on one axis
+            "values": tree.beyond() * normal(len(tree.parents), len(tree.parents)),
             "shaft_origin": 0.1 * normal(3),
             "shaft_direction": unit(3),
             "spin_end": normal(),
@@ -53,8 +89,9 @@ def make_world(counts: tuple[int, ...], joints: tuple[int | None, ...], seed: in
             "gate_width": 0.3 + normal().abs(),
             "longest": 0.5 + normal().abs(),
             "roll": roll,
+            "slides": tree.slides[::-1],
         }
-        for j in joints
+        for tree in joints
     ]
     gaussians = {
         "means": 2 * normal(count, 3),
@@ -71,14 +108,15 @@ def posed(world: World, dtype: torch.dtype, device: str = "cpu") -> tuple[list[T
         name: None if t is None else t.detach().to(device, dtype).requires_grad_()
         for name, t in world.gaussians.items()
     }
-    bodies: list[HingedBody | None] = []
+    bodies: list[ArticulatedBody | None] = []
     for index, given in enumerate(world.bodies):
         if given is None:
             bodies.append(None)
             continue
         own = {name: given[name].detach().to(device, dtype).requires_grad_() for name in LEARNED}
         leaves |= {f"{index}.{name}": tensor for name, tensor in own.items()}
-        bodies.append(HingedBody(**own, **{name: given[name].to(device, dtype) for name in ENDS}, roll=given["roll"]))
+        ends = {name: given[name].to(device, dtype) for name in ENDS}
+        bodies.append(ArticulatedBody(**own, **ends, roll=given["roll"], slides=given["slides"]))
     out = list(pose_bodies(*(leaves[name] for name in GAUSSIANS), world.counts, bodies))
     sum((tensor * weight.to(tensor)).sum() for tensor, weight in zip(out, world.weights, strict=False)).backward()
     gradients = {name: None if t.grad is None else t.grad.cpu() for name, t in leaves.items() if t is not None}

@@ -1,7 +1,8 @@
-"""Posing bodies on hinges: the kernel is its definition, gradients and all, and the same bits every time."""
+"""Posing bodies of links: the kernel is its definition, gradients and all, and the same bits every time."""
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -11,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parent))
-from posing_worlds import assert_same_as_definition, make_world, posed
+from posing_worlds import Tree, assert_same_as_definition, hinges, make_world, posed, trees
 
 from neeco.errors import NeecoError
 from neeco.raster import kernels
 from neeco.raster.native import set_threads
-from neeco.raster.posing import pose_bodies
+from neeco.raster.posing import MOST_JOINTS, ArticulatedBody, pose_bodies
 from neeco.raster.rotations import quat_to_matrix
 
 
@@ -24,33 +25,33 @@ from neeco.raster.rotations import quat_to_matrix
 @pytest.mark.parametrize("joints", [(None,), (0,), (1,), (2,), (None, 1), (None, 3, 0, 2)])
 def test_the_kernel_is_its_definition(simd: str, joints: tuple[int | None, ...], roll: float) -> None:
     counts = tuple(19 + 5 * k for k in range(len(joints)))
-    assert_same_as_definition(make_world(counts, joints, seed=len(joints), roll=roll))
+    assert_same_as_definition(make_world(counts, tuple(map(hinges, joints)), seed=len(joints), roll=roll))
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     counts=st.lists(st.sampled_from([0, 1, 2, 15, 16, 17, 40]), min_size=1, max_size=3),
-    joints=st.lists(st.sampled_from([None, 0, 1, 2]), min_size=3, max_size=3),
+    joints=st.lists(st.none() | trees(), min_size=3, max_size=3),
     seed=st.integers(0, 10_000),
     roll=st.sampled_from([0.0, -3.1, 0.4, 3.1]),
 )
-def test_any_bodies_are_posed_as_defined(counts: list[int], joints: list[int | None], seed: int, roll: float) -> None:
+def test_any_trees_are_posed_as_defined(counts: list[int], joints: list[Tree | None], seed: int, roll: float) -> None:
     assert_same_as_definition(make_world(tuple(counts), tuple(joints[: len(counts)]), seed, roll), 5e-5)
 
 
 def test_more_gaussians_than_one_thread_takes_at_a_time() -> None:
-    assert_same_as_definition(make_world((1500, 2300), (None, 1), seed=4, roll=1.0), 1e-4)
+    assert_same_as_definition(make_world((1500, 2300), (None, hinges(1)), seed=4, roll=1.0), 1e-4)
 
 
 def test_the_definition_has_the_gradients_that_differences_show() -> None:
-    world = make_world((3, 4), (None, 2), seed=2, roll=0.7)
+    world = make_world((3, 4), (None, Tree((-1, 0, 0), (False, True, False))), seed=2, roll=0.7)
     _, gradients = posed(world, torch.float64)
 
     def loss() -> float:
         return float(sum((t * w).sum() for t, w in zip(posed(world, torch.float64)[0], world.weights, strict=False)))
 
     step = 1e-6
-    for name in ("pivots", "axes", "angles"):
+    for name in ("origins", "axes", "values"):
         tensor = world.bodies[1][name]
         before = tensor.clone()
         tensor[0] += step
@@ -62,7 +63,7 @@ def test_the_definition_has_the_gradients_that_differences_show() -> None:
 
 
 def test_the_same_bits_whatever_the_number_of_threads(simd: str) -> None:
-    world = make_world((3000, 5000), (None, 2), seed=5, roll=1.0)
+    world = make_world((3000, 5000), (None, hinges(2)), seed=5, roll=1.0)
     results = []
     try:
         for count in (1, 2, 3):
@@ -85,7 +86,7 @@ def test_a_body_that_stands_still_is_left_as_it_is() -> None:
 
 
 def test_harmonics_turn_as_the_gaussian_does() -> None:
-    world = make_world((30,), (2,), seed=1, roll=1.0)
+    world = make_world((30,), (hinges(2),), seed=1, roll=1.0)
     _, quats, _, frames = posed(world, torch.float32)[0]
     resting = torch.nn.functional.normalize(world.gaussians["quats"].float(), dim=-1)
     assert torch.allclose(quat_to_matrix(quats), quat_to_matrix(frames) @ quat_to_matrix(resting), atol=1e-5)
@@ -93,7 +94,7 @@ def test_harmonics_turn_as_the_gaussian_does() -> None:
 
 @pytest.mark.parametrize("field", ["means", "quats", "log_scales", "logits"])
 def test_a_number_that_is_none_stays_with_its_gaussian(field: str) -> None:
-    world = make_world((20, 20), (None, 1), roll=1.0)
+    world = make_world((20, 20), (None, hinges(1)), roll=1.0)
     expected = posed(world, torch.float32)[0]
     world.gaussians[field][25, 1] = float("nan")
     found = posed(world, torch.float32)[0]
@@ -103,7 +104,7 @@ def test_a_number_that_is_none_stays_with_its_gaussian(field: str) -> None:
 
 
 def test_plain_torch_takes_the_place_of_the_kernel() -> None:
-    world = make_world((20, 20), (None, 1), roll=1.0)
+    world = make_world((20, 20), (None, hinges(1)), roll=1.0)
     native = posed(world, torch.float32)
     with kernels("torch"):
         plain = posed(world, torch.float32)
@@ -127,7 +128,7 @@ def test_what_does_not_fit_is_named() -> None:
         pose_bodies(means, quats, scales, None, (3,), (None,))
     with pytest.raises(NeecoError, match=r"pose_bodies: shapes \(4, 3\), \(4, 3\), \(4, 3\)"):
         pose_bodies(means, scales, scales, None, (4,), (None,))
-    world = make_world((4,), (1,))
+    world = make_world((4,), (hinges(2),))
     world.gaussians["logits"] = torch.zeros(4, 2).double()
     with pytest.raises(NeecoError, match=r"pose_bodies: logits: \(4, 2\); expected \[4, 3 or more\]"):
         posed(world, torch.float32)
@@ -150,5 +151,30 @@ def test_rows_that_do_not_lie_side_by_side_and_mixed_types_are_posed_alike() -> 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_poses_the_same() -> None:
-    world = make_world((700, 900), (None, 2), seed=5, roll=1.0)
+    world = make_world((700, 900), (None, hinges(2)), seed=5, roll=1.0)
     assert_same_as_definition(world, 1e-4, "cuda")
+
+
+def test_a_chain_moves_what_lies_beyond_each_joint() -> None:
+    """A shaft along z, a wrist that bends at 0 about x, a slide beyond it at 10: by hand."""
+    body = ArticulatedBody(
+        torch.eye(4),
+        torch.tensor([[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]]),  # the outermost joint first
+        torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+        torch.tensor([[0.0, 3.0], [math.pi / 2, math.pi / 2]]),  # of the links wrist and slide
+        torch.zeros(3),
+        torch.tensor([0.0, 0.0, 1.0]),
+        *map(torch.tensor, (-math.inf, -1e9, 1.0, 1e9)),
+        slides=(True, False),
+    )
+    logits = 1e3 * torch.eye(3)  # a Gaussian of each link
+    means = torch.tensor([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [0.0, 0.0, 12.0]])
+    moved = pose_bodies(means, torch.eye(4)[:1].expand(3, 4), torch.zeros(3, 3), logits, (3,), (body,))[0]
+    expected = torch.tensor([[0.0, 0.0, -5.0], [0.0, -5.0, 0.0], [0.0, -15.0, 0.0]])
+    assert torch.allclose(moved, expected, atol=1e-5)
+
+
+def test_a_body_of_too_many_joints_is_refused() -> None:
+    world = make_world((2,), (hinges(MOST_JOINTS + 1),))
+    with pytest.raises(NeecoError, match="a body of 32 joints and 33 links; at most 31 and 32"):
+        posed(world, torch.float32)

@@ -161,18 +161,20 @@ def test_the_kernels_of_a_training_step_compile_without_a_gpu(
 
 @here
 @pytest.mark.skipif(ready.interpreted(), reason="the interpreter compiles nothing")
-@pytest.mark.parametrize(("capability", "joints", "roll"), [(80, 2, 1.0), (90, 1, 0.0), (90, 0, 1.0)])
+@pytest.mark.parametrize(
+    ("capability", "joints", "slides", "roll"), [(80, 2, 2, 1.0), (90, 1, 0, 0.0), (90, 0, 0, 1.0)]
+)
 def test_the_kernels_of_posing_compile_without_a_gpu(
-    capability: int, joints: int, roll: float, compiled: dict[str, Any]
+    capability: int, joints: int, slides: int, roll: float, compiled: dict[str, Any]
 ) -> None:
     import triton
 
     from neeco.raster.triton.posing import Posing
 
     triton.runtime.driver.set_active(NoDevice(capability))
-    numbers, shapes = [None, torch.rand(22 + 8 * joints)], [(9, 3), (9, 4), (9, 3), (9, 5)]
+    numbers, shapes = [None, torch.rand(22 + joints * (6 + joints))], [(9, 3), (9, 4), (9, 3), (9, 5)]
     given = [torch.rand(shape) for shape in shapes]
-    posing = Posing(*given, (4, 5), numbers, (0.0, roll))
+    posing = Posing(*given, (4, 5), numbers, ((0, 0, 0.0), (1 + joints, slides, roll)))
     out = [torch.empty(9, columns) for columns in (3, 4, 3, 4)]
     posing.forward(*out)
     posing.backward(*out[:3], *given, [None, torch.empty_like(numbers[1])])

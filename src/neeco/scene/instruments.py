@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
 from neeco.raster.devices import CachedPredicate
-from neeco.raster.posing import HingedBody, part_weights
+from neeco.raster.posing import ArticulatedBody, link_weights
 from neeco.raster.rotations import rotate_about
 from neeco.scene.canonical import CanonicalGaussians
 
@@ -106,14 +106,15 @@ class Hinges(nn.Module):
         origin, direction = self.shaft()
         return (points - origin) @ direction
 
-    def body(self, world_from_instrument: Tensor, joints: Mapping[str, float], roll: float = 0.0) -> HingedBody:
+    def body(self, world_from_instrument: Tensor, joints: Mapping[str, float], roll: float = 0.0) -> ArticulatedBody:
         """How the instrument's Gaussians stand at these readings, all that lies behind the wrist spun by `roll` rad."""
         turned = [joints[name] - self.middle[joint] for joint, name in enumerate(self.joint_names)]
         shaft = self.shaft()
-        return HingedBody(
+        angles = self.offsets + self.gains * torch.stack(turned)[:, None] if turned else self.offsets
+        return ArticulatedBody(
             world_from_instrument,
             *self.hinges(shaft),
-            self.offsets + self.gains * torch.stack(turned)[:, None] if turned else self.offsets,
+            torch.block_diag(*angles.split(1)) if len(turned) > 1 else angles,  # a joint moves its own two parts
             *shaft,
             self.wrist_start,
             *self._gate(),
@@ -130,7 +131,7 @@ class Hinges(nn.Module):
 
     def part_weights(self, points: Tensor, logits: Tensor) -> Tensor:
         """Part weights [M, part_count] of Gaussians at points [M, 3] mm with part logits [M, part_count or more]."""
-        return part_weights(points, logits[:, : self.part_count], self.shaft(), *self._gate())
+        return link_weights(points, logits[:, : self.part_count], self.shaft(), *self._gate())
 
     def bend(self, points: Tensor, weights: Tensor, joints: Mapping[str, float]) -> Tensor:
         """Move points [M, 3] by the joints; weights [M, part_count] sum to 1 over parts: body, then two per joint."""

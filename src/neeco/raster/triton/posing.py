@@ -1,4 +1,4 @@
-"""Posing bodies whose parts turn about hinges, as `neeco.raster.posing` defines it: a Gaussian per lane."""
+"""Posing bodies of links that joints move, as `neeco.raster.posing` defines it: a Gaussian per lane."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from neeco.raster.triton.ready import working_on
 # where the numbers of a body begin
 SHAFT_ORIGIN, SHAFT_DIRECTION = tl.constexpr(12), tl.constexpr(15)
 SPIN_END, GATE_START, GATE_WIDTH, LONGEST = tl.constexpr(18), tl.constexpr(19), tl.constexpr(20), tl.constexpr(21)
-BODY, HINGE = tl.constexpr(22), tl.constexpr(8)  # how many, and of each joint: pivot, axis, angles
+BODY, VALUES = tl.constexpr(22), tl.constexpr(6)  # how many; of each joint: origin, axis, then values of links
 
 
 @triton.jit
@@ -96,29 +96,45 @@ def along_shaft(numbers, x, y, z):
 
 
 @triton.jit
-def softmax_of(logits, g, inside, JOINTS: tl.constexpr, LOGITS: tl.constexpr):
+def softmax_of(logits, g, inside, LINKS: tl.constexpr, LOGITS: tl.constexpr):
     """The greatest logit and the sum of all exponentials less by it."""
     greatest = tl.load(logits + g * LOGITS, inside, other=0.0)
-    for part in tl.static_range(1, 1 + 2 * JOINTS):
-        greatest = tl.maximum(greatest, tl.load(logits + g * LOGITS + part, inside, other=0.0))
+    for link in tl.static_range(1, LINKS):
+        greatest = tl.maximum(greatest, tl.load(logits + g * LOGITS + link, inside, other=0.0))
     total = 0.0 * greatest
-    for part in tl.static_range(1 + 2 * JOINTS):
-        total += tl.exp(tl.load(logits + g * LOGITS + part, inside, other=0.0) - greatest)
+    for link in tl.static_range(LINKS):
+        total += tl.exp(tl.load(logits + g * LOGITS + link, inside, other=0.0) - greatest)
     return greatest, total
 
 
 @triton.jit
-def share_of(logits, part, g, inside, greatest, total, LOGITS: tl.constexpr):
-    return tl.exp(tl.load(logits + g * LOGITS + part, inside, other=0.0) - greatest) / total
+def share_of(logits, link, g, inside, greatest, total, LOGITS: tl.constexpr):
+    return tl.exp(tl.load(logits + g * LOGITS + link, inside, other=0.0) - greatest) / total
 
 
 @triton.jit
-def pull_of(logits, numbers, joint, g, inside, greatest, total, gate, LOGITS: tl.constexpr):
-    """A joint's two parts' shares of turning, and the angle they come to."""
-    first = share_of(logits, 1 + 2 * joint, g, inside, greatest, total, LOGITS) * gate
-    second = share_of(logits, 2 + 2 * joint, g, inside, greatest, total, LOGITS) * gate
-    angles = numbers + BODY + joint * HINGE + 6
-    return first, second, first * tl.load(angles) + second * tl.load(angles + 1)
+def moving_of(logits, g, inside, greatest, total, gate, LINKS: tl.constexpr, LOGITS: tl.constexpr):
+    """How much of a Gaussian moves with any link."""
+    moving = 0.0 * gate
+    for link in tl.static_range(1, LINKS):
+        moving += share_of(logits, link, g, inside, greatest, total, LOGITS) * gate
+    return moving
+
+
+@triton.jit
+def amount_of(logits, joint, g, inside, greatest, total, gate, LINKS: tl.constexpr, LOGITS: tl.constexpr):
+    """By how much the joint whose numbers are there turns or slides a Gaussian."""
+    amount = 0.0 * gate
+    for link in tl.static_range(1, LINKS):
+        share = share_of(logits, link, g, inside, greatest, total, LOGITS) * gate
+        amount += share * tl.load(joint + VALUES + link - 1)
+    return amount
+
+
+@triton.jit
+def slide(axis, amount, x, y, z):
+    nx, ny, nz = three(axis)
+    return x + amount * nx, y + amount * ny, z + amount * nz
 
 
 @triton.jit
@@ -136,7 +152,8 @@ def spin_of(numbers, roll, x, y, z):
 @triton.jit(do_not_specialize=["roll", "start", "count"])
 def pose_kernel(
     means, quats, log_scales, logits, numbers, roll, to_means, to_quats, to_scales, to_frames, start, count,
-    SPINS: tl.constexpr, JOINTS: tl.constexpr, LOGITS: tl.constexpr, BLOCK: tl.constexpr,
+    SPINS: tl.constexpr, JOINTS: tl.constexpr, LINKS: tl.constexpr, SLIDES: tl.constexpr, LOGITS: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One body; numbers None: it stands still."""
     lane = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -153,20 +170,22 @@ def pose_kernel(
         rw, rx, ry, rz = qw, qx, qy, qz
         if JOINTS > 0:
             gate = gate_of(numbers, x, y, z)
-            greatest, total = softmax_of(logits, g, inside, JOINTS, LOGITS)
-            turning = 0.0 * gate
+            greatest, total = softmax_of(logits, g, inside, LINKS, LOGITS)
+            moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
         if SPINS:
             x, y, z, qw, qx, qy, qz = turn(
                 numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z),
                 x, y, z, qw, qx, qy, qz,
             )  # fmt: skip
         for joint in tl.static_range(JOINTS):
-            first, second, angle = pull_of(logits, numbers, joint, g, inside, greatest, total, gate, LOGITS)
-            turning += first + second
-            hinge = numbers + BODY + joint * HINGE
-            x, y, z, qw, qx, qy, qz = turn(hinge, hinge + 3, angle, x, y, z, qw, qx, qy, qz)
+            own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
+            amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
+            if (SLIDES >> joint) & 1:
+                x, y, z = slide(own_numbers + 3, amount, x, y, z)
+            else:
+                x, y, z, qw, qx, qy, qz = turn(own_numbers, own_numbers + 3, amount, x, y, z, qw, qx, qy, qz)
         if JOINTS > 0:
-            longest = tl.load(numbers + LONGEST) / tl.maximum(turning, 1e-6)
+            longest = tl.load(numbers + LONGEST) / tl.maximum(moving, 1e-6)
             sx, sy, sz = tl.minimum(sx, longest), tl.minimum(sy, longest), tl.minimum(sz, longest)
         _, a, b, c, d, length = pose_row(numbers)
         qw, qx, qy, qz = product(a / length, b / length, c / length, d / length, qw, qx, qy, qz)
@@ -235,9 +254,10 @@ def turn_backward(pivot, axis, angle, sums_pivot, sums_axis, inside, x, y, z, qw
 def pose_backward_kernel(
     means, quats, log_scales, logits, numbers, roll, from_means, from_quats, from_scales,
     to_means, to_quats, to_log_scales, to_logits, sums, start, count,
-    SPINS: tl.constexpr, JOINTS: tl.constexpr, LOGITS: tl.constexpr, BLOCK: tl.constexpr,
+    SPINS: tl.constexpr, JOINTS: tl.constexpr, LINKS: tl.constexpr, SLIDES: tl.constexpr, LOGITS: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """sums [programs, 22 + 8 J]: of dL/d numbers; dL/d the pose's quaternion stands where no gradient is wanted."""
+    """sums [programs, 22 + J (5 + L)]: of dL/d numbers; dL/d the pose's quaternion stands where none is wanted."""
     lane = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = lane < count
     g = start + lane
@@ -248,25 +268,27 @@ def pose_backward_kernel(
     wx, wy, wz = triple(from_scales, g, inside)
     wx, wy, wz = wx * sx, wy * sy, wz * sz
     if numbers is not None:
-        own = sums + tl.program_id(0) * (BODY + JOINTS * HINGE)
+        own = sums + tl.program_id(0) * (BODY + JOINTS * (VALUES + LINKS - 1))
         x, y, z, qw, qx, qy, qz, norm = resting(means, quats, g, inside)
         rw, rx, ry, rz = qw, qx, qy, qz
         spin = spin_of(numbers, roll, x, y, z)
         if JOINTS > 0:
             gate = gate_of(numbers, x, y, z)
-            greatest, total = softmax_of(logits, g, inside, JOINTS, LOGITS)
-            turning = 0.0 * gate
+            greatest, total = softmax_of(logits, g, inside, LINKS, LOGITS)
+            moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
         if SPINS:
             x, y, z, qw, qx, qy, qz = turn(
                 numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin, x, y, z, qw, qx, qy, qz
             )  # fmt: skip
         for joint in tl.static_range(JOINTS):
-            first, second, angle = pull_of(logits, numbers, joint, g, inside, greatest, total, gate, LOGITS)
-            turning += first + second
-            hinge = numbers + BODY + joint * HINGE
-            x, y, z, qw, qx, qy, qz = turn(hinge, hinge + 3, angle, x, y, z, qw, qx, qy, qz)
+            own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
+            amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
+            if (SLIDES >> joint) & 1:
+                x, y, z = slide(own_numbers + 3, amount, x, y, z)
+            else:
+                x, y, z, qw, qx, qy, qz = turn(own_numbers, own_numbers + 3, amount, x, y, z, qw, qx, qy, qz)
         if JOINTS > 0:
-            longest = tl.load(numbers + LONGEST) / tl.maximum(turning, 1e-6)
+            longest = tl.load(numbers + LONGEST) / tl.maximum(moving, 1e-6)
             wx = tl.where(sx < longest, wx, 0.0)
             wy = tl.where(sy < longest, wy, 0.0)
             wz = tl.where(sz < longest, wz, 0.0)
@@ -285,29 +307,37 @@ def pose_backward_kernel(
         put_sum(own + SPIN_END + 3, tz, inside)
         _, a, b, c, d, length = pose_row(numbers)
         hw, hx, hy, hz = product(a / length, 0.0 - b / length, 0.0 - c / length, 0.0 - d / length, hw, hx, hy, hz)
-        shared = 0.0 * gx  # sum over parts of share times dL/d share
+        shared = 0.0 * gx  # sum over links of share times dL/d share
         for undone in tl.static_range(JOINTS):
             joint = JOINTS - 1 - undone
-            first, second, angle = pull_of(logits, numbers, joint, g, inside, greatest, total, gate, LOGITS)
-            hinge, to_hinge = numbers + BODY + joint * HINGE, own + BODY + joint * HINGE
-            x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz, to_angle = turn_backward(
-                hinge, hinge + 3, angle, to_hinge, to_hinge + 3, inside, x, y, z, qw, qx, qy, qz, gx, gy, gz,
-                hw, hx, hy, hz,
-            )  # fmt: skip
-            put_sum(to_hinge + 6, to_angle * first, inside)
-            put_sum(to_hinge + 7, to_angle * second, inside)
-            shared += to_angle * angle
-            tl.store(to_logits + g * LOGITS + 1 + 2 * joint, to_angle * tl.load(hinge + 6) * gate, inside)
-            tl.store(to_logits + g * LOGITS + 2 + 2 * joint, to_angle * tl.load(hinge + 7) * gate, inside)
-        if JOINTS > 0:
+            own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
+            to_numbers = own + BODY + joint * (VALUES + LINKS - 1)
+            amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
+            if (SLIDES >> joint) & 1:
+                x, y, z = slide(own_numbers + 3, 0.0 - amount, x, y, z)
+                nx, ny, nz = three(own_numbers + 3)
+                to_amount = nx * gx + ny * gy + nz * gz
+                put_sum(to_numbers + 3, amount * gx, inside)
+                put_sum(to_numbers + 4, amount * gy, inside)
+                put_sum(to_numbers + 5, amount * gz, inside)
+            else:
+                x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz, to_amount = turn_backward(
+                    own_numbers, own_numbers + 3, amount, to_numbers, to_numbers + 3, inside, x, y, z, qw, qx, qy, qz,
+                    gx, gy, gz, hw, hx, hy, hz,
+                )  # fmt: skip
+            shared += to_amount * amount
+            for link in tl.static_range(1, LINKS):
+                share = share_of(logits, link, g, inside, greatest, total, LOGITS) * gate
+                put_sum(to_numbers + VALUES + link - 1, to_amount * share, inside)
+                at = to_logits + g * LOGITS + link  # zero before the first joint
+                to_share = to_amount * tl.load(own_numbers + VALUES + link - 1) * gate
+                tl.store(at, tl.load(at, inside, other=0.0) + to_share, inside)
             tl.debug_barrier()  # what was written is read again
-            tl.store(
-                to_logits + g * LOGITS, 0.0 - share_of(logits, 0, g, inside, greatest, total, LOGITS) * shared, inside
-            )
-            for part in tl.static_range(1, 1 + 2 * JOINTS):
-                to_share = tl.load(to_logits + g * LOGITS + part, inside, other=0.0) - shared
-                share = share_of(logits, part, g, inside, greatest, total, LOGITS)
-                tl.store(to_logits + g * LOGITS + part, share * to_share, inside)
+        if JOINTS > 0:
+            for link in tl.static_range(LINKS):
+                at = to_logits + g * LOGITS + link
+                share = share_of(logits, link, g, inside, greatest, total, LOGITS)
+                tl.store(at, share * (tl.load(at, inside, other=0.0) - shared), inside)
         if SPINS:
             x, y, z, qw, qx, qy, qz, gx, gy, gz, hw, hx, hy, hz, _ = turn_backward(
                 numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin, own + SHAFT_ORIGIN, own + SHAFT_DIRECTION,
@@ -367,8 +397,9 @@ BLOCK = 128  # Gaussians per program
 
 
 class Posing:
-    """Bodies that follow each other in the rows, `counts` long; where a body's numbers are None it stands still. All
-    tensors are float32, contiguous and on one device."""
+    """Bodies that follow each other in the rows, `counts` long; where a body's numbers are None it stands still. `how`:
+    of each how many links it has, which joints slide (bits) and by how much it rolls. All tensors are float32,
+    contiguous and on one device."""
 
     def __init__(
         self,
@@ -378,21 +409,21 @@ class Posing:
         logits: Tensor | None,
         counts: Sequence[int],
         numbers: Sequence[Tensor | None],
-        rolls: Sequence[float],
+        how: Sequence[tuple[int, int, float]],
     ) -> None:
         self.given = (means, quats, log_scales, logits)
         self.columns = 0 if logits is None else logits.shape[1]
         starts = [sum(counts[:body]) for body in range(len(counts))]
-        self.bodies = list(zip(starts, counts, numbers, rolls, strict=True))
+        self.bodies = list(zip(starts, counts, numbers, how, strict=True))
 
     def forward(self, means: Tensor, quats: Tensor, scales: Tensor, frames: Tensor) -> None:
         """Write what is posed."""
         with working_on(means.device):
-            for start, count, numbers, roll in self.bodies:
+            for start, count, numbers, how in self.bodies:
                 if count:
                     pose_kernel[(triton.cdiv(count, BLOCK),)](
-                        *self.given, numbers, roll, means, quats, scales, frames, start, count,
-                        **self._how(numbers, roll),
+                        *self.given, numbers, how[2], means, quats, scales, frames, start, count,
+                        **self._how(numbers, *how),
                     )  # fmt: skip
 
     def backward(
@@ -408,14 +439,14 @@ class Posing:
     ) -> None:
         """Write gradients of what was given, zeros before, from those of means, quats and scales."""
         with working_on(means.device):
-            for (start, count, numbers, roll), to in zip(self.bodies, to_numbers, strict=True):
+            for (start, count, numbers, how), to in zip(self.bodies, to_numbers, strict=True):
                 if not count:
                     continue
                 programs = triton.cdiv(count, BLOCK)
                 sums = None if numbers is None else torch.zeros(programs, len(numbers), device=means.device)
                 pose_backward_kernel[(programs,)](
-                    *self.given, numbers, roll, means, quats, scales, to_means, to_quats, to_log_scales, to_logits,
-                    sums, start, count, **self._how(numbers, roll),
+                    *self.given, numbers, how[2], means, quats, scales, to_means, to_quats, to_log_scales, to_logits,
+                    sums, start, count, **self._how(numbers, *how),
                 )  # fmt: skip
                 if numbers is not None:
                     width = len(numbers)
@@ -430,11 +461,13 @@ class Posing:
                         enable_fp_fusion=True,
                     )
 
-    def _how(self, numbers: Tensor | None, roll: float) -> dict[str, int | bool]:
-        joints = 0 if numbers is None else (len(numbers) - BODY.value) // HINGE.value
+    def _how(self, numbers: Tensor | None, links: int, slides: int, roll: float) -> dict[str, int | bool]:
+        joints = 0 if numbers is None else (len(numbers) - BODY.value) // (VALUES.value + links - 1)
         return {
             "SPINS": numbers is not None and roll != 0,
             "JOINTS": joints,
+            "LINKS": links,
+            "SLIDES": slides,
             "LOGITS": self.columns,
             "BLOCK": BLOCK,
             "num_warps": 4,

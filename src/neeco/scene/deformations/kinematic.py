@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.raster.posing import HingedBody, pose_bodies
+from neeco.raster.posing import ArticulatedBody, pose_bodies
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.breathing import RATES as BREATHING_RATES
 from neeco.scene.breathing import BreathingTissue
@@ -123,7 +123,7 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
-        bodies: list[HingedBody | None] = [None]  # tissue does not turn
+        bodies: list[ArticulatedBody | None] = [None]  # tissue does not turn
         for index, instrument in enumerate(self.instruments):
             given = state_of(instrument, state)
             bodies.append(self.hinges_of(index).body(given.pose.to(canonical.means), given.joints, roll))
