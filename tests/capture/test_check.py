@@ -15,6 +15,7 @@ from PIL import Image
 from neeco.capture import check_capture, errors_only, read_capture, transforms
 from neeco.capture.check import read_checked
 from neeco.capture.points import read_ply, write_ply
+from neeco.capture.writer import fingerprint, write_capture
 from neeco.cli import check as check_verb
 from neeco.errors import NeecoError
 
@@ -374,3 +375,42 @@ def test_an_image_whose_size_nothing_states_is_told_once_when_damaged(folder):
     (folder.root / "images/000005.png").write_bytes(b"")
     (line,) = told(folder, "frames[5].file_path")
     assert "not an image file" in line
+
+
+WRIST = {"name": "wrist", "parent": "shaft", "type": "revolute", "axis": [1, 0, 0], "value": {"jaw_angle": 1.0}}
+
+
+def _tree(**changes):
+    tree = {"links": [{"name": "shaft"}, WRIST | changes]}
+    return lambda document: document.__setitem__(
+        "instruments", [{"name": document["frames"][0]["instruments"][0]["name"], "joints": {}, "kinematics": tree}]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "field", "words", "severity"),
+    [
+        ({}, "instruments", "are read and checked, but not learned from yet", "warning"),
+        ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
+        ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits -1 .. 1", "warning"),
+        ({"parent": "wrist"}, "instruments[0].kinematics.links", "are joined in a circle", "error"),
+        ({"type": "hinge"}, "instruments[0].kinematics.links[1].type", "is 'hinge'", "error"),
+    ],
+)
+def test_kinematics_are_checked(folder, changes, field, words, severity):
+    folder.edit(_tree(**changes))
+    assert_found(folder, field, words, severity)
+
+
+def test_kinematics_are_kept_and_told_apart(folder, tmp_path):
+    before = fingerprint(read_capture(folder.root))
+    folder.edit(_tree())
+    capture = read_capture(folder.root)
+    write_capture(capture, tmp_path / "again")
+    again = read_capture(tmp_path / "again")
+    assert again.instruments == capture.instruments
+    assert again.instruments[0].kinematics.readings == ("jaw_angle",)
+    folder.edit(_tree(offset=0.1))
+    other = read_capture(folder.root)
+    assert other.instruments != capture.instruments
+    assert len({before, fingerprint(capture), fingerprint(other)}) == 3

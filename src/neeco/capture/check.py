@@ -19,6 +19,7 @@ import torch
 
 from neeco.capture.check_geometry import check_geometry
 from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.statefile import passes_limits
@@ -233,6 +234,8 @@ def _check_states(parsed: Parsed) -> None:
                 place.child("instruments").error(message, "give its pose or drop the frame")
         for joint in instrument.joints:
             _check_joint(parsed, instrument, joint)
+        if instrument.kinematics is not None:
+            _check_kinematics(parsed, instrument, instrument.kinematics)
     _check_changes(parsed)
 
 
@@ -257,6 +260,29 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     if largest is not None and limits is None and not is_length and abs(largest[0]) > FULL_TURN:
         message = f"reaches {largest[0]:g} rad, more than a full turn: degrees?"
         largest[1].error(message, "give radians; state the joint's limits in the header if it does turn that far")
+
+
+def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTree) -> None:
+    """Readings that a tree takes and nobody recorded, and values of its joints beyond their limits."""
+    place, name = parsed.header("instruments"), printable(instrument.name)
+    if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
+        recorded = ", ".join(instrument.joints) or "none"
+        place.error(
+            f"kinematics of {name}: {printable(missing[0])} is no joint of it (recorded: {recorded})",
+            "name the recorded readings under `value`",
+        )
+        return
+    place.warning(
+        f"kinematics of {name} are read and checked, but not learned from yet", "its joints are found from the images"
+    )
+    states = [state for _, state in parsed.states_of(instrument.name) if set(tree.readings) <= set(state.joints)]
+    for link in tree.links:
+        values = [link.joint_value(state.joints) for state in states]
+        beyond = [value for value in values if passes_limits(value, link.limits)]
+        if beyond:
+            low, high = link.limits or (0.0, 0.0)
+            message = f"joint of link {printable(link.name)} of {name}: {beyond[0]:g} in {len(beyond)} of {len(values)}"
+            place.warning(f"{message} frames, outside its limits {low:g} .. {high:g}", "check its gains and offset")
 
 
 def _check_changes(parsed: Parsed) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
+from neeco.capture.kinematics import KinematicTree
 from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
 from neeco.raster.rotations import as_pose
@@ -73,10 +74,12 @@ class State:
 
 @dataclass(frozen=True)
 class Instrument:
-    """One tracked rigid body and its joints. `joints`: name -> (lower, upper) limit in rad, or None when not stated."""
+    """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
+    or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
+    kinematics: KinematicTree | None = None
 
 
 @dataclass(frozen=True)

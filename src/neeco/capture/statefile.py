@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.capture.kinematicsfile import parse_kinematics
 from neeco.capture.model import Frame, Instrument, InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import read_text
@@ -96,7 +97,7 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
 
 
 def declared_instruments(document: Node) -> tuple[Instrument, ...]:
-    """The instruments of the header, with their joints' limits; () where the header lists none."""
+    """The instruments of the header, with their joints' limits and kinematics; () where the header lists none."""
     if not document.has("instruments"):
         return ()
     instruments: dict[str, Instrument] = {}
@@ -112,7 +113,8 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
             continue
         if name in instruments:
             item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
-        instruments[name] = Instrument(name, joints)
+        tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
+        instruments[name] = Instrument(name, joints, tree)
     return tuple(instruments.values())
 
 
@@ -124,7 +126,8 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
             known = joints.setdefault(name, {})
             for joint in state.joints:
                 known.setdefault(joint, None)
-    return tuple(Instrument(name, limits) for name, limits in joints.items())
+    trees = {item.name: item.kinematics for item in declared}
+    return tuple(Instrument(name, limits, trees.get(name)) for name, limits in joints.items())
 
 
 def _joint_nodes(item: Node) -> dict[str, Node] | None:

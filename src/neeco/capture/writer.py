@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.images import has_alpha, write_image
-from neeco.capture.model import Capture, Frame, swap_camera_axes
+from neeco.capture.model import Capture, Frame, Instrument, swap_camera_axes
 from neeco.capture.points import write_ply
 from neeco.capture.statefile import camera_to_json, state_to_json
 from neeco.capture.transforms import SCHEMA
@@ -58,15 +58,7 @@ def write_capture(
     names = _names(capture)
     header: dict[str, Any] = {"schema": SCHEMA, "camera_model": "PINHOLE", "units": "mm"}
     header["instrument_frame"] = "world" if capture.registered else "unregistered"
-    header["instruments"] = [
-        {
-            "name": instrument.name,
-            "joints": {
-                joint: {} if limits is None else {"limits": list(limits)} for joint, limits in instrument.joints.items()
-            },
-        }
-        for instrument in capture.instruments
-    ]
+    header["instruments"] = [_instrument_to_json(instrument) for instrument in capture.instruments]
     if capture.lens is not None:
         header["lens"] = capture.lens.to_json()
     pixels = [None] * len(names) if images is None else images
@@ -98,11 +90,20 @@ def fingerprint(capture: Capture) -> str:
             digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
     instruments = [[item.name, dict(item.joints)] for item in capture.instruments]
     digest.update(json.dumps([instruments, capture.registered, capture.timed]).encode())
-    if capture.lens is not None:  # captures without one keep the fingerprint that older versions noted
+    for item in capture.instruments:
+        if item.kinematics is not None:  # captures without keep the fingerprint that older versions noted
+            digest.update(json.dumps(item.kinematics.to_json()).encode())
+    if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     for numbers in (capture.points.positions, capture.points.colors):
         digest.update(numbers.tobytes())
     return digest.hexdigest()
+
+
+def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
+    joints = {joint: {} if limits is None else {"limits": list(limits)} for joint, limits in instrument.joints.items()}
+    written = {"name": instrument.name, "joints": joints}
+    return written if instrument.kinematics is None else written | {"kinematics": instrument.kinematics.to_json()}
 
 
 def _names(capture: Capture) -> list[str]:

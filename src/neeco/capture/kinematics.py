@@ -1,0 +1,193 @@
+"""Kinematic trees: the links of an instrument, what joins them, and where they stand at a state's readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neeco.errors import NeecoError
+from neeco.raster.rotations import rigid_fault
+
+FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"
+JOINT_TYPES = (FIXED, REVOLUTE, PRISMATIC)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A rigid piece, and the joint that joins it to its parent.
+
+    `origin` [4, 4] is parent_from_link, mm, where the joint's value is 0; `axis` [3] unit, in the parent's frame. The
+    joint turns the link about the axis through the origin (revolute, rad) or slides it along (prismatic, mm), by its
+    value: the sum of readings, each times its gain, plus `offset`. `body`: there is something of the instrument to see
+    that moves with the link; otherwise it is a frame only, such as the point that a robot reports.
+    """
+
+    name: str
+    parent: str | None = None  # None: the tree's root
+    type: str = FIXED
+    origin: Array = field(default_factory=lambda: np.eye(4))
+    axis: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    value: Mapping[str, float] = field(default_factory=dict)  # gain of every reading that drives the joint
+    offset: float = 0.0  # rad or mm
+    limits: tuple[float, float] | None = None  # of the value
+    body: bool = True
+
+    def joint_value(self, readings: Mapping[str, float]) -> float:
+        """rad, or mm where the joint slides, at a state's readings. Raises KeyError for a reading that is missing."""
+        return sum((gain * readings[name] for name, gain in self.value.items()), self.offset)
+
+    def parent_from_link(self, readings: Mapping[str, float]) -> Array:
+        """[4, 4] mm at a state's readings."""
+        if self.type == FIXED:
+            return self.origin
+        value, moved = self.joint_value(readings), np.eye(4)
+        if self.type == PRISMATIC:
+            moved[:3, 3] = value * self.axis
+            return moved @ self.origin
+        moved[:3, :3] = _rotation(self.axis, value)
+        moved[:3, 3] = self.origin[:3, 3] - moved[:3, :3] @ self.origin[:3, 3]
+        return moved @ self.origin
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicTree:
+    """Links from the root on. A recorded pose is that of the link `pose_of` (None: the root).
+
+    Raises NeecoError where the links are no tree.
+    """
+
+    links: tuple[Link, ...]
+    pose_of: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "links", _parents_first(self.links))
+        if self.pose_of is not None and self.pose_of not in self._index:
+            raise NeecoError(f"pose_of: there is no link {self.pose_of!r}; name one of {', '.join(self._index)}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, KinematicTree) and self.to_json() == other.to_json()
+
+    def __hash__(self) -> int:
+        return hash((self.pose_of, *(link.name for link in self.links)))
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {link.name: index for index, link in enumerate(self.links)}
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """Names of all readings that drive a joint, in the order of the links."""
+        return tuple(dict.fromkeys(name for link in self.links for name in link.value))
+
+    @property
+    def bodies(self) -> tuple[Link, ...]:
+        """Links with something to see, parents first."""
+        return tuple(link for link in self.links if link.body)
+
+    @property
+    def joints(self) -> tuple[Link, ...]:
+        """Links whose joint moves, the outermost first: the order in which joints move what is at rest."""
+        return tuple(link for link in reversed(self.links) if link.type != FIXED)
+
+    def poses(self, readings: Mapping[str, float]) -> dict[str, Array]:
+        """root_from_link [4, 4] mm of every link (forward kinematics). Raises KeyError for a reading that is
+        missing."""
+        found: dict[str, Array] = {}
+        for link in self.links:
+            here = link.parent_from_link(readings)
+            found[link.name] = here if link.parent is None else found[link.parent] @ here
+        return found
+
+    def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
+        """[4, 4] mm from the recorded pose of the link `pose_of`."""
+        if self.pose_of is None:
+            return pose
+        root_from_link = self.poses(readings)[self.pose_of]
+        back: Array = pose @ np.linalg.inv(root_from_link)
+        return back
+
+    @cached_property
+    def axes_at_rest(self) -> tuple[Array, Array]:
+        """(points [J, 3] mm, unit directions [J, 3]) of the axes of `joints` in the root's frame, where the values of
+        all joints are 0."""
+        rest: dict[str, Array] = {}
+        for link in self.links:
+            rest[link.name] = link.origin if link.parent is None else rest[link.parent] @ link.origin
+        points = [rest[link.name][:3, 3] for link in self.joints]
+        parents = [np.eye(4) if link.parent is None else rest[link.parent] for link in self.joints]
+        directions = [parent[:3, :3] @ link.axis for parent, link in zip(parents, self.joints, strict=True)]
+        return np.array(points).reshape(-1, 3), np.array(directions).reshape(-1, 3)
+
+    def values(self, readings: Mapping[str, float]) -> Array:
+        """[J, B] by which each of `joints` turns or slides each of `bodies`: its value for links that lie beyond it, 0
+        for others. With `axes_at_rest` all that posing takes. Raises KeyError for a reading that is missing."""
+        rows = [[link.joint_value(readings) * self._beyond(link, body) for body in self.bodies] for link in self.joints]
+        return np.array(rows, np.float64).reshape(len(self.joints), len(self.bodies))
+
+    def _beyond(self, joint: Link, body: Link) -> bool:
+        """Whether `body` moves with the joint of `joint`."""
+        link: Link | None = body
+        while link is not None and link.name != joint.name:
+            link = None if link.parent is None else self.links[self._index[link.parent]]
+        return link is not None
+
+    def to_json(self) -> dict[str, Any]:
+        """What `neeco.capture.kinematicsfile` reads."""
+        written: dict[str, Any] = {"links": [_link_to_json(link) for link in self.links]}
+        return written if self.pose_of is None else {"pose_of": self.pose_of} | written
+
+
+def _link_to_json(link: Link) -> dict[str, Any]:
+    shifted_only = np.array_equal(link.origin[:3, :3], np.eye(3))
+    written: dict[str, Any] = {"name": link.name}
+    written |= {} if link.parent is None else {"parent": link.parent}
+    written |= {"type": link.type, "origin": (link.origin[:3, 3] if shifted_only else link.origin).tolist()}
+    if link.type != FIXED:
+        written |= {"axis": link.axis.tolist(), "value": dict(link.value), "offset": link.offset}
+    written |= {} if link.limits is None else {"limits": list(link.limits)}
+    return written if link.body else written | {"body": False}
+
+
+def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
+    """The links of a tree, its root first. Raises NeecoError where they are none."""
+    names = [link.name for link in links]
+    if not links:
+        raise NeecoError("there are no links; give at least the root")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise NeecoError(f"{twice[0]!r} comes twice; give every link a name of its own")
+    roots = [link for link in links if link.parent is None]
+    if len(roots) != 1:
+        found = ", ".join(repr(link.name) for link in roots) or "none"
+        raise NeecoError(f"one link has no parent, the root; found {found}")
+    for link in links:
+        if link.parent is not None and link.parent not in names:
+            raise NeecoError(f"{link.name!r}: its parent {link.parent!r} is no link; name one of {', '.join(names)}")
+        if link.type == FIXED and link.value:
+            raise NeecoError(f"{link.name!r}: readings drive a fixed joint; make it revolute or prismatic")
+        if link.parent is None and link.type != FIXED:
+            raise NeecoError(f"{link.name!r}: the root has no parent to move against; leave its type out")
+        if (fault := rigid_fault(link.origin)) is not None:
+            raise NeecoError(f"{link.name!r}: origin: {fault[0]}; {fault[1]}")
+    ordered = list(roots)
+    for link in ordered:  # grows as it is gone through
+        ordered += [child for child in links if child.parent == link.name]
+    if len(ordered) < len(links):
+        circle = sorted(set(names) - {link.name for link in ordered})
+        raise NeecoError(f"{', '.join(map(repr, circle))} are joined in a circle; every link needs a way to the root")
+    return tuple(ordered)
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    """[3, 3] about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    found: Array = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return found
