@@ -18,6 +18,7 @@ from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
+from neeco.training import initial
 from neeco.training.config import training_config
 from neeco.training.initial import initial_scene
 from neeco.training.instruments.evidence import gather_evidence
@@ -69,6 +70,17 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
     evaluation = evaluate_run(run, run.capture(), ("test",), align=True)
     assert evaluation["given"]["test"]["frames"] == 4
     synthesize(run, tmp_path / "dataset", Settings(count=4, tissue_check=False, min_share=1e-4))
+
+
+def test_labels_are_weighed_in_images_of_the_size_learned(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In images of the searches' size thin Gaussians share their pixels with tissue: edges and dark rings were lost."""
+    looked_at = []
+    monkeypatch.setattr(initial, "store_label_shares", lambda session: looked_at.append(session.scale))
+    taken = read_capture(capture)
+    session = initial.begin_session(taken, TrainingViews.read(taken.split("train")), CONFIG, print)
+    assert session.resolution.search_scale < 1
+    session.instruments.weigh_labels()
+    assert looked_at == [1.0]
 
 
 def test_with_two_instruments_each_has_its_own_parts_and_both_cast_a_shadow(capture: Path, tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def begin_session(
         place_wrists=_searching(session, place_wrists),
         replace_wrists=_searching(session, replace_wrists),
         find_shadow=_searching(session, find_shadow, as_learned=True),
-        weigh_labels=_searching(session, store_label_shares),
+        weigh_labels=partial(store_label_shares, session),  # in full: reduced pixels mix thin Gaussians with tissue
         conclude=partial(conclude, session),
     )
     if is_new:

@@ -50,6 +50,17 @@ class Resolution:
         """Share of the images' size at `progress` in [0, 1] of the run."""
         return next((scale for scale, end in zip(self.scales, self.ends, strict=True) if progress < end), 1.0)
 
+    def drawn(self, progress: float) -> float:
+        """Share of all pixels of the run that are drawn by `progress`: how much of it has been learned, which is less
+        than `progress` while images are reduced."""
+        scales, ends = [*self.scales, 1.0], [*self.ends, 1.0]
+        spans = list(zip(scales, [0.0, *self.ends], ends, strict=True))
+
+        def pixels(until: float) -> float:
+            return sum(scale**2 * max(0.0, min(until, end) - start) for scale, start, end in spans)
+
+        return pixels(progress) / pixels(1.0)
+
     def limit_at(self, progress: float, limit: int) -> int:
         """How many Gaussians a body may have at `progress`, of at most `limit`."""
         return math.ceil(limit * self.scale(progress) ** self.config.growth_power)

@@ -108,7 +108,7 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
         "refine.latency": True,
         "refine.frame_poses": True,
         "density_start": 400,
-        "resolution.full_size_at": 0.6,
+        "resolution.full_size_at": 0.55,
     }
     extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
 
