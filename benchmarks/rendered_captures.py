@@ -43,6 +43,9 @@ scene is one more entry in `scenes.SCENES`.
               behind the wrist, tilted 16 degrees
     bowel-grasper, stomach-scissors
               each with the other's instrument, in other colours, under a single lamp whose shadow falls beside it
+    bowel-wristed, stomach-wristed
+              8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
+              wrist_yaw with the encoders' offsets, play and noise; truth/kinematics.json instead of hinge.json
 """
 
 from __future__ import annotations
@@ -94,6 +97,8 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
     arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
+    if arguments.video and spec.encoders is not None:
+        parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
     settings = Settings(
         arguments.size,
         every=arguments.every,

@@ -45,7 +45,7 @@ class Blade:
         middle, half = (self.length - self.heel) / 2, (self.length + self.heel) / 2
         along = (z - middle).abs() - half
         # bending and taper stretch space a little; the factor keeps this a lower bound
-        return 0.78 * _rounded(torch.stack([across_x, across_y, along], -1), self.rounding)
+        return 0.78 * rounded(torch.stack([across_x, across_y, along], -1), self.rounding)
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Design:
             z = torch.linspace(-blade.heel, blade.length, 9)
             curve = (z / blade.length) ** 2
             line = torch.stack([blade.shift_x + blade.bend_x * curve, blade.shift_y + blade.bend_y * curve, z], -1)
-            centers.append(_turn_x(line, -sign * share * opening) + torch.tensor([0.0, 0.0, self.hinge]))
+            centers.append(turn_x(line, -sign * share * opening) + torch.tensor([0.0, 0.0, self.hinge]))
             gap = (blade.length + blade.heel) / 8
             slack = 0.8 * (abs(blade.shift_x) + abs(blade.shift_y))  # the middle moves inwards as the blade thins
             radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
@@ -101,7 +101,7 @@ class Design:
         """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
         arm = points - torch.tensor([0.0, 0.0, self.hinge])
         # a positive turn about x takes z towards -y, so the first jaw turns by minus its share
-        turned = [_turn_x(arm, sign * share * opening) for sign, share in zip((1, -1), self.shares, strict=True)]
+        turned = [turn_x(arm, sign * share * opening) for sign, share in zip((1, -1), self.shares, strict=True)]
         return torch.stack(
             [self._wrist(points), *(blade.distance(t) for blade, t in zip(self.jaws, turned, strict=True))], -1
         )
@@ -110,7 +110,7 @@ class Design:
         x, y, z = points.unbind(-1)
         across = (x.square() + y.square()).sqrt()
         half = self.collar / 2
-        collar = _rounded(torch.stack([across - self.wrist_radius, (z - half).abs() - half], -1), 0.3)
+        collar = rounded(torch.stack([across - self.wrist_radius, (z - half).abs() - half], -1), 0.3)
         inner, outer = self.prong_half_x
         start, end = self.collar - 1.0, self.hinge + self.prong_half_y
         prong = torch.stack(
@@ -121,9 +121,9 @@ class Design:
             ],
             -1,
         )
-        prongs = torch.maximum(_rounded(prong, 0.4), across - self.wrist_radius - 0.1)
+        prongs = torch.maximum(rounded(prong, 0.4), across - self.wrist_radius - 0.1)
         off_hinge = (y.square() + (z - self.hinge).square()).sqrt()
-        pin = _rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
+        pin = rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
         return torch.minimum(torch.minimum(collar, prongs), pin)
 
     def on_link(self, opening: float, points: Tensor, parts: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class Design:
     def turn_to_link(self, opening: float, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
         """Vectors [M, 3] as they are with the jaws closed; sense -1: the other way round."""
         for part, sign, share in zip((FIRST_JAW, SECOND_JAW), (sense, -sense), self.shares, strict=True):
-            vectors = torch.where((parts == part)[:, None], _turn_x(vectors, sign * share * opening), vectors)
+            vectors = torch.where((parts == part)[:, None], turn_x(vectors, sign * share * opening), vectors)
         return vectors
 
     def turn_from_link(self, opening: float, vectors: Tensor, parts: Tensor) -> Tensor:
@@ -259,13 +259,13 @@ def _meet_shaft(radius: float, origin: Tensor, unit: Tensor) -> Tensor:
     return torch.minimum(side, face)
 
 
-def _rounded(outside: Tensor, rounding: float) -> Tensor:
+def rounded(outside: Tensor, rounding: float) -> Tensor:
     """Distance to a box-like solid from how far outside its faces a point is [M, K], edges rounded."""
     beyond = outside + rounding
     return beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0) - rounding
 
 
-def _turn_x(points: Tensor, angle: float) -> Tensor:
+def turn_x(points: Tensor, angle: float) -> Tensor:
     """Points [M, 3] turned about x by `angle` rad."""
     cosine, sine = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
     x, y, z = points.unbind(-1)

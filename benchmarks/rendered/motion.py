@@ -34,6 +34,17 @@ class Path:
     roll_train: float  # about the middle, either way
     roll_most: float
     camera_rolling: float = 0.0  # rad, how far the camera rolls either way
+    wrist_train: tuple[float, float] = (0.0, 0.0)  # rad, how far the wrist pitches and yaws either way
+    wrist_most: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Bend:
+    """How the joints of a wristed instrument stand, rad."""
+
+    opening: float
+    pitch: float
+    yaw: float
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,13 @@ class Moment:
     scene_from_mechanical: Array
     opening: float
     roll: float  # about the middle of the range
-    hinge: Array  # [3], scene frame
+    hinge: Array  # [3], scene frame; where it is while the wrist is straight
+    wrist: tuple[float, float] | None = None  # pitch and yaw; None: there is none
+
+    @property
+    def joints(self) -> float | Bend:
+        """What the instrument's design takes: the opening of one that has no wrist."""
+        return self.opening if self.wrist is None else Bend(self.opening, *self.wrist)
 
 
 @dataclass(frozen=True)
@@ -59,6 +76,7 @@ class Trajectory:
     _hinge: CubicSpline
     _opening: PchipInterpolator
     _roll: PchipInterpolator
+    _wrist: CubicSpline | None = None
 
     def at(self, time: float) -> Moment:
         """Everything at `time`; times a little outside the recording are as good as its ends."""
@@ -72,6 +90,7 @@ class Trajectory:
             opening,
             roll,
             hinge,
+            None if self._wrist is None else tuple(map(float, self._wrist(time))),
         )
 
 
@@ -107,6 +126,7 @@ def plan(path: Path, hinge_mm: float, seen: int, unseen: int, seed: int) -> Traj
         CubicSpline(np.r_[knots, beyond], np.concatenate([hinge, far])),
         _opening_curve(path, end, rest, generator),
         _roll_curve(path, end, rest, generator),
+        _wrist_curve(path, end, rest, np.random.default_rng((seed, 1))) if any(path.wrist_train) else None,
     )
 
 
@@ -138,6 +158,16 @@ def _roll_curve(path: Path, end: float, rest: float, generator: np.random.Genera
     far = [0.1 * path.roll_train, 0.7 * path.roll_train, 1.03 * path.roll_train, path.roll_most]
     far += [(path.roll_train + path.roll_most) / 2, 0.95 * path.roll_most]
     return PchipInterpolator(np.r_[knots, after], np.r_[values, far])
+
+
+def _wrist_curve(path: Path, end: float, rest: float, generator: np.random.Generator) -> CubicSpline:
+    """Pitch and yaw: over all of their training range, then beyond it, one after the other."""
+    knots = np.linspace(0, end, max(5, round(end / 0.9)))
+    train, most = np.array(path.wrist_train), np.array(path.wrist_most)
+    seen = 0.9 * train * _spread(len(knots), 2, generator)  # a spline goes a little beyond its knots
+    after = np.array([0.25, 0.5, 0.75, 1.0]) * rest + end
+    signs = np.array([[1.0, 0.2], [-0.3, 1.0], [-1.0, -0.4], [0.5, -1.0]])
+    return CubicSpline(np.r_[knots, after], np.concatenate([seen, signs * most]))
 
 
 def _spread(count: int, width: int, generator: np.random.Generator) -> Array:

@@ -7,6 +7,7 @@ import math
 from neeco.capture import Capture
 from rendered.frames import Settings
 from rendered.scenes import SceneSpec
+from rendered.wristed import Encoders
 
 
 def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[str, float]) -> str:
@@ -14,6 +15,12 @@ def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[
     path, joint = spec.path, spec.joint
     counts = ", ".join(f"{name} {len(capture.split(name))}" for name in capture.splits)
     size = f"{capture.frames[0].camera.width}x{capture.frames[0].camera.height}"
+    wristed = "" if spec.encoders is None else _wrist(spec.encoders)
+    links = (
+        "hinge.json (hinge and shaft, sensor frame)"
+        if spec.encoders is None
+        else "kinematics.json (links, sensor frame)"
+    )
     errors = "\n".join(f"- {name}: {value:.3f}" for name, value in quality.items())
     return f"""# {spec.organ}: rendered laparoscopic capture
 
@@ -23,9 +30,9 @@ Shows {spec.words}.
 {_switched_on(settings)}
 World: the tracker's frame, mm; `pose` = world_from_sensor, the sensor tilted
 {math.degrees(spec.mount.tilt):.0f} degrees against the shaft and off its axis.
-Reading `jaw_angle` = {joint.zero} + ({joint.sign}) * opening, rad.
+Reading `jaw_angle` = {joint.zero} + ({joint.sign}) * opening, rad.{wristed}
 `truth/`: masks (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), depth (16 bit, 0.05 mm, every second pixel, for
-frames with number % 4 == 0 and all unseen ones), transforms.json (exact), hinge.json (hinge and shaft, sensor frame).
+frames with number % 4 == 0 and all unseen ones), transforms.json (exact), {links}.
 
 Splits: the last frames are `unseen` (opening > {math.degrees(path.opening_train):.0f} deg or |roll| > \
 {math.degrees(path.roll_train):.0f} deg, checked for every frame);
@@ -36,6 +43,14 @@ Errors of transforms.json against the truth (rms; the reconstruction's scale is 
 {errors}
 - sparse points: {len(capture.points.positions)}
 """
+
+
+def _wrist(encoders: Encoders) -> str:
+    """What the readings of a wrist are."""
+    pitch, yaw, play = (math.degrees(v) for v in (encoders.pitch_offset, encoders.yaw_offset, encoders.play))
+    return f"""
+Readings `wrist_pitch` and `wrist_yaw`: the angle, rad, plus an offset of {pitch:.1f} and {yaw:.1f} degrees, less play
+of {play:.1f} degrees either way."""
 
 
 def _switched_on(settings: Settings) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rendered import instrument as tools
 from rendered.instrument import Design, Material
-from rendered.motion import Moment
+from rendered.motion import Bend, Moment
 from rendered.noise import blur
 from rendered.tissue import Tissue
 
@@ -58,7 +58,7 @@ class View:
 
     scene_from_camera: Tensor  # [4, 4] float32
     scene_from_mechanical: Tensor  # [4, 4]
-    opening: float  # rad, between the jaws
+    opening: float | Bend  # rad, between the jaws, or how all joints stand
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Place:
 def view_of(moment: Moment) -> View:
     """What `draw` needs of a moment."""
     camera, tool = (torch.from_numpy(m).float() for m in (moment.scene_from_camera, moment.scene_from_mechanical))
-    return View(camera, tool, moment.opening)
+    return View(camera, tool, moment.joints)
 
 
 def draw(place: Place, view: View, gain: tuple[float, float, float] | None = None) -> Drawing:

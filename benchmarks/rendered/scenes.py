@@ -12,6 +12,7 @@ from rendered.errors import ErrorModel
 from rendered.instrument import Blade, Design, Material
 from rendered.motion import Array, Path, rigid
 from rendered.render import Lamps
+from rendered.wristed import Encoders, WristedDesign
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class SceneSpec:
     world_turn: tuple[float, float, float]  # the tracker's world against the scene: rotation vector …
     world_shift: tuple[float, float, float]  # … and shift
     errors: ErrorModel = field(default_factory=ErrorModel)
+    encoders: Encoders | None = None  # of the wrist, where there is one
 
     def with_rolling_camera(self) -> SceneSpec:
         """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
@@ -220,4 +222,51 @@ SCENES |= {
         world_turn=(-0.7, -2.2, 0.2),
         world_shift=(-15.0, 88.0, 240.0),
     ),
+}
+
+# The organs under an instrument with a wrist, as robots carry: pitch, then 9 mm further yaw and two unequal jaws.
+NEEDLE_DRIVER = WristedDesign(
+    name="needle_driver",
+    radius=4.0,
+    pitch_at=1.5,
+    ball=3.4,
+    hinge=10.5,
+    collar=4.0,
+    wrist_radius=3.1,
+    prong_half_x=(1.7, 2.7),
+    prong_half_y=2.4,
+    pin=1.1,
+    jaws=(
+        Blade(11.0, 1.6, (1.5, 1.1), (1.45, 0.9), 0.0, 1.45, 0.0, 0.3, 0.4),
+        Blade(10.0, 1.6, (1.5, 1.2), (1.35, 0.9), 0.0, -1.35, 0.0, -0.2, 0.4),
+    ),
+    shares=(0.5, 0.5),
+    materials=(
+        Material((0.030, 0.031, 0.034), 1.0, 0.12, 20.0),
+        Material((0.40, 0.41, 0.44), 0.48, 0.40, 30.0),
+        Material((0.62, 0.58, 0.48), 0.46, 0.45, 30.0),
+    ),
+)
+
+SCENES |= {
+    f"{organ}-wristed": replace(
+        SCENES[organ],
+        design=NEEDLE_DRIVER,
+        path=replace(
+            SCENES[organ].path,
+            hinge_center=tuple(np.add(SCENES[organ].path.hinge_center, (0.0, 0.0, 7.0)).tolist()),
+            opening_train=50 * DEGREE,
+            opening_most=75 * DEGREE,
+            wrist_train=(40 * DEGREE, 35 * DEGREE),
+            wrist_most=(58 * DEGREE, 52 * DEGREE),
+        ),
+        joint=Joint(zero=0.0, sign=1, limits=(-0.1, 1.5)),
+        encoders=encoders,
+        seed=seed,
+        words=f"{organ} under an 8 mm black shaft whose steel wrist pitches and, 9 mm further, yaws two unequal jaws",
+    )
+    for organ, seed, encoders in (
+        ("bowel", 71, Encoders(1.6 * DEGREE, -1.1 * DEGREE, 0.8 * DEGREE, 0.3 * DEGREE)),
+        ("stomach", 83, Encoders(-1.2 * DEGREE, 1.9 * DEGREE, 0.6 * DEGREE, 0.3 * DEGREE)),
+    )
 }

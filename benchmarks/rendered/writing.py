@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,14 +19,15 @@ from rendered import breathing, errors
 from rendered.exposure import meter
 from rendered.frames import Renderer, Settings, Shot, image_name, moved, render_all, take_shots
 from rendered.hinge import describe_hinge
-from rendered.motion import Array, Trajectory, plan
+from rendered.kinematics import describe_kinematics
+from rendered.motion import Array, Moment, Trajectory, plan
 from rendered.optics import Optics
 from rendered.points import PointSampler
 from rendered.readme import readme
 from rendered.recording import write_raw_recording
 from rendered.render import Lens, Place
 from rendered.scenes import SceneSpec
-from rendered.truth import JOINT, World, truth_document
+from rendered.truth import JOINT, WRIST_JOINTS, World, truth_document
 
 SEEN, UNSEEN = 230, 45
 Report = Callable[[str], None]
@@ -53,7 +54,10 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
             report(f"{index + 1}/{len(shots)} frames")
     world = World(spec, shots)
     write_json(path / "truth" / "transforms.json", truth_document(world, settings.lens))
-    write_json(path / "truth" / "hinge.json", describe_hinge(spec))
+    if spec.encoders is None:
+        write_json(path / "truth" / "hinge.json", describe_hinge(spec))
+    else:
+        write_json(path / "truth" / "kinematics.json", describe_kinematics(spec))
     if settings.video:
         write_raw_recording(world, trajectory, settings, path, np.random.default_rng(spec.seed + 2))
     if modes:
@@ -87,14 +91,16 @@ def _recorded(
     numbers = np.array([shot.number for shot in world.shots])
     poses = errors.disturb_poses(np.stack([world.sensor(moment) for moment in late]), numbers, model, generator)
     readings = errors.disturb_readings(np.array([m.opening for m in late]), numbers, model, generator)
+    wrist = _wrist_readings(spec, late, np.random.default_rng((spec.seed, 3)))
     frames = []
-    for shot, camera, pose, opening in zip(world.shots, cameras, poses, readings, strict=True):
-        state = State({spec.design.name: _state(pose, spec, float(opening))}, shot.time)
+    for index, (shot, camera, pose, opening) in enumerate(zip(world.shots, cameras, poses, readings, strict=True)):
+        own = {name: round(float(values[index]), 6) for name, values in wrist.items()}
+        state = State({spec.design.name: _state(pose, spec, float(opening), own)}, shot.time)
         frames.append(Frame(path / image_name(shot), _camera(camera, lens), state, shot.split))
     to_world = world.spec.world_from_scene()
     points = np.concatenate(sampler.positions) @ to_world[:3, :3].T + to_world[:3, 3]
     cloud = PointCloud(found.points(points).astype(np.float32), np.concatenate(sampler.colors).astype(np.float32))
-    declared = Instrument(spec.design.name, {JOINT: spec.joint.limits})
+    declared = Instrument(spec.design.name, {JOINT: spec.joint.limits} | dict.fromkeys(wrist))
     openings = np.array([shot.moment.opening for shot in world.shots])
     quality = {
         **_differences("camera", cameras, true_cameras),
@@ -112,9 +118,17 @@ def _behind_optics(capture: Capture, optics: Optics, path: Path) -> Capture:
     return replace(capture, frames=tuple(replace(frame, mask_path=mask) for frame in capture.frames))
 
 
-def _state(pose: Array, spec: SceneSpec, opening: float) -> InstrumentState:
+def _wrist_readings(spec: SceneSpec, moments: Sequence[Moment], generator: np.random.Generator) -> dict[str, Array]:
+    """What the wrist's encoders say at each moment, by name; nothing without a wrist."""
+    if spec.encoders is None:
+        return {}
+    pitch, yaw = np.array([moment.wrist for moment in moments]).T
+    return dict(zip(WRIST_JOINTS, spec.encoders.readings(pitch, yaw, generator), strict=True))
+
+
+def _state(pose: Array, spec: SceneSpec, opening: float, wrist: dict[str, float]) -> InstrumentState:
     reading = round(spec.joint.reading(opening), 6)
-    return InstrumentState(torch.from_numpy(pose.round(7)), {JOINT: reading})
+    return InstrumentState(torch.from_numpy(pose.round(7)), {JOINT: reading} | wrist)
 
 
 def _camera(pose: Array, lens: Lens) -> Camera:
@@ -139,7 +153,7 @@ def clearance(place: Place, settings: Settings, spec: SceneSpec, shots: list[Sho
         tissue = moved(place, settings.modes(spec), shot.time).tissue
         points = torch.stack([x, y, tissue.height_at(x, y)], -1)
         pose = torch.from_numpy(np.linalg.inv(shot.moment.scene_from_mechanical)).float()
-        gaps = place.design.everything(points @ pose[:3, :3].T + pose[:3, 3], shot.moment.opening)
+        gaps = place.design.everything(points @ pose[:3, :3].T + pose[:3, 3], shot.moment.joints)
         smallest = min(smallest, float(gaps.min()))
     if smallest < 1:
         raise ValueError(f"the instrument comes within {smallest:.1f} mm of the tissue; raise its path")

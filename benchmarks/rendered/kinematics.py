@@ -1,0 +1,52 @@
+"""The true links of a scene's wristed instrument, in the tracked sensor's frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
+from rendered.hinge import JAW_LEFT, JAW_RIGHT, truth_ids
+from rendered.motion import Array
+from rendered.scenes import SceneSpec
+from rendered.wristed import WristedDesign
+
+PITCH, YAW = "wrist_pitch", "wrist_yaw"
+JAW_NAMES = {JAW_LEFT: "jaw_left", JAW_RIGHT: "jaw_right"}
+
+
+def true_kinematics(spec: SceneSpec) -> KinematicTree:
+    """The links in the true sensor frame, mm, with the encoders' offsets taken out: what a perfect search would find.
+    Link frames are parallel to the sensor's where the wrist is straight and the jaws are closed."""
+    design, encoders = spec.design, spec.encoders
+    assert isinstance(design, WristedDesign)
+    assert encoders is not None
+    sensor_from_mechanical = np.linalg.inv(spec.mount.mechanical_from_sensor())
+    rotation, shift = sensor_from_mechanical[:3, :3], sensor_from_mechanical[:3, 3]
+    pitch_at = rotation @ np.array([0.0, 0.0, design.pitch_at]) + shift
+    yaw_at = rotation @ np.array([0.0, 0.0, design.hinge - design.pitch_at])
+    wrist = Link("wrist", "shaft", REVOLUTE, _shift(pitch_at), rotation[:, 1], {PITCH: 1.0}, -encoders.pitch_offset)
+    links = [Link("shaft"), wrist]
+    for part, sense, share in zip(truth_ids(spec), (-1, 1), design.shares, strict=True):
+        gain = sense * share * spec.joint.sign  # per reading of the jaw
+        offset = -gain * spec.joint.zero - encoders.yaw_offset
+        value = {YAW: 1.0, "jaw_angle": gain}
+        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, _shift(yaw_at), rotation[:, 0], value, offset))
+    return KinematicTree(tuple(links))
+
+
+def describe_kinematics(spec: SceneSpec) -> dict[str, Any]:
+    """truth/kinematics.json."""
+    return {
+        "instrument": spec.design.name,
+        "frame": "tracked sensor (truth), mm",
+        "meaning": "value of a joint = sum of gain * reading without its error, plus offset",
+        "kinematics": true_kinematics(spec).to_json(),
+    }
+
+
+def _shift(place: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return pose

@@ -1,0 +1,120 @@
+"""A wristed instrument, as robots carry: a clevis that pitches at the shaft's end, and two jaws that yaw on it.
+
+Mechanical frame as `rendered.instrument` has it, the wrist straight: the pitch axis along y at (0, 0, `pitch_at`), the
+yaw axis along x at (0, 0, `hinge`). Pitch and yaw are right-handed turns about those axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rendered.instrument import FIRST_JAW, SECOND_JAW, WRIST, Design, rounded, turn_x
+from rendered.motion import Array, Bend
+
+
+@dataclass(frozen=True)
+class WristedDesign(Design):
+    """Geometry of the clevis: a ball in the shaft's end, then a block that narrows to two prongs."""
+
+    pitch_at: float = 1.5  # mm from the end of the shaft
+    ball: float = 3.5  # radius
+
+    def balls(self, bend: Bend) -> tuple[Tensor, Tensor]:
+        """Centres [K, 3] and radii [K] of balls that together hold wrist and jaws."""
+        end = self.hinge + self.prong_half_y
+        middle = torch.zeros(5, 3)
+        middle[:, 2] = torch.linspace(0.0, end, 5)
+        centers, radii = [middle], [torch.full((5,), end / 8 + self.wrist_radius + 1.5)]
+        for blade, angle in zip(self.jaws, self._jaw_angles(bend), strict=True):
+            z = torch.linspace(-blade.heel, blade.length, 9)
+            curve = (z / blade.length) ** 2
+            line = torch.stack([blade.shift_x + blade.bend_x * curve, blade.shift_y + blade.bend_y * curve, z], -1)
+            centers.append(turn_x(line, angle) + torch.tensor([0.0, 0.0, self.hinge]))
+            gap, slack = (blade.length + blade.heel) / 8, 0.8 * (abs(blade.shift_x) + abs(blade.shift_y))
+            radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
+        pitched = self._about_pitch(torch.cat(centers), bend.pitch)
+        return pitched, torch.cat(radii)
+
+    def distances(self, points: Tensor, bend: Bend) -> Tensor:
+        """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
+        straight = self._about_pitch(points, -bend.pitch)
+        arm = straight - torch.tensor([0.0, 0.0, self.hinge])
+        turned = [turn_x(arm, -angle) for angle in self._jaw_angles(bend)]
+        jaws = [blade.distance(turn) for blade, turn in zip(self.jaws, turned, strict=True)]
+        return torch.stack([self._wrist(straight), *jaws], -1)
+
+    def _wrist(self, points: Tensor) -> Tensor:
+        x, y, z = points.unbind(-1)
+        across = (x.square() + y.square()).sqrt()
+        ball = (points - torch.tensor([0.0, 0.0, self.pitch_at])).norm(dim=-1) - self.ball
+        start, end = self.pitch_at, self.pitch_at + self.collar
+        neck = rounded(
+            torch.stack([across - self.wrist_radius, (z - (start + end) / 2).abs() - (end - start) / 2], -1), 0.3
+        )
+        inner, outer = self.prong_half_x
+        tip = self.hinge + self.prong_half_y
+        sides = [(x.abs() - (inner + outer) / 2).abs() - (outer - inner) / 2, y.abs() - self.prong_half_y]
+        prong = rounded(torch.stack([*sides, (z - (end - 1 + tip) / 2).abs() - (tip - end + 1) / 2], -1), 0.4)
+        off_hinge = (y.square() + (z - self.hinge).square()).sqrt()
+        pin = rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
+        return torch.stack([ball, neck, torch.maximum(prong, across - self.wrist_radius - 0.1), pin]).amin(0)
+
+    def on_link(self, bend: Bend, points: Tensor, parts: Tensor) -> Tensor:
+        """Points [M, 3] on the given parts [M] as they lie with the wrist straight and the jaws closed, from the
+        hinge."""
+        moves = (parts >= WRIST)[:, None]
+        straight = torch.where(moves, self._about_pitch(points, -bend.pitch), points)
+        return self._turn_jaws(bend, straight - torch.tensor([0.0, 0.0, self.hinge]), parts, -1)
+
+    def turn_to_link(self, bend: Bend, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
+        """Vectors [M, 3] as they are with the wrist straight and the jaws closed; sense -1: the other way round."""
+        moves = (parts >= WRIST)[:, None]
+        if sense < 0:
+            turned = self._turn_jaws(bend, vectors, parts, 1)
+            return torch.where(moves, _turn_y(turned, bend.pitch), vectors)
+        straight = torch.where(moves, _turn_y(vectors, -bend.pitch), vectors)
+        return self._turn_jaws(bend, straight, parts, -1)
+
+    def _turn_jaws(self, bend: Bend, vectors: Tensor, parts: Tensor, sense: int) -> Tensor:
+        for part, angle in zip((FIRST_JAW, SECOND_JAW), self._jaw_angles(bend), strict=True):
+            vectors = torch.where((parts == part)[:, None], turn_x(vectors, sense * angle), vectors)
+        return vectors
+
+    def _jaw_angles(self, bend: Bend) -> tuple[float, float]:
+        """rad about +x by which the jaws stand from the clevis: a positive turn takes z towards -y, so that the first
+        opens by minus its share."""
+        first, second = self.shares
+        return bend.yaw - first * bend.opening, bend.yaw + second * bend.opening
+
+    def _about_pitch(self, points: Tensor, angle: float) -> Tensor:
+        center = torch.tensor([0.0, 0.0, self.pitch_at])
+        return _turn_y(points - center, angle) + center
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What the wrist's encoders say: the angle plus an offset, play that lags behind the motion, and noise; rad."""
+
+    pitch_offset: float
+    yaw_offset: float
+    play: float  # half of it, either way
+    noise: float
+
+    def readings(self, pitch: Array, yaw: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+        """Readings [F] of pitch and of yaw angles [F], in the order of the frames."""
+        found = []
+        for angles, offset in ((pitch, self.pitch_offset), (yaw, self.yaw_offset)):
+            lag = self.play * np.tanh(np.gradient(angles) / max(1e-6, float(np.abs(np.gradient(angles)).mean())))
+            found.append(angles + offset - lag + generator.normal(0, self.noise, len(angles)))
+        return found[0], found[1]
+
+
+def _turn_y(points: Tensor, angle: float) -> Tensor:
+    """Points [M, 3] turned about y by `angle` rad."""
+    cosine, sine = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    x, y, z = points.unbind(-1)
+    return torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], -1)
