@@ -393,7 +393,7 @@ def _tree(**changes):
         ({}, "instruments", "are read and checked, but not learned from yet", "warning"),
         ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
         ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits -1 .. 1", "warning"),
-        ({"parent": "wrist"}, "instruments[0].kinematics.links", "are joined in a circle", "error"),
+        ({"parent": "wrist"}, "instruments[0].kinematics.links", "joined in a circle", "error"),
         ({"type": "hinge"}, "instruments[0].kinematics.links[1].type", "is 'hinge'", "error"),
     ],
 )

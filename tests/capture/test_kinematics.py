@@ -154,7 +154,7 @@ def changed(index: int, **fields: object) -> dict:
         (changed(0, parent=None), "one link has no parent, the root; found 'tip', 'shaft'"),
         (changed(0, name="wrist"), "'wrist' comes twice"),
         (changed(0, parent="elbow"), "'tip': its parent 'elbow' is no link"),
-        (changed(2, parent="tip"), "'jaw_left', 'jaw_right', 'tip', 'wrist' are joined in a circle"),
+        (changed(2, parent="tip"), "joined in a circle: 'jaw_left', 'jaw_right', 'tip', 'wrist'"),
         (changed(2, type="fixed"), "'wrist': readings drive a fixed joint"),
         (changed(1, type="prismatic", axis=[1, 0, 0]), "'shaft': the root has no parent to move against"),
         (changed(2, type="screw"), r"links\[2\].type: is 'screw'; write fixed, revolute, prismatic"),

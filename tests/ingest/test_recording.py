@@ -136,6 +136,52 @@ def test_everything_at_once(world, folder):
     assert recording.settings == IngestSettings(shape_frames=20, tracker_noise_mm=1)
 
 
+TOOL = """{"DH": {"convention": "modified", "joints": [ // a comment
+{"name": "wrist_pitch", "type": "revolute", "alpha": -1.5708, "A": 0, "theta": 0, "D": 0, "offset": 0, "qmin": -1,
+ "qmax": 1},
+{"name": "wrist_yaw", "type": "revolute", "alpha": -1.5708, "A": 0.0091, "theta": 0, "D": 0, "offset": 0}
+]}, "jaw": {"ftmax": 0.16}}"""
+LINKS = "{links: [{name: shaft}, {name: tip, parent: shaft, type: prismatic, axis: [0, 0, 1], value: {jaw: 2}}]}"
+
+
+def with_kinematics(words: str) -> str:
+    return FULL.replace("laparoscope:", f"    kinematics: {words}\nlaparoscope:")
+
+
+def test_links_are_given_inline_or_by_a_tool_file(world, folder):
+    recording = read_recording(world.text(with_kinematics(LINKS), "recording.yaml"))
+    tree = recording.instruments[0].kinematics
+    assert tree.poses({"jaw": 0.5})["tip"][2, 3] == 1.0
+    world.text(TOOL, "tool.json")
+    tool = "{dvrk_tool: tool.json, readings: {wrist_pitch: wrist, wrist_yaw: jaw}}"
+    recording = read_recording(world.text(with_kinematics(tool.replace("}}", ", jaw: jaw}}")), "recording.yaml"))
+    assert recording.instruments[0].kinematics.readings == ("wrist", "jaw")
+    assert recording.instruments[0].kinematics.pose_of == "tip"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (LINKS.replace("jaw", "elbow"), r"instruments\[0\]\.kinematics: 'elbow' is no joint of it; .*\(jaw, wrist\)"),
+        (
+            LINKS.replace("shaft, type", "tip, type"),
+            r"instruments\[0\]\.kinematics\.links: joined in a circle: 'tip'",
+        ),
+        ("{dvrk_tool: none.json}", r"instruments\[0\]\.kinematics\.dvrk_tool: no such file: 'none\.json'"),
+        ("{dvrk_tool: tool.json, reading: {}}", r"kinematics\.reading: unknown key; did you mean readings\?"),
+        ("{dvrk_tool: tool.json, readings: {yaw: jaw}}", r"kinematics\.readings\.yaw: unknown key"),
+        ("{dvrk_tool: tool.json, readings: 3}", r"kinematics\.readings: expected keys"),
+        ("{dvrk_tool: tool.json}", r"instruments\[0\]\.kinematics: 'wrist_pitch' is no joint of it"),
+        ("7", r"instruments\[0\]\.kinematics: expected an object, found 7"),
+    ],
+)
+def test_links_that_are_none_are_told_with_their_key(world, folder, words, message):
+    world.text(TOOL, "tool.json")
+    with pytest.raises(NeecoError, match=r"recording\.yaml: .*" + message) as caught:
+        read_recording(world.text(with_kinematics(words), "recording.yaml"))
+    assert "\n" not in str(caught.value)
+
+
 def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder):
     recording = read_recording(world.text("video: video.mp4\nsplits: {test: [3]}\n", "recording.yaml"))
     assert recording.settings == IngestSettings()

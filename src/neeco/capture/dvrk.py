@@ -15,6 +15,7 @@ from neeco.capture.kinematics import REVOLUTE, Array, KinematicTree, Link
 from neeco.errors import NeecoError
 from neeco.files import read_text
 
+READINGS = ("wrist_pitch", "wrist_yaw", "jaw")  # what drives the joints beyond the roll
 MM = 1000.0  # per m
 # a string, which stays, or a comment of JSON as the dVRK writes it
 _STRING_OR_COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/', re.DOTALL)
@@ -41,14 +42,14 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     joints = {item.child("name").text(): item for item in frames.child("joints").items()}
     # hooks and spatulas have an entry for jaws, too, which no force moves
     has_jaws = document.has("jaw") and document.child("jaw").child("ftmax").value != 0
-    for joint in ("wrist_pitch", "wrist_yaw"):
+    for joint in READINGS[:2]:
         if joint not in joints:
             frames.child("joints").error(f"there is no joint {joint}", "only tools with a wrist have a tree")
-    known = ["wrist_pitch", "wrist_yaw", *(["jaw"] if has_jaws else [])]
+    known = READINGS if has_jaws else READINGS[:2]
     for given in names:
         if given not in known:
             raise NeecoError(f"{path}: readings: {given!r} is no joint of this tool; it has {', '.join(known)}")
-    pitch, yaw, jaw = (names.get(joint, joint) for joint in ("wrist_pitch", "wrist_yaw", "jaw"))
+    pitch, yaw, jaw = (names.get(joint, joint) for joint in READINGS)
     wrist, pitch_axis = _frame(joints["wrist_pitch"])
     pivot, yaw_axis = _frame(joints["wrist_yaw"])
     limits = joints["wrist_pitch"].child("qmin"), joints["wrist_pitch"].child("qmax")

@@ -181,7 +181,7 @@ def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
         ordered += [child for child in links if child.parent == link.name]
     if len(ordered) < len(links):
         circle = sorted(set(names) - {link.name for link in ordered})
-        raise NeecoError(f"{', '.join(map(repr, circle))} are joined in a circle; every link needs a way to the root")
+        raise NeecoError(f"joined in a circle: {', '.join(map(repr, circle))}; every link needs a way to the root")
     return tuple(ordered)
 
 

@@ -331,7 +331,7 @@ class _Ingest:
             data.note("no tissue point is seen by several frames and fits well: all of them are kept")
         cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
         instruments = tuple(
-            Instrument(item.name, {name: source.limits for name, source in item.joints.items()})
+            Instrument(item.name, {name: source.limits for name, source in item.joints.items()}, item.kinematics)
             for item in self.recording.instruments
             if item.poses is not None
         )

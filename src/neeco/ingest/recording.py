@@ -12,6 +12,10 @@ from typing import Any
 import yaml
 
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
+from neeco.capture.dvrk import READINGS as DVRK_READINGS
+from neeco.capture.dvrk import read_dvrk_tool
+from neeco.capture.kinematics import KinematicTree
+from neeco.capture.kinematicsfile import parse_kinematics
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest import columns as named
@@ -26,11 +30,12 @@ _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a r
 
 @dataclass(frozen=True)
 class InstrumentLogs:
-    """One instrument: where its poses are (None: it was not tracked) and its joints' readings, by joint."""
+    """One instrument: where its poses are (None: it was not tracked), its joints' readings, by joint, and its links."""
 
     name: str
     poses: PoseColumns | None = None
     joints: Mapping[str, JointColumns] = field(default_factory=dict)
+    kinematics: KinematicTree | None = None
 
 
 @dataclass(frozen=True)
@@ -316,7 +321,8 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
     if not isinstance(value, list):
         raise top.error("instruments", "must be a list; begin each instrument with `- name:`")
     sections = [
-        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints")) for i, item in enumerate(value)
+        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics"))
+        for i, item in enumerate(value)
     ]
     names = [section.text("name", required=True) for section in sections]
     joint_names = [joint for section in sections for joint in _joints_of(section)]
@@ -330,8 +336,27 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns)
-        found.append(InstrumentLogs(name, columns, joints))
+        found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints))))
     return tuple(found)
+
+
+def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:
+    """The links of an instrument: a tool file of the dVRK, or as transforms.json has them."""
+    value = instrument.value.get("kinematics")
+    if value is None:
+        return None
+    if isinstance(value, dict) and "dvrk_tool" in value:
+        section = instrument.section("kinematics", ("dvrk_tool", "readings"))
+        readings = section.section("readings", DVRK_READINGS)
+        names = {joint: readings.text(joint, required=True) for joint in readings.value}
+        tree: KinematicTree | None = read_dvrk_tool(section.path("dvrk_tool", required=True), names)
+    else:
+        tree = parse_kinematics(instrument.node.child("kinematics"))
+    assert tree is not None
+    if missing := [reading for reading in tree.readings if reading not in joints]:
+        message = f"{printable(missing[0])} is no joint of it; name the recorded ones ({', '.join(joints) or 'none'})"
+        raise instrument.error("kinematics", message)
+    return tree
 
 
 def _joints_of(section: Section) -> dict[str, Any]:
