@@ -56,8 +56,8 @@ def test_sizes_grow_over_the_coarse_part_of_the_run_as_the_spectrum_says(capture
     assert set(found) == {1 / 4, 1 / 2, 1.0}
     assert found.index(1.0) == 500
     assert found.index(0.5) == pytest.approx(125, rel=0.2)  # noise: a quarter of what twice the size keeps
-    # positions slow down with the pixels drawn: half of the run at full size is all but a few of them
-    drawn = [resolution.drawn(progress / 10) for progress in range(11)]
+    # positions slow down with the pixels rendered: half of the run at full size is all but a few of them
+    drawn = [resolution.rendered_share(progress / 10) for progress in range(11)]
     assert drawn == sorted(drawn)
     assert (drawn[0], drawn[10]) == (0.0, 1.0)
     share = sum(resolution.scale(progress / 1000) ** 2 for progress in range(500)) / 500  # of the first half's pixels

@@ -50,8 +50,8 @@ class Resolution:
         """Share of the images' size at `progress` in [0, 1] of the run."""
         return next((scale for scale, end in zip(self.scales, self.ends, strict=True) if progress < end), 1.0)
 
-    def drawn(self, progress: float) -> float:
-        """Share of all pixels of the run that are drawn by `progress`: how much of it has been learned, which is less
+    def rendered_share(self, progress: float) -> float:
+        """Share of the run's pixels that are rendered by `progress`: how much of it has been learned, which is less
         than `progress` while images are reduced."""
         scales, ends = [*self.scales, 1.0], [*self.ends, 1.0]
         spans = list(zip(scales, [0.0, *self.ends], ends, strict=True))

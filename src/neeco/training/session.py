@@ -198,7 +198,8 @@ class GaussianSession(GaussianTraining):
     def _update(self, progress: float) -> None:
         """One optimiser step on everything that has a gradient; shadows have none until one was found."""
         scene, optimizer = self.scene, self.config.optimizer
-        done = self.resolution.drawn(progress)  # not progress: positions would be stiff before there is detail to fit
+        # by progress alone positions would be stiff before there is detail to fit
+        done = self.resolution.rendered_share(progress)
         position_rate = optimizer.position_rate * self.extent * log_linear(1.0, FINAL_RATE, done)
         rates = self.gaussian_rates | {"means": position_rate}
         learned = [(name, tensor, rates[name]) for name, tensor in scene.canonical.tensors().items() if name in rates]
