@@ -96,6 +96,16 @@ def main() -> None:
     figure.axes[0].legend(fontsize=8, frameon=False)
     save(figure, "methods")
 
+    rows = table("recorded at")
+    figure = Figure(figsize=(8, 2.8), layout="constrained")
+    cost, quality = figure.subplots(1, 2)
+    groups = [row[0] if row[0] == row[1] else f"{row[0]}\nfrom {row[1]}" for row in rows]
+    grouped_bars(cost, groups, {"CPU minutes": [number(row[2]) for row in rows]}, "CPU minutes of training", 0)
+    series = {split: [number(row[6 + k].split(" / ")[0]) for row in rows] for k, split in enumerate(("seen", "unseen"))}
+    grouped_bars(quality, groups, series, "PSNR as given, dB", 24)
+    quality.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
+    save(figure, "sizes")
+
 
 if __name__ == "__main__":
     main()
