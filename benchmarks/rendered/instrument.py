@@ -86,22 +86,33 @@ class Design:
         spacing = end / 4
         middle = torch.zeros(5, 3)
         middle[:, 2] = torch.arange(5) * spacing
-        centers, radii = [middle], [torch.full((5,), spacing / 2 + self.wrist_radius + 1.0)]
-        for blade, sign, share in zip(self.jaws, (1, -1), self.shares, strict=True):
+        centers, radii = self._jaw_balls(opening)
+        wrist = torch.full((5,), spacing / 2 + self.wrist_radius + 1.0)
+        return torch.cat([middle, centers]), torch.cat([wrist, radii])
+
+    def _jaw_balls(self, opening: float) -> tuple[Tensor, Tensor]:
+        """Centres [18, 3] and radii [18] of balls that together hold the jaws."""
+        centers, radii = [], []
+        for blade, angle in zip(self.jaws, self.jaw_angles(opening), strict=True):
             z = torch.linspace(-blade.heel, blade.length, 9)
             curve = (z / blade.length) ** 2
             line = torch.stack([blade.shift_x + blade.bend_x * curve, blade.shift_y + blade.bend_y * curve, z], -1)
-            centers.append(turn_x(line, -sign * share * opening) + torch.tensor([0.0, 0.0, self.hinge]))
+            centers.append(turn_x(line, angle) + torch.tensor([0.0, 0.0, self.hinge]))
             gap = (blade.length + blade.heel) / 8
             slack = 0.8 * (abs(blade.shift_x) + abs(blade.shift_y))  # the middle moves inwards as the blade thins
             radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
         return torch.cat(centers), torch.cat(radii)
 
+    def jaw_angles(self, opening: float) -> tuple[float, float]:
+        """rad about +x by which the jaws stand from the wrist: a positive turn takes z towards -y, so that the first
+        turns by minus its share."""
+        first, second = self.shares
+        return -first * opening, second * opening
+
     def distances(self, points: Tensor, opening: float) -> Tensor:
         """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
         arm = points - torch.tensor([0.0, 0.0, self.hinge])
-        # a positive turn about x takes z towards -y, so the first jaw turns by minus its share
-        turned = [turn_x(arm, sign * share * opening) for sign, share in zip((1, -1), self.shares, strict=True)]
+        turned = [turn_x(arm, -angle) for angle in self.jaw_angles(opening)]
         return torch.stack(
             [self._wrist(points), *(blade.distance(t) for blade, t in zip(self.jaws, turned, strict=True))], -1
         )
@@ -111,8 +122,14 @@ class Design:
         across = (x.square() + y.square()).sqrt()
         half = self.collar / 2
         collar = rounded(torch.stack([across - self.wrist_radius, (z - half).abs() - half], -1), 0.3)
+        return torch.minimum(collar, self._prongs(points, self.collar - 1.0))
+
+    def _prongs(self, points: Tensor, start: float) -> Tensor:
+        """Lower bound [M] mm of the distance to the two prongs, from z = `start` on, and their pin."""
+        x, y, z = points.unbind(-1)
+        across = (x.square() + y.square()).sqrt()
         inner, outer = self.prong_half_x
-        start, end = self.collar - 1.0, self.hinge + self.prong_half_y
+        end = self.hinge + self.prong_half_y
         prong = torch.stack(
             [
                 (x.abs() - (inner + outer) / 2).abs() - (outer - inner) / 2,
@@ -124,7 +141,7 @@ class Design:
         prongs = torch.maximum(rounded(prong, 0.4), across - self.wrist_radius - 0.1)
         off_hinge = (y.square() + (z - self.hinge).square()).sqrt()
         pin = rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
-        return torch.minimum(torch.minimum(collar, prongs), pin)
+        return torch.minimum(prongs, pin)
 
     def on_link(self, opening: float, points: Tensor, parts: Tensor) -> Tensor:
         """Points [M, 3] on the given parts [M] as they lie with the jaws closed, from the hinge."""
@@ -132,8 +149,8 @@ class Design:
 
     def turn_to_link(self, opening: float, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
         """Vectors [M, 3] as they are with the jaws closed; sense -1: the other way round."""
-        for part, sign, share in zip((FIRST_JAW, SECOND_JAW), (sense, -sense), self.shares, strict=True):
-            vectors = torch.where((parts == part)[:, None], turn_x(vectors, sign * share * opening), vectors)
+        for part, angle in zip((FIRST_JAW, SECOND_JAW), self.jaw_angles(opening), strict=True):
+            vectors = torch.where((parts == part)[:, None], turn_x(vectors, -sense * angle), vectors)
         return vectors
 
     def turn_from_link(self, opening: float, vectors: Tensor, parts: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rendered.instrument import FIRST_JAW, SECOND_JAW, WRIST, Design, rounded, turn_x
+from rendered.instrument import WRIST, Design, rounded
 from rendered.motion import Array, Bend
 
 
@@ -28,24 +28,18 @@ class WristedDesign(Design):
         end = self.hinge + self.prong_half_y
         middle = torch.zeros(5, 3)
         middle[:, 2] = torch.linspace(0.0, end, 5)
-        centers, radii = [middle], [torch.full((5,), end / 8 + self.wrist_radius + 1.5)]
-        for blade, angle in zip(self.jaws, self._jaw_angles(bend), strict=True):
-            z = torch.linspace(-blade.heel, blade.length, 9)
-            curve = (z / blade.length) ** 2
-            line = torch.stack([blade.shift_x + blade.bend_x * curve, blade.shift_y + blade.bend_y * curve, z], -1)
-            centers.append(turn_x(line, angle) + torch.tensor([0.0, 0.0, self.hinge]))
-            gap, slack = (blade.length + blade.heel) / 8, 0.8 * (abs(blade.shift_x) + abs(blade.shift_y))
-            radii.append(torch.full((9,), 0.6 * gap + max(blade.half_x) + max(blade.half_y) + slack))
-        pitched = self._about_pitch(torch.cat(centers), bend.pitch)
-        return pitched, torch.cat(radii)
+        centers, radii = self._jaw_balls(bend)
+        wrist = torch.full((5,), end / 8 + self.wrist_radius + 1.5)
+        return self._about_pitch(torch.cat([middle, centers]), bend.pitch), torch.cat([wrist, radii])
+
+    def jaw_angles(self, bend: Bend) -> tuple[float, float]:
+        """rad about +x by which the jaws stand from the clevis."""
+        first, second = self.shares
+        return bend.yaw - first * bend.opening, bend.yaw + second * bend.opening
 
     def distances(self, points: Tensor, bend: Bend) -> Tensor:
         """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
-        straight = self._about_pitch(points, -bend.pitch)
-        arm = straight - torch.tensor([0.0, 0.0, self.hinge])
-        turned = [turn_x(arm, -angle) for angle in self._jaw_angles(bend)]
-        jaws = [blade.distance(turn) for blade, turn in zip(self.jaws, turned, strict=True)]
-        return torch.stack([self._wrist(straight), *jaws], -1)
+        return super().distances(self._about_pitch(points, -bend.pitch), bend)
 
     def _wrist(self, points: Tensor) -> Tensor:
         x, y, z = points.unbind(-1)
@@ -55,40 +49,21 @@ class WristedDesign(Design):
         neck = rounded(
             torch.stack([across - self.wrist_radius, (z - (start + end) / 2).abs() - (end - start) / 2], -1), 0.3
         )
-        inner, outer = self.prong_half_x
-        tip = self.hinge + self.prong_half_y
-        sides = [(x.abs() - (inner + outer) / 2).abs() - (outer - inner) / 2, y.abs() - self.prong_half_y]
-        prong = rounded(torch.stack([*sides, (z - (end - 1 + tip) / 2).abs() - (tip - end + 1) / 2], -1), 0.4)
-        off_hinge = (y.square() + (z - self.hinge).square()).sqrt()
-        pin = rounded(torch.stack([off_hinge - self.pin, x.abs() - outer - 0.2], -1), 0.15)
-        return torch.stack([ball, neck, torch.maximum(prong, across - self.wrist_radius - 0.1), pin]).amin(0)
+        return torch.minimum(torch.minimum(ball, neck), self._prongs(points, end - 1.0))
 
     def on_link(self, bend: Bend, points: Tensor, parts: Tensor) -> Tensor:
         """Points [M, 3] on the given parts [M] as they lie with the wrist straight and the jaws closed, from the
         hinge."""
-        moves = (parts >= WRIST)[:, None]
-        straight = torch.where(moves, self._about_pitch(points, -bend.pitch), points)
-        return self._turn_jaws(bend, straight - torch.tensor([0.0, 0.0, self.hinge]), parts, -1)
+        straight = torch.where((parts >= WRIST)[:, None], self._about_pitch(points, -bend.pitch), points)
+        return super().turn_to_link(bend, straight - torch.tensor([0.0, 0.0, self.hinge]), parts)
 
     def turn_to_link(self, bend: Bend, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
         """Vectors [M, 3] as they are with the wrist straight and the jaws closed; sense -1: the other way round."""
         moves = (parts >= WRIST)[:, None]
         if sense < 0:
-            turned = self._turn_jaws(bend, vectors, parts, 1)
+            turned = super().turn_to_link(bend, vectors, parts, sense)
             return torch.where(moves, _turn_y(turned, bend.pitch), vectors)
-        straight = torch.where(moves, _turn_y(vectors, -bend.pitch), vectors)
-        return self._turn_jaws(bend, straight, parts, -1)
-
-    def _turn_jaws(self, bend: Bend, vectors: Tensor, parts: Tensor, sense: int) -> Tensor:
-        for part, angle in zip((FIRST_JAW, SECOND_JAW), self._jaw_angles(bend), strict=True):
-            vectors = torch.where((parts == part)[:, None], turn_x(vectors, sense * angle), vectors)
-        return vectors
-
-    def _jaw_angles(self, bend: Bend) -> tuple[float, float]:
-        """rad about +x by which the jaws stand from the clevis: a positive turn takes z towards -y, so that the first
-        opens by minus its share."""
-        first, second = self.shares
-        return bend.yaw - first * bend.opening, bend.yaw + second * bend.opening
+        return super().turn_to_link(bend, torch.where(moves, _turn_y(vectors, -bend.pitch), vectors), parts)
 
     def _about_pitch(self, points: Tensor, angle: float) -> Tensor:
         center = torch.tensor([0.0, 0.0, self.pitch_at])
