@@ -3,70 +3,36 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
+from rendered_truth import frames_with_depth, labels, seen_points, sensor_from_camera, truth_of
 
 from neeco.capture import check_capture, errors_only, read_capture
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 FOCAL, WIDTH, HEIGHT = 36.25, 40, 32
 SHAFT, JAW_LEFT, JAW_RIGHT = 1, 3, 4
 
 
 @pytest.fixture(scope="module", params=["bowel", "stomach"])
-def capture(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene's whole pipeline for six frames of 40x32: four to train on, one `test`, one `unseen`."""
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        from rendered.frames import Settings
-        from rendered.render import Lens
-        from rendered.scenes import SCENES
-        from rendered.writing import write_recording
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    from rendered.frames import Settings
+    from rendered.render import Lens
+    from rendered.scenes import SCENES
+    from rendered.writing import write_recording
+
     path = tmp_path_factory.mktemp(request.param)
     settings = Settings(Lens(WIDTH, HEIGHT, FOCAL), resolution=240, every=50)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # for images this small threads only wait for each other
     write_recording(SCENES[request.param], path, settings, lambda line: None)
-    torch.set_num_threads(threads)
     return path
-
-
-def frames(capture: Path) -> list[dict]:
-    return json.loads((capture / "truth" / "transforms.json").read_text())["frames"]
-
-
-def frames_with_depth(capture: Path) -> list[dict]:
-    return [frame for frame in frames(capture) if "depth_file_path" in frame]
 
 
 def hinge(capture: Path) -> dict:
     return json.loads((capture / "truth" / "hinge.json").read_text())
-
-
-def sensor_from_camera(frame: dict) -> np.ndarray:
-    world_from_camera = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])  # to OpenCV axes
-    return np.linalg.inv(np.array(frame["instruments"][0]["pose"])) @ world_from_camera
-
-
-def labels(capture: Path, frame: dict) -> np.ndarray:
-    return np.array(Image.open(capture / "truth" / frame["part_mask_path"]))
-
-
-def seen_points(capture: Path, frame: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points [M, 3] in the sensor's frame from the stored depth, and their part ids [M]."""
-    depth = np.array(Image.open(capture / "truth" / frame["depth_file_path"])).astype(float) * 0.05
-    v, u = np.mgrid[0:HEIGHT:2, 0:WIDTH:2] + 0.5
-    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1)
-    transform = sensor_from_camera(frame)
-    points = (rays * depth[..., None]) @ transform[:3, :3].T + transform[:3, 3]
-    return points.reshape(-1, 3), labels(capture, frame)[::2, ::2].ravel()
 
 
 def test_capture_reads_and_has_no_errors(capture: Path) -> None:
@@ -117,7 +83,7 @@ def test_jaws_open_to_the_sides_their_names_say(capture: Path) -> None:
 
 def test_recorded_poses_err_but_little(capture: Path) -> None:
     recorded = json.loads((capture / "transforms.json").read_text())["frames"]
-    for found, true in zip(recorded, frames(capture), strict=True):
+    for found, true in zip(recorded, truth_of(capture)["frames"], strict=True):
         shift = np.array(found["transform_matrix"])[:3, 3] - np.array(true["transform_matrix"])[:3, 3]
         assert 0.3 < np.linalg.norm(shift) < 4
         drift = np.array(found["instruments"][0]["pose"]) - np.array(true["instruments"][0]["pose"])

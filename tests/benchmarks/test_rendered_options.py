@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -21,21 +18,7 @@ from neeco.ingest.lens import read_lens
 from neeco.ingest.logs import read_pose_log
 from neeco.ingest.recording import read_recording
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 WIDTH, HEIGHT, RESOLUTION = 64, 48, 240
-
-
-@pytest.fixture(scope="module")
-def benchmarks() -> Iterator[ModuleType]:
-    """Makes `benchmarks/` importable; gives its script."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # for images this small threads only wait for each other
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        yield importlib.import_module("rendered_captures")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
-        torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

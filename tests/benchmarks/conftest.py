@@ -1,0 +1,3 @@
+from rendered_truth import benchmarks
+
+__all__ = ["benchmarks"]
