@@ -45,7 +45,8 @@ scene is one more entry in `scenes.SCENES`.
               each with the other's instrument, in other colours, under a single lamp whose shadow falls beside it
     bowel-wristed, stomach-wristed
               8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
-              wrist_yaw with the encoders' offsets, play and noise; truth/kinematics.json instead of hinge.json
+              wrist_yaw with the encoders' offsets, play and noise; `kinematics` states every axis 5 degrees
+              and every pivot 2 mm off; truth/kinematics.json instead of hinge.json
 """
 
 from __future__ import annotations

@@ -1,10 +1,13 @@
-"""The true links of a scene's wristed instrument, in the tracked sensor's frame."""
+"""The links of a scene's wristed instrument, in the tracked sensor's frame: as they are and as stated."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from rendered.hinge import JAW_LEFT, JAW_RIGHT, truth_ids
@@ -14,6 +17,8 @@ from rendered.wristed import WristedDesign
 
 PITCH, YAW = "wrist_pitch", "wrist_yaw"
 JAW_NAMES = {JAW_LEFT: "jaw_left", JAW_RIGHT: "jaw_right"}
+# by which every axis and every pivot is stated wrongly
+AXIS_ERROR, PIVOT_ERROR = math.radians(5.0), 2.0
 
 
 def true_kinematics(spec: SceneSpec) -> KinematicTree:
@@ -34,6 +39,33 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
         value = {YAW: 1.0, "jaw_angle": gain}
         links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, _shift(yaw_at), rotation[:, 0], value, offset))
     return KinematicTree(tuple(links))
+
+
+def stated_kinematics(spec: SceneSpec) -> KinematicTree:
+    """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
+    pivots shifted by PIVOT_ERROR mm, each some way of its own, and encoders thought to be without an offset."""
+    exact = true_kinematics(replace(spec, encoders=replace(spec.encoders, pitch_offset=0.0, yaw_offset=0.0)))
+    generator = np.random.default_rng((spec.seed, 4))
+    errors: dict[str, tuple[Array, Array]] = {}  # by parent: the links that it carries share an axis
+    links = []
+    for link in exact.links:
+        if link.parent is None:
+            links.append(link)
+            continue
+        if link.parent not in errors:
+            errors[link.parent] = (_direction(generator, link.axis), _direction(generator, link.axis))
+        turn, shift = errors[link.parent]
+        origin = link.origin.copy()
+        origin[:3, 3] += PIVOT_ERROR * shift
+        axis = Rotation.from_rotvec(AXIS_ERROR * turn).apply(link.axis)
+        links.append(replace(link, origin=origin.round(4), axis=axis))
+    return KinematicTree(tuple(links))
+
+
+def _direction(generator: np.random.Generator, axis: Array) -> Array:
+    """A random unit vector [3] across an axis: an error along it would be none."""
+    drawn = np.cross(axis, generator.standard_normal(3))
+    return drawn / np.linalg.norm(drawn)
 
 
 def describe_kinematics(spec: SceneSpec) -> dict[str, Any]:

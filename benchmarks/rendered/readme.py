@@ -6,6 +6,7 @@ import math
 
 from neeco.capture import Capture
 from rendered.frames import Settings
+from rendered.kinematics import AXIS_ERROR, PIVOT_ERROR
 from rendered.scenes import SceneSpec
 from rendered.wristed import Encoders
 
@@ -50,7 +51,8 @@ def _wrist(encoders: Encoders) -> str:
     pitch, yaw, play = (math.degrees(v) for v in (encoders.pitch_offset, encoders.yaw_offset, encoders.play))
     return f"""
 Readings `wrist_pitch` and `wrist_yaw`: the angle, rad, plus an offset of {pitch:.1f} and {yaw:.1f} degrees, less play
-of {play:.1f} degrees either way."""
+of {play:.1f} degrees either way. `kinematics` states the links without offsets, every axis \
+{math.degrees(AXIS_ERROR):.0f} degrees and every pivot {PIVOT_ERROR:.0f} mm off."""
 
 
 def _switched_on(settings: Settings) -> str:

@@ -23,6 +23,11 @@ class WristedDesign(Design):
     pitch_at: float = 1.5  # mm from the end of the shaft
     ball: float = 3.5  # radius
 
+    @property
+    def reach(self) -> float:
+        """As `Design` has it, from where the hinge is while the wrist is straight, however far it pitches."""
+        return super().reach + 2 * (self.hinge - self.pitch_at)
+
     def balls(self, bend: Bend) -> tuple[Tensor, Tensor]:
         """Centres [K, 3] and radii [K] of balls that together hold wrist and jaws."""
         end = self.hinge + self.prong_half_y

@@ -19,7 +19,7 @@ from rendered import breathing, errors
 from rendered.exposure import meter
 from rendered.frames import Renderer, Settings, Shot, image_name, moved, render_all, take_shots
 from rendered.hinge import describe_hinge
-from rendered.kinematics import describe_kinematics
+from rendered.kinematics import describe_kinematics, stated_kinematics
 from rendered.motion import Array, Moment, Trajectory, plan
 from rendered.optics import Optics
 from rendered.points import PointSampler
@@ -100,7 +100,8 @@ def _recorded(
     to_world = world.spec.world_from_scene()
     points = np.concatenate(sampler.positions) @ to_world[:3, :3].T + to_world[:3, 3]
     cloud = PointCloud(found.points(points).astype(np.float32), np.concatenate(sampler.colors).astype(np.float32))
-    declared = Instrument(spec.design.name, {JOINT: spec.joint.limits} | dict.fromkeys(wrist))
+    tree = stated_kinematics(spec) if wrist else None
+    declared = Instrument(spec.design.name, {JOINT: spec.joint.limits} | dict.fromkeys(wrist), tree)
     openings = np.array([shot.moment.opening for shot in world.shots])
     quality = {
         **_differences("camera", cameras, true_cameras),

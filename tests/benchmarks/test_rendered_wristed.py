@@ -71,6 +71,19 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
     assert min(seen.values()) > 5, seen
 
 
+def test_axes_and_pivots_are_stated_as_wrongly_as_said(capture: Path) -> None:
+    from rendered.kinematics import AXIS_ERROR, PIVOT_ERROR
+
+    exact = kinematics_of(json.loads((capture / "truth" / "kinematics.json").read_text())["kinematics"], "truth")
+    stated = read_capture(capture).instruments[0].kinematics
+    assert stated is not None
+    assert [link.name for link in stated.links] == [link.name for link in exact.links]
+    for ours, theirs in zip(stated.links[1:], exact.links[1:], strict=True):
+        assert np.degrees(np.arccos(ours.axis @ theirs.axis)) == pytest.approx(np.degrees(AXIS_ERROR), abs=1e-4)
+        assert np.linalg.norm((ours.origin - theirs.origin)[:3, 3]) == pytest.approx(PIVOT_ERROR, abs=1e-3)
+    assert np.array_equal(stated.links[2].axis, stated.links[3].axis)  # the jaws share theirs
+
+
 def test_readings_err_by_their_offsets_play_and_noise(capture: Path) -> None:
     from rendered.scenes import SCENES
 
@@ -109,3 +122,14 @@ def test_logs_of_a_wrist_are_refused(benchmarks: ModuleType, capsys: pytest.Capt
         benchmarks.parse(["bowel-wristed", "out", "--video"])
     assert exit.value.code == 2
     assert "--video: the logs of a wrist are not written" in capsys.readouterr().err
+
+
+def test_all_that_casts_a_shadow_lies_within_reach(benchmarks: ModuleType) -> None:
+    from rendered.motion import Bend
+    from rendered.scenes import SCENES
+
+    design = SCENES["bowel-wristed"].design
+    for pitch, yaw in ((0.0, 0.0), (1.0, 0.9), (-1.0, 0.9), (1.0, -0.9)):
+        centers, _ = design.balls(Bend(1.3, pitch, yaw))
+        away = (centers - torch.tensor([0.0, 0.0, design.hinge])).norm(dim=1)
+        assert float(away.max()) < design.reach
