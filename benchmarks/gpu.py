@@ -48,7 +48,7 @@ from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.instruments import PART_LOGITS
+from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
@@ -126,7 +126,7 @@ def surface_scene(gaussians: Gaussians, camera: Camera) -> Scene:
         sh_dc=gaussians.sh[:, :1].contiguous(),
         sh_rest=gaussians.sh[:, 1:].contiguous(),
         counts=(count - held, held),
-        extras={PART_LOGITS: torch.randn(count, 3, generator=generator)},
+        extras={LINK_LOGITS: torch.randn(count, 3, generator=generator)},
     )
     deformation = make_deformation("kinematic", (GRASPER,), method_settings("kinematic", {}))
     recorded = Recorded(("000000",), ("train",), (STATE,), (camera,))

@@ -10,8 +10,8 @@ from rod_world import CAMERA, WALL_MM, FakeRun
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.deformations.kinematic import Kinematic
-from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.io import save_scene
 
 RADIUS = 6.0  # mm, of a ball
@@ -51,7 +51,7 @@ def ball_scene(
         (colors[:, None] - 0.5) / 0.28209479177387814,
         torch.zeros(count, 15, 3),
         (len(tissue), inside),
-        {PART_LOGITS: torch.zeros(count, 1)},
+        {LINK_LOGITS: torch.zeros(count, 1)},
     )
     states = tuple(ball_state(name, *place) for place in places)
     names = tuple(f"{k:06d}" for k in range(len(states)))

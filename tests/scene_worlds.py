@@ -9,7 +9,7 @@ from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.instruments import PART_LOGITS
+from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.scene.nerfies.field import NerfiesSettings, NerfScene
 
@@ -57,7 +57,7 @@ def make_scene(method: str) -> Scene:
     generator = torch.Generator().manual_seed(3)
     canonical = random_canonical(generator)
     if method == "kinematic":
-        canonical = canonical.with_extras(**{PART_LOGITS: torch.randn(len(canonical), 3, generator=generator)})
+        canonical = canonical.with_extras(**{LINK_LOGITS: torch.randn(len(canonical), 3, generator=generator)})
     instruments = () if method == "3dgs" else (GRASPER,)
     states = tuple(
         grasper_state(pose_of(0.3 * k - 1, 0.2 * k, 0.1, k, 2 * k, 60 - k), 0.1 * k, 0.04 * k)
@@ -73,7 +73,7 @@ def make_scene(method: str) -> Scene:
     scene = Scene(method, canonical, deformation, instruments, recorded, torch.tensor([1.0, 2.0, 80.0]))
     scene.sh_degree = 2
     if method == "kinematic":
-        hinges = scene.deformation.hinges_of(0)
+        hinges = scene.deformation.articulations[0]
         hinges.base.copy_(pose_of(0.4, -0.3, 0.2, 1.0, -2.0, 3.0))
         hinges.wrist_start.fill_(2.0)
         hinges.extent.copy_(torch.tensor([-20.0, 15.0]))

@@ -16,8 +16,8 @@ from neeco.capture.writer import write_capture
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.drawable import Learned
-from neeco.scene.instruments import PART_LOGITS
 from neeco.scene.io import save_scene
 from neeco.scene.methods import make_deformation, method_settings
 from neeco.training.config import TrainConfig
@@ -57,11 +57,11 @@ def grasper_scene(name: str = "grasper", joint: str = "jaw_angle", frame_name: s
         sh_dc=(colors[:, None] - 0.5) / SH_DC,
         sh_rest=torch.zeros(count, 15, 3),
         counts=(len(wall), len(shaft) + len(jaws)),
-        extras={PART_LOGITS: logits},
+        extras={LINK_LOGITS: logits},
     )
     instruments = (Instrument(name, {joint: LIMITS}),)
     deformation = make_deformation("kinematic", instruments, method_settings("kinematic", {}))
-    hinges = deformation.hinges_of(0)
+    hinges = deformation.articulations[0]
     hinges.extent.copy_(torch.tensor([-40.0, 14.0]))
     hinges.wrist_start.fill_(-3.0)
     states = tuple(

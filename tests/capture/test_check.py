@@ -390,7 +390,6 @@ def _tree(**changes):
 @pytest.mark.parametrize(
     ("changes", "field", "words", "severity"),
     [
-        ({}, "instruments", "are read and checked, but not learned from yet", "warning"),
         ({"value": {"elbow": 1}}, "instruments", "'elbow' is no joint of it (recorded: jaw_angle)", "error"),
         ({"offset": 50.0, "limits": [-1, 1]}, "instruments", "8 frames, outside its limits -1 .. 1", "warning"),
         ({"parent": "wrist"}, "instruments[0].kinematics.links", "joined in a circle", "error"),

@@ -11,9 +11,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kinematic_trees import at_rest, kinematic_trees, turned
 
 from neeco.capture.dvrk import read_dvrk_tool
-from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
+from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.kinematicsfile import kinematics_of
 from neeco.errors import NeecoError
 from neeco.raster.posing import ArticulatedBody, pose_bodies
@@ -48,15 +49,6 @@ TOOL = """/* a needle driver */
   "url": "https://example.org/no//comment"
 }
 """
-
-
-def turned(axis: str, angle: float, *shift: float) -> np.ndarray:
-    """[4, 4]: a turn about x, y or z, then a shift."""
-    c, s, pose = math.cos(angle), math.sin(angle), np.eye(4)
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    pose[i, i], pose[j, j], pose[j, i], pose[i, j] = c, c, s, -s
-    pose[: len(shift), 3] = shift
-    return pose
 
 
 def test_a_wrist_and_jaws_stand_where_they_are_by_hand() -> None:
@@ -175,32 +167,13 @@ def test_what_is_no_tree_is_refused_in_one_line(value: dict, message: str) -> No
     assert str(error.value).startswith("transforms.json: kinematics")
 
 
-@st.composite
-def kinematic_trees(draw: st.DrawFn) -> KinematicTree:
-    """Any tree to a depth of six, of all types of joints, several readings to a joint and several joints to one."""
-    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
-    links = [Link("0")]
-    for index in range(1, 1 + draw(st.integers(1, 6))):
-        origin = turned("x", rng.uniform(-3, 3), *rng.uniform(-9, 9, 3)) @ turned("y", rng.uniform(-3, 3))
-        axis = rng.normal(size=3)
-        kind = draw(st.sampled_from([REVOLUTE, PRISMATIC, "fixed"]))
-        gains = {f"q{k}": float(rng.uniform(-1, 1)) for k in range(draw(st.integers(1, 3)))}
-        parent = str(draw(st.integers(0, index - 1)))
-        moves = {} if kind == "fixed" else {"value": gains, "offset": float(rng.uniform(-1, 1))}
-        body = draw(st.booleans())
-        links.append(Link(str(index), parent, kind, origin, axis / np.linalg.norm(axis), **moves, body=body))
-    return KinematicTree(tuple(links))
-
-
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(tree=kinematic_trees(), seed=st.integers(0, 1000))
 def test_what_is_posed_stands_where_forward_kinematics_says(tree: KinematicTree, seed: int) -> None:
     """A point that is at rest on a link, where every joint's value is 0, goes where the link goes."""
     rng = np.random.default_rng(seed)
     readings = {name: float(value) for name, value in zip(("q0", "q1", "q2"), rng.uniform(-2, 2, 3), strict=True)}
-    resting = KinematicTree(
-        tuple(Link(link.name, link.parent, link.type, link.origin, link.axis) for link in tree.links)
-    ).poses({})
+    resting = at_rest(tree)
     there = tree.poses(readings)
     local = rng.normal(size=(len(tree.bodies), 3)) * 5
     origins, axes = tree.axes_at_rest

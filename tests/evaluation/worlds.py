@@ -62,7 +62,7 @@ class TinyScene:
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         return rasterize(self.at(state), camera, channels=self.label_channels() if labels and self.labelled else None)
 
-    def hinge_motion(self) -> None:
+    def motion(self) -> None:
         return None
 
     def torch_threads(self) -> AbstractContextManager[None]:

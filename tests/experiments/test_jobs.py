@@ -165,7 +165,7 @@ def test_kinematic_finishes_where_no_wrist_is_found(make_job) -> None:
 
     job = make_job("kinematic", config=training_config("kinematic", {}))  # the bar has no joint to find a wrist by
     result = job.run()
-    assert float(load_run(job.folder).scene.deformation.hinges[0].wrist_start) == float("-inf")
+    assert float(load_run(job.folder).scene.deformation.articulations[0].wrist_start) == float("-inf")
     assert result["splits"]["test"]["psnr"] > 5
 
 

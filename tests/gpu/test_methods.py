@@ -149,7 +149,7 @@ def test_an_instrument_is_found_there_and_an_interrupted_run_goes_on(device: tor
     for run in (whole, cut):
         scene = load_run(run, device).scene
         assert scene.diagnostics["instruments"]["grasper"]["moves_with_its_pose"]
-        assert abs(float(scene.deformation.hinges_of(0).hinge(0)[0][2]) - 6.0) < 6
+        assert abs(float(scene.deformation.articulations[0].hinge(0)[0][2]) - 6.0) < 6
     opened = load_run(whole, device)
     aligned = evaluate_run(opened, read_capture(capture), ("test",), align=True)
     assert aligned["aligned"]["test"]["psnr"] >= aligned["given"]["test"]["psnr"] - 0.1

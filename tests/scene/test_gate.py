@@ -15,8 +15,8 @@ from neeco.errors import NeecoError
 from neeco.scene import Scene
 from neeco.scene.deformations.base import mark_moving
 from neeco.scene.deformations.nps import NPS, NPSSettings
-from neeco.scene.instruments import SweptVolume
 from neeco.scene.io import load_scene, save_scene
+from neeco.scene.swept_volume import SweptVolume
 
 MARGIN_MM = 4.0
 

@@ -15,8 +15,8 @@ from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
+from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.deformations.kinematic import Kinematic, Spin
-from neeco.scene.instruments import PART_LOGITS
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
 UNIT = torch.nn.functional.normalize
@@ -26,7 +26,7 @@ def assign(scene: Scene, part: int) -> None:
     """Give every Gaussian of the instrument to one part."""
     logits = torch.zeros(len(scene.canonical), 3)
     logits[:, part] = SURE
-    scene.canonical = scene.canonical.with_extras(**{PART_LOGITS: logits})
+    scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: logits})
 
 
 def test_an_instruments_gaussians_move_with_its_pose(kinematic: Scene) -> None:
@@ -57,7 +57,7 @@ def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic
     assign(kinematic, part)
     identity = pose_of(0, 0, 0, 0, 0, 0)
     shut, open_ = (kinematic.at(grasper_state(identity, jaw)).means[TISSUE:] for jaw in (0.0, 0.7))
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     pivot, axis = hinges.hinge(0)
     turn = (0.7 * hinges.gains[0, part - 1]).expand(len(shut))
     assert turn[0].abs() > 0.1
@@ -66,7 +66,7 @@ def test_a_joint_turns_its_parts_by_gain_times_reading_about_the_hinge(kinematic
 
 
 def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: Scene) -> None:
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     hinges.middle.fill_(0.6)
     before = [kinematic.at(grasper_state(POSE, jaw)).means for jaw in (0.6, 1.1)]
     with torch.no_grad():
@@ -77,7 +77,7 @@ def test_at_the_middle_reading_a_change_of_gains_moves_nothing(kinematic: Scene)
 
 
 def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     hinges.middle.fill_(0.6)
     hinges.closed.fill_(0.1)
     shut, open_ = (kinematic.keypoints(grasper_state(POSE, jaw))["grasper"] for jaw in (0.1, 0.6))
@@ -86,7 +86,7 @@ def test_tips_meet_where_the_joint_is_closed(kinematic: Scene) -> None:
 
 
 def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene) -> None:
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     pivot, axis = hinges.hinge(0)
     _, direction = hinges.shaft()
     beside = torch.linalg.cross(axis, direction)
@@ -104,7 +104,7 @@ def test_tips_turn_with_their_parts_wherever_they_were_measured(kinematic: Scene
 
 def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
     assign(kinematic, 1)
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     hinges.radius.fill_(2.0)
     origin, direction = (part.detach() for part in hinges.shaft())
     depth = float(hinges.hinge_depth[0].detach())
@@ -118,7 +118,7 @@ def test_what_lies_far_behind_the_hinge_never_turns(kinematic: Scene) -> None:
 
 
 def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: Scene) -> None:
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     hinges.radius.fill_(2.0)
     with torch.no_grad():
         kinematic.canonical.log_scales[TISSUE:, 0] = 4.0
@@ -132,7 +132,7 @@ def test_what_turns_is_no_longer_than_the_shaft_is_thick(kinematic: Scene) -> No
 def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
     """It is learned as body, since it moves like it."""
     assign(kinematic, 0)
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     hinges.radius.fill_(2.0)
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) > hinges.hinge_depth[0] + 1.0
     assert 0 < int(beyond.sum()) < len(beyond)
@@ -154,7 +154,7 @@ def test_a_jaw_that_stands_still_is_a_jaw(kinematic: Scene) -> None:
 
 def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
     assign(kinematic, 1)
-    pivot, axis = kinematic.deformation.hinges_of(0).hinge(0)
+    pivot, axis = kinematic.deformation.articulations[0].hinge(0)
     with torch.no_grad():
         along = torch.linspace(-8, 8, len(kinematic.canonical) - TISSUE)
         kinematic.canonical.means[TISSUE:] = pivot + along[:, None] * axis
@@ -163,14 +163,14 @@ def test_points_on_the_hinge_line_stay(kinematic: Scene) -> None:
 
 
 def test_the_hinge_crosses_the_shaft_at_a_right_angle(kinematic: Scene) -> None:
-    hinges = kinematic.deformation.hinges_of(0)
+    hinges = kinematic.deformation.articulations[0]
     (origin, direction), (pivot, axis) = hinges.shaft(), hinges.hinge(0)
     assert float((axis @ direction).detach().abs()) < 1e-6
     assert torch.allclose(torch.linalg.cross(pivot - origin, direction), torch.zeros(3), atol=1e-5)
 
 
 def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene) -> None:
-    state, hinges = grasper_state(POSE), kinematic.deformation.hinges_of(0)
+    state, hinges = grasper_state(POSE), kinematic.deformation.articulations[0]
     still, spun = kinematic.at(state).means, kinematic.at(state, Spin(shaft_roll=1.0)).means
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
     moved = (spun - still).norm(dim=1)
@@ -181,7 +181,7 @@ def test_spinning_the_shaft_leaves_the_wrist_and_the_axis_alone(kinematic: Scene
 
 
 def test_spinning_keeps_the_distance_from_the_shaft(kinematic: Scene) -> None:
-    hinges, state = kinematic.deformation.hinges_of(0), grasper_state(pose_of(0, 0, 0, 0, 0, 0))
+    hinges, state = kinematic.deformation.articulations[0], grasper_state(pose_of(0, 0, 0, 0, 0, 0))
     assign(kinematic, 0)
     origin, direction = hinges.shaft()
     points, spun = (kinematic.at(state, Spin(shaft_roll=roll)).means[TISSUE:] for roll in (0.0, 2.0))
@@ -194,8 +194,8 @@ def test_a_method_made_of_it_says_for_itself_how_it_moves(kinematic: Scene) -> N
     class Sways(Kinematic):
         method = "sways"
 
-    assert kinematic.hinge_motion() is not None
-    assert Sways(kinematic.instruments).hinge_motion(kinematic.canonical) is None
+    assert kinematic.motion() is not None
+    assert Sways(kinematic.instruments).motion(kinematic.canonical) is None
 
 
 def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene) -> None:
@@ -209,7 +209,7 @@ def test_labels_share_out_the_instrument_and_leave_tissue_free(kinematic: Scene)
 
 def test_shaft_and_wrist_meet_at_wrist_start(kinematic: Scene) -> None:
     assign(kinematic, 0)
-    labels, hinges = kinematic.label_channels()[TISSUE:], kinematic.deformation.hinges_of(0)
+    labels, hinges = kinematic.label_channels()[TISSUE:], kinematic.deformation.articulations[0]
     beyond = hinges.along_shaft(kinematic.canonical.means[TISSUE:]) >= hinges.wrist_start
     assert [name for _, name in kinematic.label_names[:2]] == ["shaft", "wrist"]
     assert torch.equal(labels[:, 1] > 0.5, beyond)

@@ -14,18 +14,14 @@ from torch import Tensor
 from neeco.capture import read_capture
 from neeco.capture.model import Camera, Frame, InstrumentState, State
 from neeco.raster.rotations import rigid, rigid_from_vector, rotate_about
-from neeco.scene.instruments import Hinges
+from neeco.scene.articulation.hinges import Hinges
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import SearchConfig, training_config
 from neeco.training.initial import begin_session, initial_scene
 from neeco.training.instruments import discovery
-from neeco.training.instruments.discovery import (
-    search_hinge,
-    shape_around_frame,
-    tissue_evidence,
-    unbend_seeds,
-)
+from neeco.training.instruments.discovery import shape_around_frame, tissue_evidence
 from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
+from neeco.training.instruments.hinge_search import search_hinge, unbend_seeds
 
 SEARCH = SearchConfig(seeds=500)
 PIVOT_MM, TIP_MM, RADIUS_MM = 8.0, 24.0, 3.0

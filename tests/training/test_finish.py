@@ -12,9 +12,10 @@ from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 
 from neeco.capture import read_capture
 from neeco.raster import rasterize
+from neeco.scene.articulation import LINK_LOGITS
+from neeco.scene.articulation.hinges import Hinges
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.instruments import PART_LOGITS, Hinges
 from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
@@ -38,13 +39,13 @@ def session(tmp_path: Path) -> GaussianSession:
     logits = torch.zeros(len(body), 3)
     logits[:-30, 0] = logits[-30:-15, 1] = logits[-15:, 2] = 30.0
     canonical = join_bodies(
-        [wall.with_extras(**{PART_LOGITS: torch.zeros(900, 3)}), grasper.with_extras(**{PART_LOGITS: logits})]
+        [wall.with_extras(**{LINK_LOGITS: torch.zeros(900, 3)}), grasper.with_extras(**{LINK_LOGITS: logits})]
     )
     states, cameras = tuple(f.state for f in frames), tuple(f.camera for f in frames)
     recorded = Recorded(tuple(f.name for f in frames), ("train",) * len(frames), states, cameras)
     deformation = make_deformation("kinematic", capture.instruments)
     scene = Scene("kinematic", canonical, deformation, capture.instruments, recorded, torch.tensor([0.0, 0.0, 100.0]))
-    hinges = deformation.hinges_of(0)
+    hinges = deformation.articulations[0]
     with torch.no_grad():
         hinges.hinge_depth.fill_(PIVOT_MM)
         hinges.wrist_start.fill_(-20.0)
@@ -55,7 +56,7 @@ def session(tmp_path: Path) -> GaussianSession:
 
 
 def hinges_of(session: GaussianSession) -> Hinges:
-    return session.scene.deformation.hinges_of(0)
+    return session.scene.deformation.articulations[0]
 
 
 def verdict(session: GaussianSession) -> dict:

@@ -63,7 +63,7 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
 
     scene = load_scene(first / "scene.safetensors")
     assert scene.diagnostics["instruments"]["grasper"]["moves_with_its_pose"]
-    pivot = scene.deformation.hinges_of(0).hinge(0)[0]
+    pivot = scene.deformation.articulations[0].hinge(0)[0]
     assert abs(float(pivot[2]) - PIVOT_MM) < 6
 
     run = load_run(first)  # images of two sizes all the way

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from neeco.raster.types import Camera, Gaussians
+from neeco.scene.articulation import LABEL_SHARE
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.scene.instruments import LABEL_SHARE
 from neeco.training.instruments import label_shares as module
 from neeco.training.instruments.label_shares import store_label_shares
 

@@ -70,13 +70,13 @@ def test_numbers_come_back_within_their_steps() -> None:
 def test_turns_and_sizes_are_those_that_are_drawn() -> None:
     scene = make_scene("kinematic")
     header, planes = pack(scene, 0)
-    found, (hinge,) = unpacked(header, planes), header["instruments"][0]["joints"]
+    found, (hinge,) = unpacked(header, planes), header["instruments"][0]["axes"]
     rows = scene.canonical.body(1)
     state = scene.recorded.states[3]
     reading = state.instruments["grasper"].joints["jaw_angle"]
     posed = scene.at(state)
     turns = np.stack([between(found["turn"][rows, k], 65535, header["ranges"]["turn"][k]) for k in (0, 1)], 1)
-    hinges, weights = scene.deformation.hinges_of(0), scene.deformation.part_weights(scene.canonical, 0)
+    hinges, weights = scene.deformation.articulations[0], scene.deformation.link_weights(scene.canonical, 0)
     expected = weights[:, 1:3] @ hinges.turns(0, reading)
     assert np.abs(turns[:, 0] + turns[:, 1] * reading - expected.numpy()).max() < 1e-3
     pivot, axis = hinges.hinge(0)

@@ -272,9 +272,6 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
             "name the recorded readings under `value`",
         )
         return
-    place.warning(
-        f"kinematics of {name} are read and checked, but not learned from yet", "its joints are found from the images"
-    )
     states = [state for _, state in parsed.states_of(instrument.name) if set(tree.readings) <= set(state.joints)]
     for link in tree.links:
         values = [link.joint_value(state.joints) for state in states]

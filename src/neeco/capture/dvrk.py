@@ -33,8 +33,7 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     """
     path, names = Path(path), dict(readings or {})
     document = Node(_json_with_comments(path), str(path), "", RaisingReport())
-    if not document.is_object():
-        raise AssertionError  # has raised
+    document.is_object()
     frames = document.child("DH")
     if frames.child("convention").value != "modified":
         found = printable(frames.child("convention").value)
@@ -52,14 +51,8 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     pitch, yaw, jaw = (names.get(joint, joint) for joint in READINGS)
     wrist, pitch_axis = _frame(joints["wrist_pitch"])
     pivot, yaw_axis = _frame(joints["wrist_yaw"])
-    limits = joints["wrist_pitch"].child("qmin"), joints["wrist_pitch"].child("qmax")
-    low, high = (node.number() for node in limits)
-    assert low is not None
-    assert high is not None
-    links = [
-        Link("shaft"),
-        Link("wrist", "shaft", REVOLUTE, wrist, pitch_axis, {pitch: 1.0}, limits=(low, high)),
-    ]
+    low, high = (joints["wrist_pitch"].child(end).number() or 0.0 for end in ("qmin", "qmax"))
+    links = [Link("shaft"), Link("wrist", "shaft", REVOLUTE, wrist, pitch_axis, {pitch: 1.0}, limits=(low, high))]
     if has_jaws:
         for side, share in (("left", 0.5), ("right", -0.5)):
             links.append(Link(f"jaw_{side}", "wrist", REVOLUTE, pivot, yaw_axis, {yaw: 1.0, jaw: share}))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from neeco.errors import NeecoError
-from neeco.raster.rotations import rigid_fault
+from neeco.raster.rotations import rigid_fault, rotation_from_vector
 
 FIXED, REVOLUTE, PRISMATIC = "fixed", "revolute", "prismatic"
 JOINT_TYPES = (FIXED, REVOLUTE, PRISMATIC)
@@ -52,7 +52,7 @@ class Link:
         if self.type == PRISMATIC:
             moved[:3, 3] = value * self.axis
             return moved @ self.origin
-        moved[:3, :3] = _rotation(self.axis, value)
+        moved[:3, :3] = rotation_from_vector(torch.from_numpy(value * self.axis)).numpy()
         moved[:3, 3] = self.origin[:3, 3] - moved[:3, :3] @ self.origin[:3, 3]
         return moved @ self.origin
 
@@ -129,10 +129,10 @@ class KinematicTree:
     def values(self, readings: Mapping[str, float]) -> Array:
         """[J, B] by which each of `joints` turns or slides each of `bodies`: its value for links that lie beyond it, 0
         for others. With `axes_at_rest` all that posing takes. Raises KeyError for a reading that is missing."""
-        rows = [[link.joint_value(readings) * self._beyond(link, body) for body in self.bodies] for link in self.joints]
+        rows = [[link.joint_value(readings) * self.carries(link, body) for body in self.bodies] for link in self.joints]
         return np.array(rows, np.float64).reshape(len(self.joints), len(self.bodies))
 
-    def _beyond(self, joint: Link, body: Link) -> bool:
+    def carries(self, joint: Link, body: Link) -> bool:
         """Whether `body` moves with the joint of `joint`."""
         link: Link | None = body
         while link is not None and link.name != joint.name:
@@ -183,11 +183,3 @@ def _parents_first(links: tuple[Link, ...]) -> tuple[Link, ...]:
         circle = sorted(set(names) - {link.name for link in ordered})
         raise NeecoError(f"joined in a circle: {', '.join(map(repr, circle))}; every link needs a way to the root")
     return tuple(ordered)
-
-
-def _rotation(axis: Array, angle: float) -> Array:
-    """[3, 3] about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    found: Array = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return found

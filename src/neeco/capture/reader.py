@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from neeco.capture.colmap import find_model, parse_colmap
 from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
-from neeco.capture.model import Capture
+from neeco.capture.model import Capture, Instrument, State
 from neeco.capture.points import points_in_view
 from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
@@ -36,13 +39,35 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 
 def capture_of(parsed: Parsed) -> Capture:
-    """What was read without an error, as a capture."""
+    """What was read without an error, as a capture, the poses of articulated instruments as those of their roots."""
     points = parsed.points
     if points is None:
         points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
-    return Capture(
-        parsed.root, tuple(parsed.frames), parsed.instruments, points, parsed.registered, parsed.timed, parsed.lens
-    )
+    frames, instruments = tuple(parsed.frames), parsed.instruments
+    if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):
+        frames = tuple(replace(frame, state=_of_roots(frame.state, instruments, parsed)) for frame in frames)
+        instruments = tuple(
+            item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
+            for item in instruments
+        )
+    return Capture(parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens)
+
+
+def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
+    """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
+    moved = dict(state.instruments)
+    for item in instruments:
+        tree, given = item.kinematics, state.instruments.get(item.name)
+        if tree is None or tree.pose_of is None or given is None:
+            continue
+        if missing := [name for name in tree.readings if name not in given.joints]:
+            raise NeecoError(
+                f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
+                "check` on the capture"
+            )
+        root = tree.world_from_root(given.pose.double().numpy(), given.joints)
+        moved[item.name] = replace(given, pose=torch.from_numpy(root))
+    return replace(state, instruments=moved)
 
 
 def parse_capture(

@@ -1,4 +1,4 @@
-"""Aligned scoring: fit instrument and camera pose of one frame to its recorded image, the scene frozen.
+"""Aligned scoring: fit instrument state and camera pose of one frame to its recorded image, the scene frozen.
 
 Trackers are off by a millimetre, which moves the drawn instrument by pixels whatever the model does. Fitting the pose
 separates what the scene learned from the tracker's error. The fit is Levenberg-Marquardt on the photometric residual
@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from neeco.capture.images import area_averaged
+from neeco.capture.kinematics import PRISMATIC
 from neeco.capture.model import Frame, State
 from neeco.raster import rasterize
 from neeco.raster.rotations import rigid_from_vector
@@ -33,6 +34,8 @@ class AlignConfig:
 
     sigma_instrument_mm: float = 1.0
     sigma_instrument_deg: float = 0.5
+    sigma_joint_deg: float = 1.5  # of joints in stated kinematics: play and noise of encoders
+    sigma_joint_mm: float = 0.5  # of those that slide
     sigma_camera_mm: float = 1.5
     sigma_camera_deg: float = 0.3
     levels: tuple[float, ...] = (0.25, 0.5, 1.0)  # sizes of the images compared, coarse to fine
@@ -50,7 +53,7 @@ class Fit:
 
     state: State
     camera: Camera
-    increments: Tensor  # [6 * (instruments + 1)] float64: rotation vector rad, translation mm, the camera's last
+    increments: Tensor  # [P] float64: rotation vector rad and translation mm of each instrument, joints, the camera
 
 
 @dataclass(frozen=True)
@@ -60,25 +63,35 @@ class _Level:
     camera: Camera  # size and intrinsics; its pose is the given one
     target: Tensor  # [h, w, 3]
     weight: Tensor  # [h, w], 0 where pixels do not count
-    step: Tensor  # [6] finite difference
+    step: Tensor  # [6] finite difference of a pose
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """What is fitted: one increment of 6 numbers per instrument, in the instrument's frame, then one for the camera."""
+    """What is fitted: one increment of 6 numbers per instrument, in the instrument's frame, then of every reading in
+    stated kinematics, then one of 6 for the camera."""
 
     scene: Scene
     state: State
     names: tuple[str, ...]
+    joints: tuple[tuple[str, str, bool], ...]  # instrument, reading, whether it slides
     config: AlignConfig
 
     @property
     def sigmas(self) -> Tensor:
-        """Prior standard deviation of every parameter, [6 * (instruments + 1)]."""
+        """Prior standard deviation of every parameter, [P]."""
         config = self.config
         instrument = [config.sigma_instrument_deg * torch.pi / 180] * 3 + [config.sigma_instrument_mm] * 3
+        joints = [
+            config.sigma_joint_mm if slides else config.sigma_joint_deg * torch.pi / 180 for _, _, slides in self.joints
+        ]
         camera = [config.sigma_camera_deg * torch.pi / 180] * 3 + [config.sigma_camera_mm] * 3
-        return torch.tensor(instrument * len(self.names) + camera, dtype=torch.float64)
+        return torch.tensor(instrument * len(self.names) + joints + camera, dtype=torch.float64)
+
+    def steps(self, level: _Level) -> Tensor:
+        """Finite difference of every parameter, [P]."""
+        joints = [level.step[3 if slides else 0] for _, _, slides in self.joints]
+        return torch.cat([*[level.step] * len(self.names), torch.tensor(joints, dtype=torch.float64), level.step])
 
     @property
     def scale(self) -> float:
@@ -93,6 +106,10 @@ class _Problem:
             given = instruments[name]
             increment = rigid_from_vector(parameters[6 * index : 6 * index + 6])
             instruments[name] = replace(given, pose=given.pose.double() @ increment)
+        for (name, reading, _), change in zip(self.joints, parameters[6 * len(self.names) : -6], strict=True):
+            given = instruments[name]
+            joints = {**given.joints, reading: given.joints[reading] + float(change)}
+            instruments[name] = replace(given, joints=joints)
         return replace(self.state, instruments=instruments)
 
     def moved_camera(self, camera: Camera, parameters: Tensor) -> Camera:
@@ -121,18 +138,20 @@ class _Problem:
 def fit_frame(
     scene: Scene, frame: Frame, image: Tensor, start: Tensor | None = None, config: AlignConfig | None = None
 ) -> Fit:
-    """Fit the poses of `frame` to its recorded `image` [H, W, 3], by about 7 * (6 * instruments + 8) small renderings.
+    """Fit the state of `frame` to its recorded `image` [H, W, 3], by about 7 * (6 * instruments + joints + 8) small
+    renderings.
 
-    One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), with
-    weak Gaussian priors at zero; joints and intrinsics stay. Pixels outside the frame's loss mask do not count.
+    One SE(3) increment per instrument (world_from_instrument @ exp), one for the camera (world_from_camera @ exp), and
+    one of every joint in stated kinematics, with weak Gaussian priors at zero; other joints and intrinsics stay.
+    Pixels outside the frame's loss mask do not count.
     `start`: a neighbouring frame's increments, begun from where they explain the image better than none.
     """
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)
-    problem, mask = _Problem(scene, frame.state, names, config), frame.load_mask()
+    problem, mask = _Problem(scene, frame.state, names, _stated_joints(scene, names), config), frame.load_mask()
     largest = min(1.0, math.sqrt(config.max_pixels / (frame.camera.width * frame.camera.height)))
     levels = [_level(frame.camera, image, mask, factor, largest, config) for factor in config.levels]
-    increments = torch.zeros(6 * (len(names) + 1), dtype=torch.float64)
+    increments = torch.zeros(len(problem.sigmas), dtype=torch.float64)
     if start is not None and len(start) == len(increments):
 
         def cost(tried: Tensor) -> float:
@@ -142,6 +161,17 @@ def fit_frame(
     for level, steps in zip(levels, config.steps, strict=True):
         increments = _fit_level(problem, level, increments, steps)
     return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
+
+
+def _stated_joints(scene: Scene, names: tuple[str, ...]) -> tuple[tuple[str, str, bool], ...]:
+    """(instrument, reading, whether it slides) of every reading in stated kinematics."""
+    trees = [(item.name, item.kinematics) for item in scene.instruments if item.name in names]
+    return tuple(
+        (name, reading, any(joint.type == PRISMATIC and reading in joint.value for joint in tree.joints))
+        for name, tree in trees
+        if tree is not None
+        for reading in tree.readings
+    )
 
 
 def _level(
@@ -189,10 +219,10 @@ def _normal_equations(
     # drawn a dozen times: the shadows, which move as little as what casts them, once
     camera = problem.moved_camera(level.camera, parameters)
     still = shadowed(gaussians, camera, rasterize)
-    columns = []
+    columns, steps = [], problem.steps(level)
     for index in range(len(parameters)):
         moved = parameters.clone()
-        step = float(level.step[index % 6])
+        step = float(steps[index])
         moved[index] += step
         is_camera = index >= len(parameters) - 6
         posed = still if is_camera else replace(problem.gaussians(moved), headlight=still.headlight)

@@ -150,6 +150,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
             state, camera = fit.state, fit.camera
             row["moved"] = pose_changes(frame, state, camera)
             row["world_from_camera"] = camera.world_from_camera.tolist()
+            row["joints"] = {name: dict(item.joints) for name, item in state.instruments.items()}
             row["world_from_instrument"] = {name: item.pose.tolist() for name, item in state.instruments.items()}
         drawing = draw(scene, state, camera)
         tally.scores.append(_scores(drawing, recorded, networks))

@@ -25,9 +25,7 @@ from neeco.scene.scene import gaussian_scene
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene
 
-KEYPOINTS = ("shaft_far", "shaft_near", "hinge", "tip_left", "tip_right")
-SKELETON = (("shaft_far", "shaft_near"), ("shaft_near", "hinge"), ("hinge", "tip_left"), ("hinge", "tip_right"))
-WORKING_END = ("hinge", "tip_left", "tip_right")
+SHAFT_ENDS = ("shaft_far", "shaft_near")  # keypoints; all others are of the working end
 OUTSIDE, OCCLUDED, VISIBLE = 0, 1, 2  # OUTSIDE: of the image, or the scene has nothing of the instrument
 OTHERS_MM = 1.0  # a surface of something else this much nearer than a keypoint hides it
 SELF_MM = 6.0  # keypoints lie inside their instrument: its own surface hides them only from this much nearer
@@ -136,8 +134,8 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
     others = [drawing.tissue_depth] + [layer.depth for name, layer in drawing.layers.items() if name != instrument]
     absent = not drawing.layers[instrument].mask.any()
     projected = {}
-    for name in sorted(points, key=lambda known: KEYPOINTS.index(known) if known in KEYPOINTS else len(KEYPOINTS)):
-        place = place_in_image(to_numpy(points[name]), camera)
+    for name, point in points.items():
+        place = place_in_image(to_numpy(point), camera)
         projected[name] = Keypoint(0.0, 0.0, OUTSIDE)
         if not absent and place is not None:
             x, y, z = place
@@ -150,18 +148,18 @@ def project_keypoints(points: dict[str, Tensor], drawing: LayeredDrawing, instru
 
 @torch.no_grad()
 def keypoint_names(scene: Scene) -> tuple[str, ...]:
-    """Every keypoint that some instrument of the scene has, in the order of KEYPOINTS."""
+    """Every keypoint that some instrument of the scene has."""
     if not scene.recorded.states:
         return ()
-    known = {name for points in scene.keypoints(scene.recorded.states[0]).values() for name in points}
-    return tuple(name for name in KEYPOINTS if name in known)
+    known = scene.keypoints(scene.recorded.states[0]).values()
+    return tuple(dict.fromkeys(name for points in known for name in points))
 
 
 @torch.no_grad()
 def working_ends(scene: Scene, state: State) -> dict[str, list[np.ndarray]]:
-    """Hinge and jaw tips [3] mm of every instrument for which the scene knows any."""
+    """Pivots and tips [3] mm of every instrument for which the scene knows any."""
     ends = {
-        instrument: [to_numpy(points[name]) for name in WORKING_END if name in points]
+        instrument: [to_numpy(point) for name, point in points.items() if name not in SHAFT_ENDS]
         for instrument, points in scene.keypoints(state).items()
     }
     return {instrument: points for instrument, points in ends.items() if points}

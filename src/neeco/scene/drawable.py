@@ -15,6 +15,7 @@ from torch import Tensor
 from neeco.capture.lens import Lens
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.types import Rendering
+from neeco.scene.articulation import JointMotion
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,13 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class HingeMotion:
-    """All that posing takes where bodies move rigidly with their instruments and turn about hinges, for renderers
+class ArticulatedMotion:
+    """All that posing takes where bodies move rigidly with their instruments and joints move their links, for renderers
     other than this program's."""
 
     log_scales: Tensor  # [N, 3], as drawn
-    turns: Tensor  # [N, J, 2] rad by which joint j turns a Gaussian: at a reading of 0, and per unit of the reading
-    hinges: tuple[tuple[tuple[Tensor, Tensor], ...], ...]  # pivot [3] mm, unit axis [3] per moving instrument and joint
+    amounts: Tensor  # [N, A, 2] rad or mm by which axis a moves a Gaussian: at a reading of 0, and per unit of it
+    axes: tuple[tuple[JointMotion, ...], ...]  # of every moving instrument, in the order in which they move
 
 
 class Drawable(Protocol):
@@ -102,8 +103,8 @@ class Drawable(Protocol):
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it; `labels`: with label channels, where the scene has any."""
 
-    def hinge_motion(self) -> HingeMotion | None:
-        """How the Gaussians move, where hinges say all of it; None otherwise."""
+    def motion(self) -> ArticulatedMotion | None:
+        """How the Gaussians move, where joints say all of it; None otherwise."""
 
     def torch_threads(self) -> AbstractContextManager[None]:
         """Use as many of torch's threads as pay where the scene is drawn."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neeco import __version__
 from neeco.capture.documents import Node, RaisingReport
+from neeco.capture.kinematicsfile import kinematics_of
 from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
@@ -102,9 +103,7 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "version": __version__,
         "method": scene.method,
         "diagnostics": scene.diagnostics,
-        "instruments": [
-            {"name": instrument.name, "joints": dict(instrument.joints)} for instrument in scene.instruments
-        ],
+        "instruments": [_described(instrument) for instrument in scene.instruments],
         "recorded": [
             {
                 "name": name,
@@ -155,10 +154,7 @@ def unpack_scene(tensors: dict[str, Tensor], header: dict[str, Any]) -> Learned:
 
 def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tuple[Instrument, ...], Recorded]:
     """The instruments and the training frames. Raises ValueError for what cannot have been recorded."""
-    instruments = tuple(
-        Instrument(entry["name"], {name: _limits(limits) for name, limits in entry["joints"].items()})
-        for entry in header["instruments"]
-    )
+    instruments = tuple(_instrument(entry) for entry in header["instruments"])
     states, cameras = [], []
     for index, entry in enumerate(header["recorded"]):
         moved = {
@@ -177,6 +173,21 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     return instruments, Recorded(names, splits, tuple(states), tuple(cameras), lens, scale)
+
+
+def _described(instrument: Instrument) -> dict[str, Any]:
+    """For the header; `_instrument` reads it."""
+    described = {"name": instrument.name, "joints": dict(instrument.joints)}
+    tree = instrument.kinematics
+    return described if tree is None else described | {"kinematics": tree.to_json()}
+
+
+def _instrument(entry: dict[str, Any]) -> Instrument:
+    joints = {name: _limits(limits) for name, limits in entry["joints"].items()}
+    tree = kinematics_of(entry["kinematics"], "header") if "kinematics" in entry else None
+    if tree is not None and not set(tree.readings) <= set(joints):
+        raise ValueError("its kinematics take readings that are not joints of it")
+    return Instrument(entry["name"], joints, tree)
 
 
 def _number(value: Any) -> float:

@@ -16,9 +16,10 @@ from neeco.raster import rasterize
 from neeco.raster.devices import CachedPredicate
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
+from neeco.scene.articulation import Skeleton
 from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
-from neeco.scene.drawable import Drawable, HingeMotion, Recorded
+from neeco.scene.drawable import ArticulatedMotion, Drawable, Recorded
 from neeco.scene.method import Stored
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 
@@ -193,9 +194,9 @@ class Scene(nn.Module):
         channels = self.label_channels() if labels and self.label_names else None
         return rasterize(self.at(state), camera, channels=channels)
 
-    def hinge_motion(self) -> HingeMotion | None:
-        """How the Gaussians move, where hinges say all of it; None otherwise."""
-        return self.deformation.hinge_motion(self.canonical)
+    def motion(self) -> ArticulatedMotion | None:
+        """How the Gaussians move, where joints say all of it; None otherwise."""
+        return self.deformation.motion(self.canonical)
 
     def torch_threads(self) -> AbstractContextManager[None]:
         """As many of torch's threads as pay where the scene is drawn."""
@@ -222,6 +223,10 @@ class Scene(nn.Module):
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
         """Named 3D points [3] mm, world frame, per instrument."""
         return self.deformation.keypoints(self.registered(state))
+
+    def skeleton(self) -> Skeleton:
+        """Pairs of keypoints' names that a line joins."""
+        return self.deformation.skeleton()
 
 
 def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
+from neeco.scene.articulation import ArticulatedInstruments
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
-from neeco.scene.instruments import HingedInstruments, SweptVolume
+from neeco.scene.swept_volume import SweptVolume
 from neeco.scene.training_views import TrainingViews
 
 Report = Callable[[str], None]  # shows the user one line
@@ -133,20 +134,21 @@ class GaussianScene(Learned, Protocol):
 class InstrumentSearch:
     """Functions that find instruments and their joints in the training views, without masks, CAD or labels."""
 
-    # carve every instrument, add its Gaussians to the scene as a body of its own, and start its hinges
-    find: Callable[[HingedInstruments], None]
+    # carve every instrument, add its Gaussians to the scene as a body of its own, and start its
+    # joints
+    find: Callable[[ArticulatedInstruments], None]
     # bound the volume by what the carved instruments sweep
     bound: Callable[[SweptVolume], None]
     # find where each shaft ends and the wrist begins
-    place_wrists: Callable[[HingedInstruments], None]
+    place_wrists: Callable[[ArticulatedInstruments], None]
     # find it again, and move a wrist where spinning the shaft behind it costs no more than before
-    replace_wrists: Callable[[HingedInstruments], None]
+    replace_wrists: Callable[[ArticulatedInstruments], None]
     # find lamps that explain the instruments' shadows, beside those found before
     find_shadow: Callable[[], None]
     # find how far each of the instruments' Gaussians counts as instrument, by the images' colours
     weigh_labels: Callable[[], None]
     # set each instrument's extent, prolong its shaft, and judge whether its joints were found
-    conclude: Callable[[HingedInstruments], None]
+    conclude: Callable[[ArticulatedInstruments], None]
 
 
 @dataclass

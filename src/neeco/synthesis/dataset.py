@@ -255,7 +255,7 @@ class DataSetFolder:
         instruments, keypoints = instruments_of(names), keypoint_names(self.scene)
         write_states(output, images)
         writers: dict[Format, Callable[[], None]] = {
-            "coco": lambda: write_coco(output, images, instruments, keypoints),
+            "coco": lambda: write_coco(output, images, instruments, keypoints, self.scene.skeleton()),
             "yolo": lambda: write_yolo(output, images, instruments, keypoints),
             "webdataset": lambda: write_webdataset(output, images),
             "bop": lambda: write_bop(output, images, names),
@@ -265,7 +265,7 @@ class DataSetFolder:
             if name in self.formats:
                 writers[name]()
         if images:
-            write_preview(output, images, names)
+            write_preview(output, images, names, self.scene.skeleton())
         thresholds = self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None
         info = self.info | {
             "complete": complete,

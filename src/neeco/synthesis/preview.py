@@ -12,7 +12,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from neeco.capture.model import evenly_spaced
 from neeco.evaluation.image_metrics import outline
 from neeco.files import write_atomically
-from neeco.labels.annotation import OCCLUDED, SKELETON
+from neeco.labels.annotation import OCCLUDED
 from neeco.synthesis.writers.folder import Record, stem
 
 TILES, COLUMNS, TILE_WIDTH, GAP, CAPTION_LINE = 12, 4, 360, 14, 17
@@ -25,9 +25,11 @@ CAPTION_FONTS = 13, 12  # px
 LABEL_COLUMN = 210
 
 
-def write_preview(root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]]) -> None:
+def write_preview(
+    root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]], bones: Sequence[tuple[str, str]]
+) -> None:
     """Write preview.png: up to 12 images spread over the data set, parts tinted, with boxes and keypoints."""
-    tiles = [draw_tile(root, records[k]) for k in evenly_spaced(len(records), TILES, floor=True)]
+    tiles = [draw_tile(root, records[k], bones) for k in evenly_spaced(len(records), TILES, floor=True)]
     columns = min(COLUMNS, len(tiles))
     rows = -(-len(tiles) // columns)
     height = max(tile.height for tile in tiles)
@@ -41,8 +43,8 @@ def write_preview(root: Path, records: Sequence[Record], names: Sequence[tuple[s
     write_atomically(root / "preview.png", lambda temporary: sheet.save(temporary, format="PNG"))
 
 
-def draw_tile(root: Path, record: Record) -> Image.Image:
-    """One image with its labels drawn over it, and a caption below."""
+def draw_tile(root: Path, record: Record, bones: Sequence[tuple[str, str]] = ()) -> Image.Image:
+    """One image with its labels drawn over it, and a caption below; `bones` join keypoints."""
     with Image.open(root / record["image"]) as stored:
         pixels = np.asarray(stored.convert("RGB"), dtype=float)
     with Image.open(root / "parts" / f"{stem(record['index'])}.png") as stored:
@@ -54,7 +56,7 @@ def draw_tile(root: Path, record: Record) -> Image.Image:
     tinted = Image.fromarray(_tinted(image, ids).round().astype(np.uint8))
     canvas = ImageDraw.Draw(tinted)
     for label in record["labels"]:
-        _draw_label(canvas, label, scale)
+        _draw_label(canvas, label, bones, scale)
     first, second = (wrap(items, size[0], font) for items, font in zip(_caption(record), CAPTION_FONTS, strict=True))
     height = size[1] + 6 + CAPTION_LINE * (len(first) + len(second))
     tile = Image.new("RGB", (size[0], height), PAPER)
@@ -87,7 +89,9 @@ def _tinted(image: np.ndarray, ids: np.ndarray) -> np.ndarray:
     return tinted
 
 
-def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], scale: float) -> None:
+def _draw_label(
+    canvas: ImageDraw.ImageDraw, label: dict[str, Any], bones: Sequence[tuple[str, str]], scale: float
+) -> None:
     if label["area"] > 0:
         x, y, width, height = (value * scale for value in label["box"])
         canvas.rectangle((x, y, x + width - 1, y + height - 1), outline=BOX)
@@ -95,7 +99,7 @@ def _draw_label(canvas: ImageDraw.ImageDraw, label: dict[str, Any], scale: float
         canvas.line([*corners, corners[0]], fill=RECTANGLE, width=2)
         _tag(canvas, x, y, label["name"])
     points = {name: (x * scale, y * scale, v) for name, (x, y, v) in label["keypoints"].items() if v > 0}
-    for start, end in SKELETON:
+    for start, end in bones:
         if start in points and end in points:
             canvas.line([points[start][:2], points[end][:2]], fill=BONE, width=2)
     for x, y, visibility in points.values():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -71,10 +72,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     # first, as files may be deleted once training has begun: the grey behind transparent images, which need not be
     # learned then; black for opaque images
     background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
-    instruments = tuple(
-        Instrument(i.name, {joint: i.joints[joint] for joint in moving_joints(i, frames, config, report)})
-        for i in capture.instruments
-    )
+    instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
     # at their recorded size, whatever is learned from
     recorded = Recorded.of(capture.split("train"), instruments, capture.lens, config.scale)
     positions, colors = _thinned_points(capture, frames, config)
@@ -98,6 +96,25 @@ def _thinned_points(capture: Capture, frames: tuple[Frame, ...], config: TrainCo
         chosen = np.random.default_rng(config.seed).choice(len(positions), most, replace=False)
         positions, colors = positions[np.sort(chosen)], colors[np.sort(chosen)]
     return np.ascontiguousarray(positions), np.ascontiguousarray(colors)
+
+
+def _learned_instrument(
+    instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
+) -> Instrument:
+    """The instrument with the joints that are learned: those of stated kinematics, where the method takes such and no
+    `config.joints` are asked for, else those that may move something (`moving_joints`)."""
+    tree = instrument.kinematics
+    if tree is None or config.joints is not None or not getattr(config.deformation, "kinematics", False):
+        return Instrument(
+            instrument.name,
+            {joint: instrument.joints[joint] for joint in moving_joints(instrument, frames, config, report)},
+        )
+    if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
+        raise NeecoError(
+            f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
+            "recorded readings, or train with --set deformation.kinematics=false"
+        )
+    return replace(instrument, joints={reading: instrument.joints[reading] for reading in tree.readings})
 
 
 def moving_joints(

@@ -1,4 +1,4 @@
-"""Corrections to the recorded geometry: instrument poses per frame, one latency, cameras per frame.
+"""Corrections to the recorded geometry: instrument poses and joints per frame, one latency, cameras per frame.
 
 The constant tracker-to-world correction is the scene's own (`Scene.registration`), since new states need it as well.
 """
@@ -6,37 +6,44 @@ The constant tracker-to-world correction is the scene's own (`Scene.registration
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from neeco.capture.model import Camera, Frame, InstrumentState, State
+from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.optimizer import adam_update
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
 from neeco.training.config import RefineConfig
 
-STATE = ("poses", "cameras", "latency", "frame_steps")  # tensors of a checkpoint beside the moments
+LEARNED = ("poses", "joints", "cameras", "latency")
+STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
 
 
 class Refinement:
     """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
 
-    Tensors: `poses` [F, I, 6], `cameras` [F, 6], `latency` [1].
+    Readings of joints in stated kinematics are corrected in rad or mm. Tensors: `poses` [F, I, 6], `joints` [F, R],
+    `cameras` [F, 6], `latency` [1].
     """
 
     def __init__(
-        self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[str, ...], device: torch.device
+        self, config: RefineConfig, frames: tuple[Frame, ...], instruments: tuple[Instrument, ...], device: torch.device
     ) -> None:
         self.config = config
-        self.instruments = instruments
-        self.poses = torch.zeros(len(frames), len(instruments), 6, device=device)
+        self.instruments = names = tuple(instrument.name for instrument in instruments)
+        trees = [(item.name, item.kinematics) for item in instruments if item.kinematics is not None]
+        self.readings = tuple((name, reading) for name, tree in trees for reading in tree.readings)
+        self.joints = torch.zeros(len(frames), len(self.readings), device=device)
+        self.poses = torch.zeros(len(frames), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
-        self.velocities = _velocities(frames, instruments).to(device)  # [F, I, 6] per s, body frame
+        self.velocities = _velocities(frames, names).to(device)  # [F, I, 6] per s, body frame
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),
+            "joints": torch.tensor(config.joint_rate, device=device),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
@@ -44,7 +51,7 @@ class Refinement:
         self.moments = {
             f"{order}.{name}": torch.zeros_like(getattr(self, name))
             for order in ("first", "second")
-            for name in ("poses", "cameras", "latency")
+            for name in LEARNED
         }
         self.frame_steps = torch.zeros(len(frames))  # on the CPU: read in every step
         self._leaves: dict[str, Tensor] = {}
@@ -55,12 +62,12 @@ class Refinement:
         if iteration < self.config.start:
             return state, camera, None
         penalty = None
-        if self.instruments and (self.config.frame_poses or self.config.latency):
+        if self.instruments and (self.config.frame_poses or self.config.latency or self.config.frame_joints):
             offset = self.latency.new_zeros(len(self.instruments), 6)
             if self.config.frame_poses:
                 leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
                 offset = offset + leaf
-                penalty = self._prior(leaf)
+                penalty = self._prior(leaf, self.prior_sigma)
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
                 offset = offset + self.velocities[index] * leaf
@@ -68,17 +75,25 @@ class Refinement:
             for k, name in enumerate(self.instruments):
                 given = state.instruments[name]
                 moved[name] = InstrumentState(given.pose.to(offset) @ rigid_from_vector(offset[k]), given.joints)
+            if self.config.frame_joints and self.readings:
+                leaf = self._leaves["joints"] = self.joints[index].clone().requires_grad_()
+                joint_penalty = self._prior(leaf, leaf.new_full((), self.config.prior_joint))
+                penalty = joint_penalty if penalty is None else penalty + joint_penalty
+                for (name, reading), change in zip(self.readings, leaf, strict=True):
+                    corrected_reading: Any = moved[name].joints[reading] + change
+                    moved[name] = replace(moved[name], joints={**moved[name].joints, reading: corrected_reading})
             state = replace(state, instruments=moved)
         if self.config.cameras:
             leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
             corrected = camera.world_from_camera.to(leaf) @ rigid_from_vector(leaf)
             camera = replace(camera, world_from_camera=corrected)
-            penalty = self._prior(leaf) if penalty is None else penalty + self._prior(leaf)
+            camera_penalty = self._prior(leaf, self.prior_sigma)
+            penalty = camera_penalty if penalty is None else penalty + camera_penalty
         return state, camera, penalty
 
-    def _prior(self, correction: Tensor) -> Tensor:
-        """Penalty [] on a correction [..., 6]."""
-        return self.config.prior_weight * (correction / self.prior_sigma).square().mean()
+    def _prior(self, correction: Tensor, sigma: Tensor) -> Tensor:
+        """Penalty [] on a correction [..., 6] or [R] of such standard deviations."""
+        return self.config.prior_weight * (correction / sigma).square().mean()
 
     @torch.no_grad()
     def step(self, index: int, progress: float) -> None:
@@ -106,6 +121,7 @@ class Refinement:
         seen = (self.frame_steps > 0).nonzero()[:, 0].to(self.poses.device)
         if len(seen):
             self.poses[seen] -= self.poses[seen].mean(0)
+            self.joints[seen] -= self.joints[seen].mean(0)
             self.cameras[seen] -= self.cameras[seen].mean(0)
 
     def tensors(self) -> dict[str, Tensor]:

@@ -55,7 +55,7 @@ class GaussianSession(GaussianTraining):
         names = tuple(instrument.name for instrument in self.scene.instruments)
         self.adam = Adam(self.batch_size)
         self.pose_order = pose_order(frames, names)
-        self.refinement = Refinement(config.refine, frames, names, device)
+        self.refinement = Refinement(config.refine, frames, self.scene.instruments, device)
         self.rng = np.random.default_rng(config.seed)
         self.schedule = Schedule(config.schedule, config.iterations)
         self.full_views = self.views

@@ -31,7 +31,7 @@ from neeco.files import read_json, write_text
 from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
 from neeco.scene import Drawable, Scene
-from neeco.scene.drawable import HingeMotion
+from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.scene import gaussian_scene
 from neeco.training.run import Run, load_run
 from neeco.viewer.controls import perpendicular_axes, shafts_of, slider_ranges
@@ -148,12 +148,15 @@ def _templates() -> Environment:
 
 def why_not(scene: Drawable) -> str | None:
     """Why a page cannot hold `scene`, in a line that says what can show it; None where it can."""
-    if scene.hinge_motion() is None:
+    motion = scene.motion()
+    if motion is None:
         return (
             f"method {scene.method} asks a network for every state, which a page cannot; "
             "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"
         )
-    joints = max((len(item.joints) for item in scene.instruments), default=0)
+    if any(axis.slides for axes in motion.axes for axis in axes):
+        return "a page turns joints and cannot slide them yet; look at it with `neeco view RUN`"
+    joints = max((len(axes) for axes in motion.axes), default=0)
     for name, found, most in (
         ("instruments", len(scene.instruments), MAX_INSTRUMENTS),
         ("joints of an instrument", joints, MAX_JOINTS),
@@ -168,14 +171,14 @@ def why_not(scene: Drawable) -> str | None:
 def pack(scene: Scene, sh_degree: int) -> tuple[dict[str, Any], bytes]:
     """(header, planes) of a scene, harmonics up to `sh_degree`. Raises NeecoError where its method cannot be packed, or
     there are more instruments, joints or labels than the page has room for."""
-    canonical, motion = scene.canonical, scene.hinge_motion()
+    canonical, motion = scene.canonical, scene.motion()
     if (refusal := why_not(scene)) or motion is None:
         raise NeecoError(f"--export: {refusal}")
     degree = min(sh_degree, scene.sh_degree)
     means, boxes = _in_boxes(canonical.means, canonical.counts)
     scales, scale_range = _quantized(motion.log_scales.clamp_min(float(np.log(THINNEST_MM))), 255)
     base, base_range = _quantized(canonical.sh_dc[:, 0] * SH_C0 + 0.5, 65535)
-    turns = [_quantized(column[:, None], 65535) for column in motion.turns.flatten(1).unbind(1)]
+    turns = [_quantized(column[:, None], 65535) for column in motion.amounts.flatten(1).unbind(1)]
     harmonics, bands = _harmonics(canonical.sh_rest, degree)
     fields = (  # name, whole numbers [N, K], type
         ("mean", means, "uint24"),
@@ -257,29 +260,37 @@ def _light(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _instruments(scene: Scene, motion: HingeMotion) -> list[dict[str, Any]]:
-    """Name, shaft and hinges of every instrument that moves, in its own frame, mm and rad: the page steers by them."""
-    if not motion.hinges:
+def _instruments(scene: Scene, motion: ArticulatedMotion) -> list[dict[str, Any]]:
+    """Name, shaft, joints and their axes of every instrument that moves, in its own frame, mm and rad."""
+    if not motion.axes:
         return []
     shafts, ranges = shafts_of(scene), slider_ranges(scene.instruments, scene.recorded.states)
     found = []
-    for instrument, hinges in zip(scene.instruments, motion.hinges, strict=False):
-        joints = []
-        for name, (pivot, axis) in zip(instrument.joints, hinges, strict=True):
+    for instrument, axes in zip(scene.instruments, motion.axes, strict=False):
+        names, joints = list(instrument.joints), []
+        for name in names:
             span = ranges[instrument.name, name]
-            ends = [span.lower, span.upper]
-            joints.append({"name": name, "pivot": pivot.tolist(), "axis": axis.tolist(), "range": ends})
+            joints.append({"name": name, "range": [span.lower, span.upper]})
         shaft = shafts[instrument.name]
         side, up = perpendicular_axes(shaft.along)
-        axes = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
-        known = {name: vector.tolist() for name, vector in axes.items()}
-        found.append({"name": instrument.name, "shaft": known, "joints": joints})
+        vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
+        found.append(
+            {
+                "name": instrument.name,
+                "shaft": {name: vector.tolist() for name, vector in vectors.items()},
+                "joints": joints,
+                "axes": [
+                    {"pivot": item.pivot.tolist(), "axis": item.axis.tolist(), "joint": names.index(item.reading)}
+                    for item in axes
+                ],
+            }
+        )
     return found
 
 
-def _recorded(scene: Scene, motion: HingeMotion) -> dict[str, Any]:
+def _recorded(scene: Scene, motion: ArticulatedMotion) -> dict[str, Any]:
     """Names, cameras and states of the frames trained on; matrices are the first three rows, 12 numbers."""
-    moving = scene.instruments[: len(motion.hinges)]
+    moving = scene.instruments[: len(motion.axes)]
     states = [scene.registered(state) for state in scene.recorded.states]
     return {
         "names": list(scene.recorded.names),

@@ -149,6 +149,33 @@ def spin_of(numbers, roll, x, y, z):
     return tl.where(along_shaft(numbers, x, y, z) < tl.load(numbers + SPIN_END), roll, 0.0)
 
 
+@triton.jit
+def articulate(
+    numbers, logits, roll, g, inside, x, y, z, qw, qx, qy, qz,
+    SPINS: tl.constexpr, JOINTS: tl.constexpr, LINKS: tl.constexpr, SLIDES: tl.constexpr, LOGITS: tl.constexpr,
+):  # fmt: skip
+    """Resting means and quaternions moved by roll and joints, and what shares of links are made of: the gate, the
+    greatest logit, the sum of exponentials, the share that moves; 0 without joints."""
+    gate, greatest, total, moving = 0.0 * x, 0.0 * x, 0.0 * x, 0.0 * x
+    if JOINTS > 0:
+        gate = gate_of(numbers, x, y, z)
+        greatest, total = softmax_of(logits, g, inside, LINKS, LOGITS)
+        moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
+    if SPINS:
+        x, y, z, qw, qx, qy, qz = turn(
+            numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z),
+            x, y, z, qw, qx, qy, qz,
+        )  # fmt: skip
+    for joint in tl.static_range(JOINTS):
+        own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
+        amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
+        if (SLIDES >> joint) & 1:
+            x, y, z = slide(own_numbers + 3, amount, x, y, z)
+        else:
+            x, y, z, qw, qx, qy, qz = turn(own_numbers, own_numbers + 3, amount, x, y, z, qw, qx, qy, qz)
+    return x, y, z, qw, qx, qy, qz, gate, greatest, total, moving
+
+
 @triton.jit(do_not_specialize=["roll", "start", "count"])
 def pose_kernel(
     means, quats, log_scales, logits, numbers, roll, to_means, to_quats, to_scales, to_frames, start, count,
@@ -168,22 +195,9 @@ def pose_kernel(
     else:
         x, y, z, qw, qx, qy, qz, _ = resting(means, quats, g, inside)
         rw, rx, ry, rz = qw, qx, qy, qz
-        if JOINTS > 0:
-            gate = gate_of(numbers, x, y, z)
-            greatest, total = softmax_of(logits, g, inside, LINKS, LOGITS)
-            moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
-        if SPINS:
-            x, y, z, qw, qx, qy, qz = turn(
-                numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin_of(numbers, roll, x, y, z),
-                x, y, z, qw, qx, qy, qz,
-            )  # fmt: skip
-        for joint in tl.static_range(JOINTS):
-            own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
-            amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
-            if (SLIDES >> joint) & 1:
-                x, y, z = slide(own_numbers + 3, amount, x, y, z)
-            else:
-                x, y, z, qw, qx, qy, qz = turn(own_numbers, own_numbers + 3, amount, x, y, z, qw, qx, qy, qz)
+        x, y, z, qw, qx, qy, qz, _, _, _, moving = articulate(
+            numbers, logits, roll, g, inside, x, y, z, qw, qx, qy, qz, SPINS, JOINTS, LINKS, SLIDES, LOGITS
+        )
         if JOINTS > 0:
             longest = tl.load(numbers + LONGEST) / tl.maximum(moving, 1e-6)
             sx, sy, sz = tl.minimum(sx, longest), tl.minimum(sy, longest), tl.minimum(sz, longest)
@@ -272,21 +286,9 @@ def pose_backward_kernel(
         x, y, z, qw, qx, qy, qz, norm = resting(means, quats, g, inside)
         rw, rx, ry, rz = qw, qx, qy, qz
         spin = spin_of(numbers, roll, x, y, z)
-        if JOINTS > 0:
-            gate = gate_of(numbers, x, y, z)
-            greatest, total = softmax_of(logits, g, inside, LINKS, LOGITS)
-            moving = moving_of(logits, g, inside, greatest, total, gate, LINKS, LOGITS)
-        if SPINS:
-            x, y, z, qw, qx, qy, qz = turn(
-                numbers + SHAFT_ORIGIN, numbers + SHAFT_DIRECTION, spin, x, y, z, qw, qx, qy, qz
-            )  # fmt: skip
-        for joint in tl.static_range(JOINTS):
-            own_numbers = numbers + BODY + joint * (VALUES + LINKS - 1)
-            amount = amount_of(logits, own_numbers, g, inside, greatest, total, gate, LINKS, LOGITS)
-            if (SLIDES >> joint) & 1:
-                x, y, z = slide(own_numbers + 3, amount, x, y, z)
-            else:
-                x, y, z, qw, qx, qy, qz = turn(own_numbers, own_numbers + 3, amount, x, y, z, qw, qx, qy, qz)
+        x, y, z, qw, qx, qy, qz, gate, greatest, total, moving = articulate(
+            numbers, logits, roll, g, inside, x, y, z, qw, qx, qy, qz, SPINS, JOINTS, LINKS, SLIDES, LOGITS
+        )
         if JOINTS > 0:
             longest = tl.load(numbers + LONGEST) / tl.maximum(moving, 1e-6)
             wx = tl.where(sx < longest, wx, 0.0)

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera, Rendering
+from neeco.scene.articulation import Skeleton
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.drawable import HingeMotion
+from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.method import Method
 from neeco.scene.training_session import GaussianTraining
 
@@ -93,7 +94,7 @@ class Deformation(nn.Module, Method):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        cls.hinge_motion = vars(cls).get("hinge_motion", Deformation.hinge_motion)  # type: ignore[method-assign]
+        cls.motion = vars(cls).get("motion", Deformation.motion)  # type: ignore[method-assign]
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         """Posed geometry of `canonical` in `state`."""
@@ -113,8 +114,12 @@ class Deformation(nn.Module, Method):
         """Named points [3] mm, world frame, per instrument; empty where the deformation knows none."""
         return {}
 
-    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion | None:
-        """How Gaussians move, where hinges say all of it; None otherwise. Subclasses do not inherit it: they may pose
+    def skeleton(self) -> Skeleton:
+        """Pairs of keypoints' names that a line joins."""
+        return ()
+
+    def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion | None:
+        """How Gaussians move, where joints say all of it; None otherwise. Subclasses do not inherit it: they may pose
         otherwise."""
         return None
 

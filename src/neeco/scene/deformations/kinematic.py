@@ -1,8 +1,8 @@
-"""Rigid parts on learned hinges, method `kinematic`.
+"""Rigid links on joints, method `kinematic`.
 
 Tissue is static, or moves with the breath where that was found. Each instrument's Gaussians live in its own tracked
-frame and move rigidly with its pose; joints turn parts about hinges that are learned from the images, with soft part
-assignment per Gaussian.
+frame and move rigidly with its pose; joints move links about axes that are learned from the images, with soft
+assignment of Gaussians to links.
 """
 
 from __future__ import annotations
@@ -20,6 +20,14 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.raster.posing import ArticulatedBody, pose_bodies
 from neeco.raster.types import Camera, Rendering
+from neeco.scene.articulation import (
+    LABEL_SHARE,
+    LINK_LOGITS,
+    ArticulatedInstruments,
+    Articulation,
+    Skeleton,
+    articulation_of,
+)
 from neeco.scene.breathing import RATES as BREATHING_RATES
 from neeco.scene.breathing import BreathingTissue
 from neeco.scene.canonical import CanonicalGaussians
@@ -32,24 +40,14 @@ from neeco.scene.deformations.base import (
     floored_decay,
     state_of,
 )
-from neeco.scene.drawable import HingeMotion
-from neeco.scene.instruments import LABEL_SHARE, PART_LOGITS, HingedInstruments, Hinges
+from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.method import PLAIN_TRAINING
 from neeco.scene.training_session import GaussianTraining
 from neeco.scene.visibility import extrapolate_tissue, outside_all_views
 
 WRISTS_AT = 0.4  # of the run: the shape is there, and time is left to learn
 WRISTS_AGAIN_AT = (0.6, 0.8)  # of the run
-RATES = {  # of the hinges' parameters, at the start
-    "shaft_tilt": 8e-3,
-    "shaft_shift": 8e-2,
-    "hinge_angle": 1e-2,
-    "hinge_depth": 8e-2,
-    "offsets": 6e-3,
-    "share": 6e-3,
-    "scale": 2e-4,
-    **BREATHING_RATES,
-}
+PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,9 @@ class KinematicSettings:
     tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`: whether
     Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours;
     `breathing`: whether a period is looked for with which the tissue moves, and its motion learned (see
-    `neeco.scene.breathing`)."""
+    `neeco.scene.breathing`); `kinematics`: whether joints move as the capture's kinematics state, where they do (else
+    as found from the images); `stated_axes`, `stated_readings`: whether the axes stated there, and offsets and gains of
+    the readings, are corrected."""
 
     renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
 
@@ -83,6 +83,9 @@ class KinematicSettings:
     extrapolate_tissue: bool = True
     label_shares: bool = True
     breathing: bool = True
+    kinematics: bool = True
+    stated_axes: bool = True
+    stated_readings: bool = True
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ class Spin(Perturbation):
     shaft_roll: float = 0.0
 
 
-class Kinematic(BreathingTissue, HingedInstruments, Deformation):
+class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
 
     method = "kinematic"
@@ -107,39 +110,39 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
         "schedule.plain_density.threshold": 2e-4,
         "refine.latency": True,
         "refine.frame_poses": True,
+        "refine.frame_joints": True,
         "density_start": 400,
         "resolution.full_size_at": 0.55,
     }
-    extra_rates: ClassVar[Mapping[str, float]] = {PART_LOGITS: 1e-2}
+    extra_rates: ClassVar[Mapping[str, float]] = {LINK_LOGITS: 1e-2}
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
         super().__init__(instruments, settings)
         self.may_breathe = self.settings.breathing
         self.start_iteration = self.settings.hinge_start
-        self.hinges = nn.ModuleList(Hinges(tuple(instrument.joints)) for instrument in instruments)
+        self.articulate([articulation_of(instrument) for instrument in instruments])
         self.label_names = tuple(
-            (instrument.name, part) for instrument in instruments for part in part_names(tuple(instrument.joints))
+            (instrument.name, part)
+            for instrument, articulation in zip(instruments, self.articulations, strict=True)
+            for part in articulation.part_names
         )
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
         bodies: list[ArticulatedBody | None] = [None]  # tissue does not turn
-        for index, instrument in enumerate(self.instruments):
+        for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
             given = state_of(instrument, state)
-            bodies.append(self.hinges_of(index).body(given.pose.to(canonical.means), given.joints, roll))
-        logits = canonical.extras.get(PART_LOGITS)
+            bodies.append(articulation.body(given.pose.to(canonical.means), given.joints, roll))
+        logits = self.placed_logits(canonical)
         means = self.breathed(canonical.means, canonical.counts[0], state.time)
         return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
 
     def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
         labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
         column = 0
-        for index in range(len(self.instruments)):
-            hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-            if hinges.joint_names:
-                parts = hinges.parts(canonical.means[rows], self.part_weights(canonical, index))
-            else:
-                parts = labels.new_ones(canonical.counts[index + 1], 1)
+        for index, articulation in enumerate(self.articulations):
+            rows = canonical.body(index + 1)
+            parts = articulation.parts(canonical.means[rows], self.link_weights(canonical, index))
             labels[rows, column : column + parts.shape[1]] = parts
             column += parts.shape[1]
         share = canonical.extras.get(LABEL_SHARE)
@@ -156,55 +159,49 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
 
     def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
         found: dict[str, dict[str, Tensor]] = {}
-        for index, instrument in enumerate(self.instruments):
-            hinges, given = self.hinges_of(index), state_of(instrument, state)
-            origin, direction = hinges.shaft()
-            points = {"shaft_far": origin + hinges.extent[0] * direction}
-            end = hinges.extent[1]
-            if hinges.joint_names:
-                points["shaft_near"] = origin + torch.maximum(hinges.wrist_start, hinges.extent[0]) * direction
-                points["hinge"] = hinges.hinge(0)[0]
-                tips = hinges.tips_at(0, given.joints[hinges.joint_names[0]])
-                points |= {"tip_left": tips[0], "tip_right": tips[1]}
-            else:
-                points["shaft_near"] = origin + end * direction
-            pose = given.pose.to(origin)
+        for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
+            given = state_of(instrument, state)
+            points = articulation.keypoints(given.joints)
+            pose = given.pose.to(points["shaft_far"])
             found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
         return found
 
-    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
+    def skeleton(self) -> Skeleton:
+        bones = [bone for articulation in self.articulations for bone in articulation.skeleton]
+        return tuple(dict.fromkeys(bones))
+
+    def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion:
         log_scales = canonical.log_scales.clone()
-        joints = max((len(instrument.joints) for instrument in self.instruments), default=0)
-        turns = canonical.means.new_zeros(len(canonical), joints, 2)
-        for index, instrument in enumerate(self.instruments):
-            if not instrument.joints:
-                continue
-            hinges, rows = self.hinges_of(index), canonical.body(index + 1)
-            weights = self.part_weights(canonical, index)
-            log_scales[rows] = torch.minimum(log_scales[rows], hinges.longest(weights).log())
-            for joint in range(len(hinges.joint_names)):
-                pair = weights[:, 1 + 2 * joint : 3 + 2 * joint]
-                turns[rows, joint, 0] = pair @ hinges.turns(joint, 0.0)
-                turns[rows, joint, 1] = pair @ hinges.gains[joint]
-        bodies = [self.hinges_of(index) for index in range(len(self.instruments))]
-        found = tuple(tuple(body.hinge(joint) for joint in range(len(body.joint_names))) for body in bodies)
-        return HingeMotion(log_scales, turns, found)
+        axes, moved = [], []
+        for index, articulation in enumerate(self.articulations):
+            rows = canonical.body(index + 1)
+            weights = self.link_weights(canonical, index)
+            if articulation.jointed:
+                log_scales[rows] = torch.minimum(log_scales[rows], articulation.longest(weights).log())
+            own, amounts = articulation.motion(weights)
+            axes.append(tuple(own))
+            moved.append((rows, amounts))
+        most = max((len(own) for own in axes), default=0)
+        amounts = canonical.means.new_zeros(len(canonical), most, 2)
+        for rows, own_amounts in moved:
+            amounts[rows, : own_amounts.shape[1]] = own_amounts
+        return ArticulatedMotion(log_scales, amounts, tuple(axes))
 
     @classmethod
     def combined(cls, deformations: Sequence[Deformation]) -> Kinematic:
         parts = [part for part in deformations if isinstance(part, Kinematic)]
         instruments = tuple(instrument for part in parts for instrument in part.instruments)
         made = cls(instruments, copy.deepcopy(parts[0].settings))
-        made.hinges = nn.ModuleList(copy.deepcopy(hinges) for part in parts for hinges in part.hinges)
+        made.articulate([copy.deepcopy(articulation) for part in parts for articulation in part.articulations])
         return made
 
     def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        logits, columns = extras[PART_LOGITS], self.logit_count
+        logits, columns = extras[LINK_LOGITS], self.logit_count
         logits = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
-        return {PART_LOGITS: logits, LABEL_SHARE: extras.get(LABEL_SHARE, logits.new_ones(len(logits)))}
+        return {LINK_LOGITS: logits, LABEL_SHARE: extras.get(LABEL_SHARE, logits.new_ones(len(logits)))}
 
     def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
-        return {PART_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
+        return {LINK_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
 
     def begin(self, training: GaussianTraining) -> None:
         training.instruments.find(self)
@@ -244,6 +241,8 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
             terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
         if settings.part_sharpness > 0 and iteration > self.start_iteration:
             terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
+        priors = [articulation.prior() for articulation in self.articulations]
+        terms += [PRIOR_WEIGHT * prior for prior in priors if prior is not None]
         if rendering.channels is not None and settings.label_sharpness > 0:
             label = rendering.channels[..., 0]
             terms.append(settings.label_sharpness * (label * (1 - label)).mean())
@@ -251,7 +250,7 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
 
     def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
         """How mixed one instrument's Gaussians are of its parts, a scalar in [0, 1)."""
-        weights = self.part_weights(canonical, index)
+        weights = self.link_weights(canonical, index)
         opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
         return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
 
@@ -276,12 +275,13 @@ class Kinematic(BreathingTissue, HingedInstruments, Deformation):
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         scale = self.settings.rate_scale * floored_decay(progress)
-        return {name: RATES[name.rsplit(".", 1)[-1]] * scale for name, _ in self.named_parameters()}
-
-
-def part_names(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Parts of an instrument with these joints: one `instrument` without any, else shaft, wrist and two per joint."""
-    if not joints:
-        return ("instrument",)
-    stems = [joint.removesuffix("_angle") for joint in joints]
-    return ("shaft", "wrist", *(f"{stem}_{side}" for stem in stems for side in ("left", "right")))
+        found = {}
+        for name, _ in self.named_parameters():
+            module, _, parameter = name.rpartition(".")
+            owner = self.get_submodule(module)
+            rates = owner.rates if isinstance(owner, Articulation) else BREATHING_RATES
+            fixed = (parameter.startswith("axis_") and not self.settings.stated_axes) or (
+                parameter.startswith("reading_") and not self.settings.stated_readings
+            )
+            found[name] = 0.0 if fixed else rates[parameter] * scale
+        return found

@@ -32,7 +32,7 @@ from neeco.scene.deformations.base import (
     robust_bounds,
     state_of,
 )
-from neeco.scene.instruments import SweptVolume
+from neeco.scene.swept_volume import SweptVolume
 from neeco.scene.training_session import GaussianTraining
 
 # What one unit of the head's output means. With unit features a first Adam step moves every output by about

@@ -15,7 +15,7 @@ from neeco.capture.model import State
 from neeco.scene.breathing import BreathingTissue
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed
-from neeco.scene.drawable import HingeMotion
+from neeco.scene.drawable import ArticulatedMotion
 from neeco.scene.method import PLAIN_TRAINING
 
 
@@ -29,5 +29,5 @@ class Static(BreathingTissue, Deformation):
         means = self.breathed(canonical.means, len(canonical), state.time)
         return Posed(means, canonical.quats, canonical.log_scales.exp())
 
-    def hinge_motion(self, canonical: CanonicalGaussians) -> HingeMotion:
-        return HingeMotion(canonical.log_scales, canonical.means.new_zeros(len(canonical), 0, 2), ())
+    def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion:
+        return ArticulatedMotion(canonical.log_scales, canonical.means.new_zeros(len(canonical), 0, 2), ())

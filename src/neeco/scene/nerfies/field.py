@@ -377,7 +377,7 @@ class NerfScene(nn.Module):
         self.coarse = Template(settings)
         self.fine = Template(settings) if settings.fine_samples else None
 
-    def hinge_motion(self) -> None:
+    def motion(self) -> None:
         """A field has no Gaussians that could move."""
 
     def torch_threads(self) -> AbstractContextManager[None]:

@@ -9,19 +9,25 @@ from typing import Any
 import numpy as np
 
 from neeco.files import write_json
-from neeco.labels.annotation import SKELETON
 from neeco.synthesis.writers.folder import Record
 
 FOLDER = "coco"
 
 
-def write_coco(root: Path, records: Sequence[Record], instruments: Sequence[str], keypoints: Sequence[str]) -> None:
+def write_coco(
+    root: Path,
+    records: Sequence[Record],
+    instruments: Sequence[str],
+    keypoints: Sequence[str],
+    bones: Sequence[tuple[str, str]],
+) -> None:
     """Write both COCO files. `file_name` is relative to the data set's images/ folder.
 
-    Instruments have keypoints in the order of `keypoints` (all of them, absent ones as 0 0 0) and, beyond COCO's own
-    fields, `visibility`, `rectangle` (minimum-area, 4 corners) and `camera_from_instrument` (4x4, mm, OpenCV axes).
+    `bones` are pairs of keypoints that a line joins. Instruments have keypoints in the order of `keypoints` (all of
+    them, absent ones as 0 0 0) and, beyond COCO's own fields, `visibility`, `rectangle` (minimum-area, 4 corners) and
+    `camera_from_instrument` (4x4, mm, OpenCV axes).
     """
-    skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in SKELETON if {a, b} <= set(keypoints)]
+    skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in bones if {a, b} <= set(keypoints)]
     categories: list[dict[str, Any]] = [
         {"id": k + 1, "name": name, "supercategory": "instrument"} for k, name in enumerate(instruments)
     ]

@@ -175,9 +175,11 @@ class PosedViews:
         return torch.stack([score_points(self.evidence, other, points)[0] for other in self.exchanged]).mean(0)
 
 
-def posed_views(evidence: Evidence, name: str, search: SearchConfig) -> PosedViews:
-    """The views of instrument `name`. An exchange keeps the cameras and shifts the poses among the frames."""
+def posed_views(evidence: Evidence, name: str, search: SearchConfig, moved: Tensor | None = None) -> PosedViews:
+    """The views of instrument `name`; of a link of it that each frame's readings move by `moved` [F, 4, 4]. An exchange
+    keeps the cameras and shifts poses and readings among the frames."""
     own = camera_from_instrument(evidence, name)
+    own = own if moved is None else own @ moved
     cameras = evidence.camera_from_world.double()
     poses = torch.linalg.inv(cameras) @ own.double()
     # uneven shifts, so that periodic motion does not come out the same

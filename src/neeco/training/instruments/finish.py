@@ -11,9 +11,9 @@ from torch import Tensor
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.raster import rasterize
 from neeco.raster.pinhole import in_image
+from neeco.scene.articulation import ArticulatedInstruments, Articulation
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.scene.scene import Scene
 from neeco.scene.visibility import visible_pixels
 from neeco.training.instruments.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
@@ -25,12 +25,10 @@ OCCLUSION_FRAMES = 64  # looked at, evenly spaced
 WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
 END_IN_VIEW = 0.3  # share above which the instrument's rear end is its real end
 SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
-MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
-TIP_QUANTILE = 0.97  # of the distances of a part's solid Gaussians from the hinge: farther ones are its tip
 
 
 @torch.no_grad()
-def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
+def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
     into `scene.diagnostics`.
 
@@ -39,12 +37,12 @@ def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
     session.scene.canonical = drop_occluded(session.scene)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
-        hinges = hinged.hinges_of(index)
-        boundary = color_boundary(session, hinged, index) if hinges.joint_names else None
+        articulation = articulated.articulations[index]
+        boundary = color_boundary(session, articulated, index) if articulation.jointed else None
         if boundary is not None:
-            hinges.wrist_start.fill_(boundary)
-        for joint, name in enumerate(hinges.joint_names):
-            verdicts[f"{instrument.name}.{name}"] = _verdict(session, hinged, index, joint)
+            articulation.wrist_start.fill_(boundary)
+        for reading in articulation.reading_names:
+            verdicts[f"{instrument.name}.{reading}"] = _verdict(session, articulated, index, reading)
         scene = session.scene
         count = int(solid_gaussians(scene.canonical, index).sum())
         scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count
@@ -53,30 +51,32 @@ def conclude(session: GaussianSession, hinged: HingedInstruments) -> None:
                 f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
                 "labels will be empty; the images show it too little, or another that moves alike has its place"
             )
-        hinges.extent.copy_(solid_extent(scene.canonical, index, hinges))
-        if hinges.joint_names:
-            measure_tips(scene.canonical, index, hinges, hinged.part_weights(scene.canonical, index))
+        articulation.extent.copy_(solid_extent(scene.canonical, index, articulation))
+        if articulation.jointed:
+            solid = solid_gaussians(scene.canonical, index)
+            points = scene.canonical.means[scene.canonical.body(index + 1)]
+            weights = articulated.link_weights(scene.canonical, index)
+            articulation.measure_tips(points[solid], weights[solid])
         scene.canonical = extend_shaft(
-            scene.canonical, index + 1, instrument.name, hinges, scene.recorded, 1.5 * session.extent
+            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, 1.5 * session.extent
         )
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
 
 
-def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, joint: int) -> dict[str, Any]:
-    """Whether the joint was found: whether its reading explains the image of the moving parts, in the training frames
-    of its extreme readings.
+def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:
+    """Whether the joint of a reading was found: whether the reading explains the image of the moving parts, in the
+    training frames of its extremes.
 
     `explained` = 1 - error(reading) / error(mean reading), over pixels that a moving part covers in either rendering.
     """
     scene = session.scene
-    hinges, instrument = hinged.hinges_of(index), scene.instruments[index]
-    name = hinges.joint_names[joint]
+    articulation, instrument = articulated.articulations[index], scene.instruments[index]
     readings = torch.tensor([frame.state.instruments[instrument.name].joints[name] for frame in session.views.frames])
     ordered = readings.argsort()
     extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
-    moving = _moving_weight(scene.canonical, hinged, index, joint)
+    moving = _moving_weight(scene.canonical, articulated, index, name)
     given = middle = 0.0
     for frame_index in extremes:
         state, camera = session.corrected(frame_index)
@@ -91,16 +91,12 @@ def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, jo
             covered &= mask
         errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
         given, middle = given + errors[0], middle + errors[1]
-    pivot, axis = hinges.hinge(joint)
     explained = 1 - given / middle if middle > 0 else 0.0
     found = bool(explained > session.config.search.min_joint_explained and math.isfinite(explained))
     return {
         "found": found,
         "explained": round(explained, 4),
-        "axis": [round(float(v), 5) for v in axis],
-        "pivot_mm": [round(float(v), 3) for v in pivot],
-        "gains": [round(float(v), 4) for v in hinges.gains[joint]],
-        "offsets_rad": [round(float(v), 4) for v in hinges.turns(joint, 0.0)],
+        **articulation.describe(name),
         "verdict": (
             f"found: the reading explains {explained:.0%} of the moving parts' error"
             if found
@@ -110,11 +106,13 @@ def _verdict(session: GaussianSession, hinged: HingedInstruments, index: int, jo
     }
 
 
-def _moving_weight(canonical: CanonicalGaussians, hinged: HingedInstruments, index: int, joint: int) -> Tensor:
-    """[N, 1] share of each Gaussian that joint `joint` of instrument `index` moves."""
+def _moving_weight(
+    canonical: CanonicalGaussians, articulated: ArticulatedInstruments, index: int, reading: str
+) -> Tensor:
+    """[N, 1] share of each Gaussian of instrument `index` that a reading moves."""
     weight = canonical.means.new_zeros(len(canonical), 1)
-    weights = hinged.part_weights(canonical, index)[:, 1 + 2 * joint : 3 + 2 * joint]
-    weight[canonical.body(index + 1), 0] = weights.sum(1)
+    weights = articulated.link_weights(canonical, index)
+    weight[canonical.body(index + 1), 0] = articulated.articulations[index].moved_by(reading, weights)
     return weight
 
 
@@ -147,7 +145,7 @@ def drop_occluded(scene: Scene) -> CanonicalGaussians:
 
 @torch.no_grad()
 def extend_shaft(
-    canonical: CanonicalGaussians, body: int, name: str, hinges: Hinges, recorded: Recorded, length: float
+    canonical: CanonicalGaussians, body: int, name: str, articulation: Articulation, recorded: Recorded, length: float
 ) -> CanonicalGaussians:
     """Canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
     unchanged when its real end is in view.
@@ -156,20 +154,20 @@ def extend_shaft(
     same all along, so the rearmost well-seen slab is repeated towards the rear.
     """
     rows = canonical.body(body)
-    along = hinges.along_shaft(canonical.means[rows])  # [M]
+    along = articulation.along_shaft(canonical.means[rows])  # [M]
     solid = torch.sigmoid(canonical.opacity_logits[rows]) > SOLID_OPACITY
-    if not hinges.joint_names or int(solid.sum()) < 50:
+    if not articulation.jointed or int(solid.sum()) < 50:
         return canonical
-    rear, front = float(along[solid].quantile(0.01)), float(hinges.wrist_start)
+    rear, front = float(along[solid].quantile(0.01)), float(articulation.wrist_start)
     if not rear < front:
         return canonical
     device = canonical.means.device
     positions = torch.linspace(rear, front, 40, device=device)
-    seen = shaft_coverage(positions, name, hinges, recorded)
+    seen = shaft_coverage(positions, name, articulation, recorded)
     if float(seen[0]) > END_IN_VIEW or not bool((seen >= WELL_SEEN).any()):
         return canonical
     start = float(positions[seen >= WELL_SEEN][0])
-    slab = SLAB_RADII * _median_radius(canonical, rows, hinges, solid)
+    slab = SLAB_RADII * _median_radius(canonical, rows, articulation, solid)
     copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
     if start + slab > front or len(copied) < 10:
         return canonical
@@ -183,14 +181,14 @@ def extend_shaft(
     counts = list(canonical.counts)
     counts[body] = len(index)
     extended = canonical.map(lambda tensor: tensor[whole].contiguous(), tuple(counts))
-    _, direction = hinges.shaft()
+    _, direction = articulation.shaft()
     extended.means[extended.body(body)] += shift[:, None] * direction
     return extended
 
 
-def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recorded) -> Tensor:
+def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, recorded: Recorded) -> Tensor:
     """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
-    origin, direction = hinges.shaft()
+    origin, direction = articulation.shaft()
     points = origin + positions[:, None] * direction  # [Q, 3]
     counts = torch.zeros_like(positions)
     for state, camera in zip(recorded.states, recorded.cameras, strict=True):
@@ -199,27 +197,10 @@ def shaft_coverage(positions: Tensor, name: str, hinges: Hinges, recorded: Recor
     return counts / max(1, len(recorded.states))
 
 
-def _median_radius(canonical: CanonicalGaussians, rows: slice, hinges: Hinges, solid: Tensor) -> float:
+def _median_radius(canonical: CanonicalGaussians, rows: slice, articulation: Articulation, solid: Tensor) -> float:
     """Median distance mm of solid Gaussians behind the wrist from the axis."""
-    origin, direction = hinges.shaft()
+    origin, direction = articulation.shaft()
     arm = canonical.means[rows][solid] - origin
     across = arm - (arm @ direction)[:, None] * direction
-    behind = (arm @ direction) < hinges.wrist_start
+    behind = (arm @ direction) < articulation.wrist_start
     return float((across[behind] if bool(behind.any()) else across).norm(dim=1).median())
-
-
-def measure_tips(canonical: CanonicalGaussians, index: int, hinges: Hinges, weights: Tensor) -> None:
-    """Set the tips of every joint's parts to where their solid Gaussians lie farthest from the hinge; leave them
-    unknown where there are too few. weights [M, part_count]."""
-    points, solid = canonical.means[canonical.body(index + 1)], solid_gaussians(canonical, index)
-    shares = hinges.parts(points, weights)
-    for joint in range(len(hinges.joint_names)):
-        pivot, _ = hinges.hinge(joint)
-        found = torch.full_like(hinges.tips[joint], torch.nan)
-        for side, part in enumerate(hinges.left_right_order(joint).tolist()):
-            of_part = points[solid & (shares[:, 2 + 2 * joint + side] > MIN_PART_SHARE)]
-            if len(of_part) < MIN_SOLID:
-                continue
-            away = (of_part - pivot).norm(dim=1)
-            found[part] = of_part[away >= away.quantile(TIP_QUANTILE)].mean(0)
-        hinges.tips[joint] = found

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from neeco.raster import rasterize
-from neeco.scene.instruments import LABEL_SHARE
+from neeco.scene.articulation import LABEL_SHARE
 from neeco.scene.visibility import visible_pixels
 from neeco.training.session import GaussianSession
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from neeco.raster import rasterize
 from neeco.raster.pinhole import pixel_centers, unproject_world
 from neeco.raster.types import Camera
+from neeco.scene.articulation import ArticulatedInstruments, Articulation
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Perturbation
-from neeco.scene.instruments import HingedInstruments, Hinges
 from neeco.training.session import GaussianSession
 
 WRIST_STEPS = 14  # wrist positions whose symmetry is tested
@@ -32,57 +32,57 @@ MIN_SOLID = 10  # solid Gaussians, with fewer nothing is measured
 
 
 @torch.no_grad()
-def place_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
+def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Set every wrist to where it is found."""
     for index in range(len(session.scene.instruments)):
-        hinges = hinged.hinges_of(index)
-        if hinges.joint_names:
-            measure_radius(session.scene.canonical, index, hinges)
-            hinges.wrist_start.fill_(_boundary(session, hinged, index))
+        articulation = articulated.articulations[index]
+        if articulation.jointed:
+            measure_radius(session.scene.canonical, index, articulation)
+            articulation.wrist_start.fill_(_boundary(session, articulated, index))
 
 
 @torch.no_grad()
-def replace_wrists(session: GaussianSession, hinged: HingedInstruments) -> None:
+def replace_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
     """Find every wrist again, and move it unless spinning what then lies behind it costs more than before."""
     for index in range(len(session.scene.instruments)):
-        hinges = hinged.hinges_of(index)
-        if not hinges.joint_names:
+        articulation = articulated.articulations[index]
+        if not articulation.jointed:
             continue
-        before, found = float(hinges.wrist_start), _boundary(session, hinged, index)
+        before, found = float(articulation.wrist_start), _boundary(session, articulated, index)
         frames = session.frames_along_poses(session.config.search.spin_frames)
-        costs = {place: _spun_error(session, hinged, index, place, frames) for place in (before, found)}
-        hinges.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
+        costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, found)}
+        articulation.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
 
 
-def _boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
-    boundary = color_boundary(session, hinged, index)
-    return _symmetry_boundary(session, hinged, index) if boundary is None else boundary
+def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
+    boundary = color_boundary(session, articulated, index)
+    return _symmetry_boundary(session, articulated, index) if boundary is None else boundary
 
 
-def _symmetry_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float:
+def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
     """Position mm along the shaft up to which spinning what lies behind costs little."""
     scene = session.scene
-    hinges = hinged.hinges_of(index)
-    before = float(hinges.wrist_start)
-    hinge, rear = float(hinges.hinge_depth[0]), float(solid_extent(scene.canonical, index, hinges)[0])
-    starts = torch.linspace(rear + 0.3 * (hinge - rear), hinge, WRIST_STEPS)
+    articulation = articulated.articulations[index]
+    before = float(articulation.wrist_start)
+    joint, rear = float(articulation.first_joint()), float(solid_extent(scene.canonical, index, articulation)[0])
+    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, WRIST_STEPS)
     frames = session.frames_along_poses(session.config.search.spin_frames)
     base = sum(_image_error(session, frame, UNPERTURBED) for frame in frames)
-    costs = [_spun_error(session, hinged, index, float(start), frames) - base for start in starts]
-    hinges.wrist_start.fill_(before)
+    costs = [_spun_error(session, articulated, index, float(start), frames) - base for start in starts]
+    articulation.wrist_start.fill_(before)
     limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
     return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
 
 
 def _spun_error(
-    session: GaussianSession, hinged: HingedInstruments, index: int, start: float, frames: list[int]
+    session: GaussianSession, articulated: ArticulatedInstruments, index: int, start: float, frames: list[int]
 ) -> float:
     """Summed error of the frames' images with what lies behind `start` spun a little, one way and the other in turn.
     Leaves the wrist there."""
-    hinged.hinges_of(index).wrist_start.fill_(start)
+    articulated.articulations[index].wrist_start.fill_(start)
     angle = session.config.search.spin_angle
     return sum(
-        _image_error(session, frame, hinged.spin_perturbation(-angle if k % 2 else angle))
+        _image_error(session, frame, articulated.spin_perturbation(-angle if k % 2 else angle))
         for k, frame in enumerate(frames)
     )
 
@@ -95,18 +95,18 @@ def _image_error(session: GaussianSession, index: int, perturbation: Perturbatio
     return float(error.mean() if mask is None else error[mask].mean())
 
 
-def color_boundary(session: GaussianSession, hinged: HingedInstruments, index: int) -> float | None:
+def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float | None:
     """Position mm along the shaft where the recorded images' colour along it changes most; None without a clear
     step."""
-    hinges = hinged.hinges_of(index)
-    radius = float(hinges.radius)
-    rear = float(solid_extent(session.scene.canonical, index, hinges)[0])
-    count = int((float(hinges.hinge_depth[0].detach()) - rear) / (radius / BINS_PER_RADIUS))
+    articulation = articulated.articulations[index]
+    radius = float(articulation.radius)
+    rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
+    count = int((float(articulation.first_joint()) - rear) / (radius / BINS_PER_RADIUS))
     if not count > 2 * BINS_PER_RADIUS:
         return None
     edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
     frames = session.frames_along_poses(session.config.search.border_frames)
-    steps = torch.stack([_steps(*_profile(session, hinged, index, frame, edges)) for frame in frames])
+    steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges)) for frame in frames])
     seen = steps.isfinite().all(2).sum(0)  # [count + 1] frames
     enough = seen >= MIN_FRAME_SHARE * len(steps)
     if int(enough.sum()) < BINS_PER_RADIUS:
@@ -135,18 +135,18 @@ def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _profile(
-    session: GaussianSession, hinged: HingedInstruments, index: int, frame_index: int, edges: Tensor
+    session: GaussianSession, articulated: ArticulatedInstruments, index: int, frame_index: int, edges: Tensor
 ) -> tuple[Tensor, Tensor]:
     """A recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and
     two log ratios, to which the light's colour and distance add constants."""
     scene = session.scene
     state, camera = session.corrected(frame_index)
     body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
-    body[scene.canonical.body(index + 1), 0] = hinged.part_weights(scene.canonical, index)[:, 0]
+    body[scene.canonical.body(index + 1), 0] = articulated.link_weights(scene.canonical, index)[:, 0]
     channels = rasterize(scene.at(state), camera, channels=body).channels
     assert channels is not None
     pose = scene.registered(state).instruments[scene.instruments[index].name].pose
-    along = _along_shaft(camera, pose.to(body), hinged.hinges_of(index))  # [H, W]
+    along = _along_shaft(camera, pose.to(body), articulated.articulations[index])  # [H, W]
     chosen = (channels[..., 0] > MIN_BODY_SHARE) & along.isfinite()
     mask = session.views.mask(frame_index)
     if mask is not None:
@@ -161,12 +161,12 @@ def _profile(
     return sums, pixels
 
 
-def _along_shaft(camera: Camera, pose: Tensor, hinges: Hinges) -> Tensor:
+def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Tensor:
     """[H, W] mm along the shaft where the rays of pixels meet its cylinder; nan where they miss or graze it.
 
     The Gaussians are too imprecise for this: they lie in a cloud about the surface. pose [4, 4] world_from_instrument.
     """
-    origin, direction = hinges.shaft()
+    origin, direction = articulation.shaft()
     rotation = pose[:3, :3]
     centers = pixel_centers(camera.height, camera.width).to(pose)
     eye = camera.world_from_camera.to(pose)[:3, 3]
@@ -174,7 +174,7 @@ def _along_shaft(camera: Camera, pose: Tensor, hinges: Hinges) -> Tensor:
     start = (eye - pose[:3, 3]) @ rotation - origin  # [3]
     ray_along, start_along = rays @ direction, start @ direction
     across, aside = rays - ray_along[..., None] * direction, start - start_along * direction
-    square, radius = across.square().sum(-1), hinges.radius
+    square, radius = across.square().sum(-1), articulation.radius
     half = across @ aside
     discriminant = half.square() - square * (aside.square().sum() - radius.square())
     depth = (-half - discriminant.clamp_min(0).sqrt()) / square
@@ -187,20 +187,20 @@ def solid_gaussians(canonical: CanonicalGaussians, index: int) -> Tensor:
     return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > SOLID_OPACITY
 
 
-def measure_radius(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> None:
+def measure_radius(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> None:
     """Set the shaft's radius to the quantile RADIUS_SHARE of the solid Gaussians' distances from its axis, well behind
-    the first hinge; leave it where there are too few."""
+    the first joint; leave it where there are too few."""
     points = canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)]
-    origin, direction = hinges.shaft()
-    along = hinges.along_shaft(points)
-    away = (points - origin - along[:, None] * direction)[along < hinges.hinge_depth.min() - 2 * hinges.radius]
+    origin, direction = articulation.shaft()
+    along = articulation.along_shaft(points)
+    away = (points - origin - along[:, None] * direction)[along < articulation.first_joint() - 2 * articulation.radius]
     if len(away) >= MIN_SOLID:
-        hinges.radius.copy_(away.norm(dim=1).quantile(RADIUS_SHARE))
+        articulation.radius.copy_(away.norm(dim=1).quantile(RADIUS_SHARE))
 
 
-def solid_extent(canonical: CanonicalGaussians, index: int, hinges: Hinges) -> Tensor:
+def solid_extent(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> Tensor:
     """[2] mm along the shaft between which the solid Gaussians lie."""
-    along = hinges.along_shaft(canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)])
+    along = articulation.along_shaft(canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)])
     if len(along) < MIN_SOLID:
-        return hinges.extent.clone()
+        return articulation.extent.clone()
     return torch.quantile(along, along.new_tensor([0.02, 0.985]))

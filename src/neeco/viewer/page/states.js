@@ -77,12 +77,12 @@ function standings(head, wish) {
   });
 }
 
-// The rasteriser's state: 8 poses of 16 numbers, then 8 times 4 hinges of 7.
+// The rasteriser's state: 8 poses of 16 numbers, then 8 times 4 axes of 7.
 function packedState(head, wish) {
   const state = new Float32Array(8 * 16 + 8 * 4 * 7);
   standings(head, wish).forEach(({ pose, readings }, index) => {
     state.set([...pose, ...quaternion(pose)], 16 * index);
-    head.instruments[index].joints.forEach(({ pivot, axis }, j) => state.set([...pivot, ...axis, readings[j]], 128 + 28 * index + 7 * j));
+    head.instruments[index].axes.forEach(({ pivot, axis, joint }, k) => state.set([...pivot, ...axis, readings[joint]], 128 + 28 * index + 7 * k));
   });
   return state;
 }

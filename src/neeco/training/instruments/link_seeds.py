@@ -1,0 +1,90 @@
+"""Seeds on the links of a stated kinematic tree: each link is carved in its own frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from neeco.scene.articulation.stated import StatedLinks
+from neeco.training.instruments.evidence import POSSIBLE, CarvedShape, Evidence, PosedViews, posed_views
+from neeco.training.session import GaussianSession
+
+LINK_LOGIT = 2.0  # initial logit of a seed for the link that it was carved on
+SHAFT_SHARE = 0.4  # of the seeds
+REACH_RADII = 7.0  # how far beyond its pivot a link without links of its own is looked for
+BESIDE_RADII = 2.0  # how far about the pivots beyond it another is
+CANDIDATES = 20  # points tried per seed
+TOLERANCE = 0.03  # of evidence, by which another link may be likelier
+MIN_SEEN = 0.05  # share of the frames that must see a seed
+
+
+@torch.no_grad()
+def start_links(
+    session: GaussianSession,
+    links: StatedLinks,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    columns: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Seeds [M, 3] mm at rest on every link, and their link logits [M, columns].
+
+    A point belongs to the link with which it must move to stay on evidence.
+    """
+    search = session.config.search
+    links.wrist_start.fill_(float(links.first_joint()) - shape.radius)
+    moved = link_motions(links, evidence, name)  # [F, L, 4, 4]
+    views = [posed_views(evidence, name, search, moved[:, k]) for k in range(links.link_count)]
+    behind = links.along_shaft(shape.seeds) < links.first_joint()
+    of_shaft = shape.seeds[behind] if bool(behind.any()) else shape.seeds
+    count = round(SHAFT_SHARE * search.seeds)
+    chosen = torch.randint(len(of_shaft), (count,), generator=generator, device=generator.device).to(of_shaft.device)
+    seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
+    each = (search.seeds - count) // max(links.link_count - 1, 1)
+    for link in range(1, links.link_count):
+        found = _on_link(views, links, link, shape.radius, each, generator)
+        seeds.append(found)
+        owners.append(torch.full((len(found),), link))
+    points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
+    logits = 0.3 * torch.randn(len(points), columns, generator=generator).to(points)
+    return points, logits + LINK_LOGIT * nn.functional.one_hot(owner, columns)
+
+
+def link_motions(links: StatedLinks, evidence: Evidence, name: str) -> Tensor:
+    """[F, L, 4, 4] instrument frame: how every link has moved from rest at each frame's readings."""
+    frame = torch.eye(4, device=links.points.device)[:, :3]  # origin and axes, as points
+    corners = torch.cat([frame[3:4], frame[:3]])  # [4, 3]
+    moved = []
+    for given in evidence.frames:
+        joints = given.state.instruments[name].joints
+        for link in range(links.link_count):
+            origin, *ends = links.place(corners, link, joints)
+            rigid = torch.eye(4, device=corners.device)
+            rigid[:3, :3], rigid[:3, 3] = torch.stack(ends, 1) - origin[:, None], origin
+            moved.append(rigid)
+    return torch.stack(moved).reshape(len(evidence.frames), links.link_count, 4, 4)
+
+
+def _on_link(
+    views: list[PosedViews], links: StatedLinks, link: int, radius: float, count: int, generator: torch.Generator
+) -> Tensor:
+    """[count, 3] mm at rest: points that stay on evidence when moved with a link, and better than with any other."""
+    device = links.points.device
+    centers, reaches = (part.to(device) for part in links.where(link, REACH_RADII * radius, BESIDE_RADII * radius))
+    total = CANDIDATES * count
+    random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
+    which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
+    points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
+    own, seen = views[link].scores(points)
+    likely = torch.nonzero((own > 0.5 * POSSIBLE) & (seen > MIN_SEEN))[:, 0]
+    others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
+    fits = own[likely] >= others - TOLERANCE
+    likely, score = likely[fits], own[likely][fits]
+    if not len(likely):  # nothing tells: about its pivot, for the training to sort out
+        return points[:count] * 0 + centers[:1] + 0.5 * (points[:count] - centers[which[:count]])
+    best = likely[score >= min(POSSIBLE, 0.85 * float(score.max()))]
+    again = torch.randint(len(best), (max(0, count - len(best)),), generator=generator, device=generator.device)
+    jitter = 0.1 * radius * torch.randn(len(again), 3, generator=generator, device=generator.device).to(points)
+    order = torch.randperm(len(best), generator=generator, device=generator.device).to(device)[:count]
+    return torch.cat([points[best[order]], points[best[again.to(device)]] + jitter])
