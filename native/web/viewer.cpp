@@ -15,8 +15,8 @@
 namespace neeco {
 namespace {
 
-constexpr int kMostInstruments = 8, kMostJoints = 4, kMostLamps = 3;  // joints: of one instrument
-constexpr int kPoseFloats = 16, kHingeFloats = 7;  // floats: [R|t] by rows and the rotation's quaternion; pivot, axis, reading
+constexpr int kMostInstruments = 8, kMostAxes = 8, kMostLamps = 3;  // axes: of one instrument
+constexpr int kPoseFloats = 16, kAxisFloats = 8;  // [R|t] by rows and the rotation's quaternion; pivot, axis, reading, whether it slides
 constexpr float kMargin15 = 0.15f;     // of the image: how far beyond it the projection is linearised where it stands
 
 // The shadows of what moves on what stands still are those of neeco/raster/shadow.py.
@@ -31,14 +31,14 @@ struct Lamp {
 enum Show { kImage, kLabelsOverImage, kLabels, kDepth };
 
 struct Page {
-    int count = 0, tissue = 0, coefficients = 1, joints = 0, labels = 0;  // the first `tissue` Gaussians stand still
+    int count = 0, tissue = 0, coefficients = 1, axes = 0, labels = 0;  // the first `tissue` Gaussians stand still
     float threshold = 0.5f, background = 0, shadow_width = 0;
     int lamps = 0;
     Lamp lamp[kMostLamps];
     float vignette[2];
-    float state[kMostInstruments * (kPoseFloats + kMostJoints * kHingeFloats)];  // poses, then the hinges of every instrument
+    float state[kMostInstruments * (kPoseFloats + kMostAxes * kAxisFloats)];  // poses, then the axes of every instrument
     float matrix[12];                                                // world_from_camera
-    Buffer<float> canonical_means, canonical_quats, scales, opacities, sh, falloff, shares, turns;
+    Buffer<float> canonical_means, canonical_quats, scales, opacities, sh, falloff, shares, amounts;
     Buffer<int32_t> body;
     Buffer<float> means, quats, frames, gains, radii, plain;
     Buffer<float> color, alpha, depth, channels;
@@ -72,14 +72,19 @@ void turn_by(const float* turn, float* quat) {
 }
 
 // A point p, the Gaussian's orientation r and the turn of its harmonics, about a hinge by `angle` (Rodrigues).
-void bend(const float* hinge, float angle, float* p, float* r, float* turned) {
-    const float s = sinf(angle), c = cosf(angle), *axis = hinge + 3;
-    const float d[3] = {p[0] - hinge[0], p[1] - hinge[1], p[2] - hinge[2]};
+// Moves a Gaussian by `amount` about an axis, rad, or along one that slides, mm.
+void move(const float* pivot, float amount, float* p, float* r, float* turned) {
+    if (pivot[7] != 0) {
+        for (int k = 0; k < 3; k++) p[k] += amount * pivot[3 + k];
+        return;
+    }
+    const float s = sinf(amount), c = cosf(amount), *axis = pivot + 3;
+    const float d[3] = {p[0] - pivot[0], p[1] - pivot[1], p[2] - pivot[2]};
     const float dot = (d[0] * axis[0] + d[1] * axis[1] + d[2] * axis[2]) * (1 - c);
-    p[0] = hinge[0] + d[0] * c + (axis[1] * d[2] - axis[2] * d[1]) * s + axis[0] * dot;
-    p[1] = hinge[1] + d[1] * c + (axis[2] * d[0] - axis[0] * d[2]) * s + axis[1] * dot;
-    p[2] = hinge[2] + d[2] * c + (axis[0] * d[1] - axis[1] * d[0]) * s + axis[2] * dot;
-    const float half = sinf(angle / 2), turn[4] = {cosf(angle / 2), half * axis[0], half * axis[1], half * axis[2]};
+    p[0] = pivot[0] + d[0] * c + (axis[1] * d[2] - axis[2] * d[1]) * s + axis[0] * dot;
+    p[1] = pivot[1] + d[1] * c + (axis[2] * d[0] - axis[0] * d[2]) * s + axis[1] * dot;
+    p[2] = pivot[2] + d[2] * c + (axis[0] * d[1] - axis[1] * d[0]) * s + axis[2] * dot;
+    const float half = sinf(amount / 2), turn[4] = {cosf(amount / 2), half * axis[0], half * axis[1], half * axis[2]};
     turn_by(turn, r);
     turn_by(turn, turned);
 }
@@ -174,18 +179,18 @@ using namespace neeco;
 
 extern "C" {
 
-NEECO_EXPORT(begin) void begin(int count, int tissue, int coefficients, int joints, int labels, int lamps) {
-    if (count < 0 || tissue < 0 || tissue > count || joints < 0 || joints > kMostJoints || labels < 0 || labels > kMostChannels ||
+NEECO_EXPORT(begin) void begin(int count, int tissue, int coefficients, int axes, int labels, int lamps) {
+    if (count < 0 || tissue < 0 || tissue > count || axes < 0 || axes > kMostAxes || labels < 0 || labels > kMostChannels ||
         lamps < 0 || lamps > kMostLamps)
         refuse("a scene of that size");
-    page.count = count, page.tissue = tissue, page.coefficients = coefficients, page.joints = joints;
+    page.count = count, page.tissue = tissue, page.coefficients = coefficients, page.axes = axes;
     page.labels = labels, page.lamps = lamps;
     float* plain = page.plain.reserve(3 * (size_t)count);
     for (size_t i = 0; i < 3 * (size_t)count; i++) plain[i] = 0;
 }
 
 // Where to write: 0 means [N, 3], 1 quaternions [N, 4] wxyz, 2 scales [N, 3] mm, 3 opacities [N], 4 harmonics [N, K, 3], 5 falloff [N],
-// 6 labels [N, L], 7 turns [N, J, 2] (rad at a reading of 0, and per unit of it), 8 bodies [N] (int32), 9 light: vignette [2], shadow
+// 6 labels [N, L], 7 amounts [N, A, 2] (rad or mm at a reading of 0, and per unit of it), 8 bodies [N] (int32), 9 light: vignette [2], shadow
 // width, background, label threshold, then offset [3] and strength of every lamp; 10 the state, 11 the camera.
 NEECO_EXPORT(input) void* input(int which) {
     const size_t n = page.count;
@@ -198,7 +203,7 @@ NEECO_EXPORT(input) void* input(int which) {
         case 4: return page.sh.reserve(3 * n * page.coefficients);
         case 5: return page.falloff.reserve(n);
         case 6: return page.shares.reserve(n * page.labels);
-        case 7: return page.turns.reserve(n * 2 * page.joints);
+        case 7: return page.amounts.reserve(n * 2 * page.axes);
         case 8: return page.body.reserve(n);
         case 9: return light;
         case 10: return page.state;
@@ -216,7 +221,7 @@ NEECO_EXPORT(lit) void lit() {
 
 // Poses the scene as the state says.
 NEECO_EXPORT(pose) void pose() {
-    const int n = page.count, joints = page.joints;
+    const int n = page.count, axes = page.axes;
     float *means = page.means.reserve(3 * n), *quats = page.quats.reserve(4 * n), *frames = page.frames.reserve(4 * n);
     for (int i = 0; i < n; i++) {
         const int body = page.body.data()[i];
@@ -224,9 +229,9 @@ NEECO_EXPORT(pose) void pose() {
         std::memcpy(p, page.canonical_means.data() + 3 * i, sizeof p);
         std::memcpy(r, page.canonical_quats.data() + 4 * i, sizeof r);
         if (body > 0 && body <= kMostInstruments) {
-            const float* hinges = page.state + kMostInstruments * kPoseFloats + (body - 1) * kMostJoints * kHingeFloats;
-            const float* turns = page.turns.data() + (size_t)i * 2 * joints;
-            for (int j = 0; j < joints; j++) bend(hinges + kHingeFloats * j, turns[2 * j] + turns[2 * j + 1] * hinges[kHingeFloats * j + 6], p, r, turned);
+            const float* own = page.state + kMostInstruments * kPoseFloats + (body - 1) * kMostAxes * kAxisFloats;
+            const float* amounts = page.amounts.data() + (size_t)i * 2 * axes;
+            for (int a = 0; a < axes; a++, own += kAxisFloats) move(own, amounts[2 * a] + amounts[2 * a + 1] * own[6], p, r, turned);
             const float* b = page.state + kPoseFloats * (body - 1);
             const float world[3] = {b[0] * p[0] + b[1] * p[1] + b[2] * p[2] + b[3], b[4] * p[0] + b[5] * p[1] + b[6] * p[2] + b[7],
                                     b[8] * p[0] + b[9] * p[1] + b[10] * p[2] + b[11]};

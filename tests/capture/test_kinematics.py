@@ -55,7 +55,7 @@ def test_a_wrist_and_jaws_stand_where_they_are_by_hand() -> None:
     tree = kinematics_of(WRISTED, "transforms.json")
     poses = tree.poses({"pitch": math.pi / 2, "yaw": 0.2, "jaw": 0.6})
     assert tree.links[0].name == "shaft"  # wherever it was listed
-    assert tree.readings == ("pitch", "yaw", "jaw")
+    assert tree.readings == ("pitch", "yaw", "jaw")  # the tip comes first of what the yaw moves
     # pitched by a quarter turn about x, what lay 9 mm along z lies along -y
     assert np.allclose(poses["tip"][:3, 3], [0, -9, 0])
     assert np.allclose(poses["jaw_left"], turned("x", math.pi / 2) @ turned("y", 0.5, 0, 0, 9))
@@ -85,7 +85,7 @@ def test_a_tool_of_the_dvrk_stands_as_denavit_and_hartenberg_say(tmp_path: Path)
     file.write_text(TOOL)
     tree = read_dvrk_tool(file, {"wrist_pitch": "pitch"})
     assert [link.name for link in tree.bodies] == ["shaft", "wrist", "jaw_left", "jaw_right"]
-    assert (tree.readings, tree.pose_of) == (("pitch", "wrist_yaw", "jaw"), "tip")
+    assert (tree.readings, tree.pose_of) == (("pitch", "jaw", "wrist_yaw"), "tip")
     pitch, yaw, jaw = 0.4, -0.7, 0.9
 
     def frame(length: float, theta: float) -> np.ndarray:  # modified DH with alpha -pi / 2

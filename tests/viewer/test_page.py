@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from scene_worlds import GRASPER, grasper_state, make_scene, pose_of
+from wristed_world import make_driver
 
 from neeco.capture.model import State
 from neeco.evaluation.image_metrics import psnr
@@ -182,6 +183,40 @@ def test_every_slider_moves_the_instrument_as_the_server_does(
     assert decibels(page.drawn()[0], before) < 40
     page.page.get_by_role("button", name="as recorded").click()
     assert np.array_equal(page.drawn()[0], before)
+
+
+@pytest.fixture(scope="module")
+def driver(scene: Scene) -> Scene:
+    """A driver with a wrist and a blade that slides, over the same wall."""
+    driver = make_driver(FRAMES)
+    own = driver.canonical.map(lambda tensor: tensor[driver.canonical.body(1)], (driver.canonical.counts[1],))
+    tissue = scene.canonical.map(lambda tensor: tensor[scene.canonical.body(0)], (scene.canonical.counts[0],))
+    logits = own.extras["part_logits"]
+    driver.canonical = join_bodies(
+        [tissue.with_extras(part_logits=logits.new_zeros(len(tissue), logits.shape[1])), own]
+    )
+    driver.recorded = replace(driver.recorded, cameras=scene.recorded.cameras)
+    return driver.requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("pitch", -0.5), ("yaw", 0.6), ("jaw", 1.1), ("blade_mm", 0.8), (None, None)]
+)
+def test_sliders_move_every_joint_of_a_wrist_as_the_server_does(
+    chromium: Any, driver: Scene, tmp_path: Path, name: str | None, value: float | None
+) -> None:
+    path = tmp_path / "driver.html"
+    path.write_text(page_of(*pack(driver, 3), "driver", [("method", "kinematic")]))
+    opened = Page(chromium, path)
+    opened.page.evaluate("window.neeco.toFrame(2)")
+    joints = {}
+    if name is not None:
+        opened.slide(name, value)
+        joints = {name: opened.value(name)}
+    controls = Controls(2.0, {"driver": InstrumentControls(joints=joints)} if joints else {})
+    state = controlled_state(driver.recorded.states, shafts_of(driver), controls)
+    agree(opened, driver, state, driver.recorded.cameras[2], None)
+    opened.page.close()
 
 
 def test_between_frames_it_interpolates_as_the_server_does(page: Page, scene: Scene) -> None:

@@ -84,8 +84,8 @@ class KinematicTree:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """Names of all readings that drive a joint, in the order of the links."""
-        return tuple(dict.fromkeys(name for link in self.links for name in link.value))
+        """Names of all readings that drive a joint, in the order of the links, of one joint in that of the alphabet."""
+        return tuple(dict.fromkeys(name for link in self.links for name in sorted(link.value)))
 
     @property
     def bodies(self) -> tuple[Link, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from neeco.capture.images import read_image, read_mask
-from neeco.capture.kinematics import KinematicTree
+from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
 from neeco.raster.rotations import as_pose
@@ -80,6 +80,13 @@ class Instrument:
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
+
+    def slides(self, joint: str) -> bool:
+        """Is a joint's reading a length in mm? As its kinematics state, else by its name."""
+        tree = self.kinematics
+        if tree is None or joint not in tree.readings:
+            return joint.endswith("_mm")
+        return any(link.type == PRISMATIC for link in tree.joints if joint in link.value)
 
 
 @dataclass(frozen=True)

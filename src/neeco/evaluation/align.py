@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from neeco.capture.images import area_averaged
-from neeco.capture.kinematics import PRISMATIC
 from neeco.capture.model import Frame, State
 from neeco.raster import rasterize
 from neeco.raster.rotations import rigid_from_vector
@@ -165,12 +164,11 @@ def fit_frame(
 
 def _stated_joints(scene: Scene, names: tuple[str, ...]) -> tuple[tuple[str, str, bool], ...]:
     """(instrument, reading, whether it slides) of every reading in stated kinematics."""
-    trees = [(item.name, item.kinematics) for item in scene.instruments if item.name in names]
     return tuple(
-        (name, reading, any(joint.type == PRISMATIC and reading in joint.value for joint in tree.joints))
-        for name, tree in trees
-        if tree is not None
-        for reading in tree.readings
+        (item.name, reading, item.slides(reading))
+        for item in scene.instruments
+        if item.kinematics is not None and item.name in names
+        for reading in item.kinematics.readings
     )
 
 

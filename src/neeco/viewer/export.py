@@ -41,7 +41,7 @@ SCRIPTS = ("scene.js", "states.js", "drawing.js", "camera.js", "panel.js", "main
 WORKER, STYLE, WASM = "worker.js", "page.css", "viewer.wasm"
 MAX_DEGREE = 3
 EMBEDDED_DEGREE = 1  # in a report: half the size, and for a first look
-MAX_INSTRUMENTS, MAX_JOINTS, MAX_LABELS = 8, 4, 32  # that the page's rasteriser has room for; joints of one instrument
+MAX_INSTRUMENTS, MAX_AXES, MAX_LABELS = 8, 8, 32  # that the page's rasteriser has room for; axes of one instrument
 THINNEST_MM = 0.01  # thinner than any pixel
 POSITION_STEPS = 2**20 - 1  # of a body's box: 2**16 change the order in depth of neighbours, which costs 5 dB
 BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "uint24": 3}
@@ -154,12 +154,10 @@ def why_not(scene: Drawable) -> str | None:
             f"method {scene.method} asks a network for every state, which a page cannot; "
             "look at it with `neeco view RUN`, or export a run of method kinematic or 3dgs"
         )
-    if any(axis.slides for axes in motion.axes for axis in axes):
-        return "a page turns joints and cannot slide them yet; look at it with `neeco view RUN`"
-    joints = max((len(axes) for axes in motion.axes), default=0)
+    most_axes = max((len(axes) for axes in motion.axes), default=0)
     for name, found, most in (
         ("instruments", len(scene.instruments), MAX_INSTRUMENTS),
-        ("joints of an instrument", joints, MAX_JOINTS),
+        ("axes of an instrument", most_axes, MAX_AXES),
         ("labels", len(scene.label_names), MAX_LABELS),
     ):
         if found > most:
@@ -270,7 +268,8 @@ def _instruments(scene: Scene, motion: ArticulatedMotion) -> list[dict[str, Any]
         names, joints = list(instrument.joints), []
         for name in names:
             span = ranges[instrument.name, name]
-            joints.append({"name": name, "range": [span.lower, span.upper]})
+            slides = instrument.slides(name)
+            joints.append({"name": name, "range": [span.lower, span.upper], "slides": slides})
         shaft = shafts[instrument.name]
         side, up = perpendicular_axes(shaft.along)
         vectors = {"end": shaft.end, "along": shaft.along, "side": side, "up": up}
@@ -280,7 +279,12 @@ def _instruments(scene: Scene, motion: ArticulatedMotion) -> list[dict[str, Any]
                 "shaft": {name: vector.tolist() for name, vector in vectors.items()},
                 "joints": joints,
                 "axes": [
-                    {"pivot": item.pivot.tolist(), "axis": item.axis.tolist(), "joint": names.index(item.reading)}
+                    {
+                        "pivot": item.pivot.tolist(),
+                        "axis": item.axis.tolist(),
+                        "joint": names.index(item.reading),
+                        "slides": item.slides,
+                    }
                     for item in axes
                 ],
             }

@@ -238,9 +238,12 @@ class InstrumentPanel:
         self.name = instrument.name
         self._changed, self._toggle_gizmo = changed, toggle_gizmo
         self._ranges = {joint: ranges[self.name, joint] for joint in instrument.joints if (self.name, joint) in ranges}
+        # what sliders show of a reading: degrees of one that turns, mm of one that slides
+        self._per_unit = {joint: 1.0 if instrument.slides(joint) else math.degrees(1.0) for joint in instrument.joints}
         with gui.add_folder(f"Instrument {self.name}"):
             self._joints = {
-                joint: _degrees_slider(gui, joint, span) for joint, span in list(self._ranges.items())[:MAX_JOINTS]
+                joint: _joint_slider(gui, joint, span, self._per_unit[joint])
+                for joint, span in list(self._ranges.items())[:MAX_JOINTS]
             }
             self.as_recorded = gui.add_checkbox(
                 "joints as recorded", True, visible=bool(self._joints), hint="Off as soon as a joint is moved."
@@ -270,7 +273,7 @@ class InstrumentPanel:
             for joint, slider in self._joints.items():
                 span = self._ranges[joint]
                 # a degree and back may lie a hair outside the limits
-                joints[joint] = min(max(math.radians(slider.value), span.lower), span.upper)
+                joints[joint] = min(max(slider.value / self._per_unit[joint], span.lower), span.upper)
         return InstrumentControls(
             joints,
             float(self.slide.value),
@@ -284,7 +287,7 @@ class InstrumentPanel:
         """Show the recorded readings, unless the user has set others."""
         if self.as_recorded.value:
             for joint, slider in self._joints.items():
-                on_step = round(math.degrees(state.joints[joint]) / slider.step) * slider.step
+                on_step = round(state.joints[joint] * self._per_unit[joint] / slider.step) * slider.step
                 shown = min(max(round(on_step, 6), slider.min), slider.max)
                 if shown != slider.value:
                     slider.value = shown
@@ -319,13 +322,16 @@ class InstrumentPanel:
             self._changed()
 
 
-def _degrees_slider(gui: viser.GuiApi, joint: str, span: JointRange) -> viser.GuiSliderHandle[float]:
-    """Ends are rounded outwards; what lies outside the range there is drawn at its end."""
-    lower, upper = math.degrees(span.lower), math.degrees(span.upper)
+def _joint_slider(gui: viser.GuiApi, joint: str, span: JointRange, per_unit: float) -> viser.GuiSliderHandle[float]:
+    """In mm where `per_unit` is 1, else in degrees. Ends are rounded outwards; what lies outside the range there is
+    drawn at its end."""
+    lower, upper = per_unit * span.lower, per_unit * span.upper
     digits = max(0, 1 - math.floor(math.log10((upper - lower) / 5)))
     step = 10.0**-digits
     lower, upper = round(math.floor(lower / step) * step, digits), round(math.ceil(upper / step) * step, digits)
-    return gui.add_slider(f"{joint} (°)", lower, upper, step, min(max(0.0, lower), upper))
+    return gui.add_slider(
+        f"{joint} ({'mm' if per_unit == 1 else '°'})", lower, upper, step, min(max(0.0, lower), upper)
+    )
 
 
 def status_html(parts: Sequence[RunPicture], seconds: float, size: tuple[int, int], note: str) -> str:

@@ -21,9 +21,10 @@ PIVOT_SIGMA = 2.0  # mm
 # wide: what an offset is, is seen only by how it carries the axes beyond it along, and those are stated no better
 OFFSET_SIGMA = {False: 0.1, True: 2.0}  # rad where the joint turns, mm where it slides
 GAIN_SIGMA = 0.03
-SIDE_LOGITS = (
-    2.0  # per radius of the shaft by which a Gaussian lies on the wrong side of a joint, for each of its links
-)
+SIDE_LOGITS = 2.0  # for each link of a joint, per radius by which a Gaussian lies on the wrong side of it
+SIDE_AT = 0.4  # radii beyond the pivot: a link holds the next one between its prongs
+MIN_STEP = 1.0  # mm between two pivots that tell a direction
+WRIST_WITHIN = 2.5  # radii behind the first joint in which the shaft's end is believed
 
 
 class StatedLinks(Articulation):
@@ -83,7 +84,7 @@ class StatedLinks(Articulation):
 
     def placed_logits(self, points: Tensor, logits: Tensor) -> Tensor:
         """Near a joint motion hardly tells links apart; there a Gaussian is rather of the link on whose side of the
-        joint it lies. Sides are those of the plane through the pivot across the links at rest."""
+        joint it lies: of a plane across the links at rest."""
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
 
     @torch.no_grad()
@@ -96,9 +97,11 @@ class StatedLinks(Articulation):
             if self.slides[joint]:
                 continue
             inner = self._inner_joint(joint)
-            step = pivots[joint] - pivots[inner] if inner in directions else self.shaft()[1]
-            directions[joint] = nn.functional.normalize(step, dim=0) if step.norm() > 0.5 else directions[inner]
-            beyond = (points - pivots[joint]) @ directions[joint] * (SIDE_LOGITS / self.radius)  # [M]
+            directions[joint] = directions.get(inner, self.shaft()[1])
+            if inner in directions and float((step := pivots[joint] - pivots[inner]).norm()) > MIN_STEP:
+                directions[joint] = nn.functional.normalize(step, dim=0)
+            along = (points - pivots[joint]) @ directions[joint]  # [M] mm
+            beyond = SIDE_LOGITS * (along / self.radius - SIDE_AT)
             sides[:, 1:][:, self._moves(joint)] += beyond.clamp_max(0)[:, None]
             sides[:, self._link_of(self.joint_groups[joint][0].parent)] -= beyond.clamp_min(0)
         return sides
@@ -161,7 +164,28 @@ class StatedLinks(Articulation):
         return found
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        return weights
+        """What turns about a ball or pin looks the same on either side of it: of what moves with the shaft, all beyond
+        the shaft's end (where its colour or its symmetry ends) is labelled as the link that follows."""
+        first = self.first_joint()
+        found = (self.wrist_start > first - WRIST_WITHIN * self.radius) & (self.wrist_start <= first)
+        end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
+        beyond = weights[:, 0] * (self.along_shaft(points) > end)
+        following = next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
+        moved = nn.functional.one_hot(torch.tensor([0, following]), self.link_count).to(weights)
+        return weights + beyond[:, None] * (moved[1] - moved[0])
+
+    def rest_line(self) -> tuple[Tensor, Tensor] | None:
+        """(point [3] mm, unit direction [3]) along which the links lie at rest: from the first pivot to the one that it
+        carries; None where there are not two."""
+        pivots, _ = self.axes()
+        for joint in reversed(range(len(pivots))):
+            inner = self._inner_joint(joint)
+            if inner < 0 or self.slides[joint] or self.slides[inner]:
+                continue
+            step = pivots[joint] - pivots[inner]
+            if float(step.norm()) > MIN_STEP:
+                return pivots[inner], nn.functional.normalize(step, dim=0)
+        return None
 
     def moved_by(self, reading: str, weights: Tensor) -> Tensor:
         moves = self.gains[:, :, self.reading_names.index(reading)].abs().amax(0) > 0  # [L - 1]

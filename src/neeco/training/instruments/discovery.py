@@ -28,7 +28,7 @@ from neeco.training.instruments.evidence import (
     score_points,
 )
 from neeco.training.instruments.hinge_search import start_hinges
-from neeco.training.instruments.link_seeds import start_links
+from neeco.training.instruments.link_seeds import along_links, start_links
 from neeco.training.session import GaussianSession, new_session
 
 MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
@@ -64,6 +64,8 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         if not moves_with_pose(session, evidence, instrument.name, shape):
             shape = shape_around_frame(shape, evidence.distance, search.seeds, generator)
         articulation = articulated.articulations[index]
+        if isinstance(articulation, StatedLinks):
+            shape = along_links(session, articulation, evidence, instrument.name, shape, generator)
         articulation.base.copy_(shape.instrument_from_shaft)
         articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
         articulation.radius.fill_(shape.radius)

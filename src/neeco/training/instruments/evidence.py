@@ -8,6 +8,7 @@ axis (which need not be the sensor's z), the tip, and seeds for the Gaussians.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -207,6 +208,21 @@ def carve(evidence: Evidence, name: str, generator: torch.Generator, search: Sea
     return CarvedShape(base, near, tip, radius, line, points @ base[:3, :3].T + base[:3, 3], level)
 
 
+def carve_along(
+    evidence: Evidence, name: str, base: Tensor, level: float, generator: torch.Generator, search: SearchConfig
+) -> CarvedShape | None:
+    """As `carve`, about a line that is known: the z axis of `base` [4, 4], instrument_from_shaft. None where there is
+    no evidence along it."""
+    reach = 0.6 * evidence.distance
+    views = posed_views(evidence, name, search).seen_from(base)
+    line, radius = _solid_line(views, 2 * reach / (search.fine_grid - 1), 0.09 * evidence.distance, level)
+    if len(line) < 4:
+        return None
+    near, tip = float(line[0, 0]), float(line[-1, 0])
+    points = _sample_seeds(views, near, tip, max(3 * radius, 0.08 * reach), search.seeds, generator)
+    return CarvedShape(base, near, tip, radius, line[:, :3], points @ base[:3, :3].T + base[:3, 3], level)
+
+
 def _solid_points(views: PosedViews, reach: float, side: int) -> tuple[Tensor, float]:
     """Points [S, 3] surely inside, of a grid of `side`^3 that ends `reach` mm from the frame's origin, and their level:
     the strictest of SOLID that MIN_SOLID of them have."""
@@ -230,10 +246,10 @@ def _shaft_frame(views: PosedViews, solid: Tensor) -> Tensor:
     _, seen = score_points(views.evidence, views.own, ends)
     if seen[0] > seen[1]:
         direction = -direction
-    return _frame_along(center, direction)
+    return frame_along(center, direction)
 
 
-def _frame_along(origin: Tensor, direction: Tensor) -> Tensor:
+def frame_along(origin: Tensor, direction: Tensor) -> Tensor:
     """[4, 4] with z along `direction` and x as near as can be to the instrument frame's x (or y)."""
     x = origin.new_tensor([1.0, 0.0, 0.0])
     if abs(float(direction @ x)) > 0.9:
@@ -250,11 +266,10 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
     half = 0.09 * views.evidence.distance
     line, radius = base.new_zeros(0, 3), spacing
     for _ in range(3):
-        rows = _slice_centers(views.seen_from(base), spacing, half, level)
+        rows, radius = _solid_line(views.seen_from(base), spacing, half, level)
         if len(rows) < 4:
             return base, base.new_zeros(0, 3), radius
         line, area, seen = rows[:, :3], rows[:, 3], rows[:, 4]
-        radius = max(float((area.median() / torch.pi).sqrt()), spacing / 4)
         near, tip = float(line[0, 0]), float(line[-1, 0])
         # the ends are seen rarely (rear) or bend and open (front)
         middle = (line[:, 0] > near + 0.15 * (tip - near)) & (line[:, 0] < near + 0.65 * (tip - near)) & (seen > 0.3)
@@ -263,9 +278,16 @@ def _refine_axis(views: PosedViews, base: Tensor, spacing: float, level: float) 
         slope = _robust_line(line[middle, 0], line[middle, 1:], (area * seen)[middle])
         direction = base[:3, :3] @ torch.nn.functional.normalize(torch.cat([slope[0], slope.new_ones(1)]), dim=0)
         origin = base[:3, :3] @ torch.cat([slope[1], slope.new_zeros(1)]) + base[:3, 3]
-        base = _frame_along(origin, direction)
+        base = frame_along(origin, direction)
         half = max(min(half, 4 * radius), 2 * spacing)
     return base, line, radius
+
+
+def _solid_line(views: PosedViews, spacing: float, half: float, level: float) -> tuple[Tensor, float]:
+    """The rows [Z, 5] of `_slice_centers`, and the solid's radius mm by their median area."""
+    rows = _slice_centers(views, spacing, half, level)
+    area = float(rows[:, 3].median()) if len(rows) else 0.0
+    return rows, max(math.sqrt(area / math.pi), spacing / 4)
 
 
 def center_line(evidence: Evidence, name: str, shape: CarvedShape, search: SearchConfig) -> Tensor:

@@ -6,7 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from neeco.scene.articulation.stated import StatedLinks
-from neeco.training.instruments.evidence import POSSIBLE, CarvedShape, Evidence, PosedViews, posed_views
+from neeco.training.instruments.evidence import (
+    POSSIBLE,
+    CarvedShape,
+    Evidence,
+    PosedViews,
+    carve_along,
+    frame_along,
+    posed_views,
+)
 from neeco.training.session import GaussianSession
 
 LINK_LOGIT = 2.0  # initial logit of a seed for the link that it was carved on
@@ -15,7 +23,36 @@ REACH_RADII = 7.0  # how far beyond its pivot a link without links of its own is
 BESIDE_RADII = 2.0  # how far about the pivots beyond it another is
 CANDIDATES = 20  # points tried per seed
 TOLERANCE = 0.03  # of evidence, by which another link may be likelier
+# a carved shaft is believed where it agrees so well with the line of the links at rest
+MIN_COSINE = 0.85
+MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
 MIN_SEEN = 0.05  # share of the frames that must see a seed
+
+
+@torch.no_grad()
+def along_links(
+    session: GaussianSession,
+    links: StatedLinks,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    generator: torch.Generator,
+) -> CarvedShape:
+    """`shape`, or where its line is not that of the links at rest, one carved about theirs: an instrument that hardly
+    turns leaves evidence along its lines of sight, too."""
+    line = links.rest_line()
+    if line is None:
+        return shape
+    pivot, direction = line
+    origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
+    apart = pivot - origin
+    off = float((apart - (apart @ along) * along).norm())
+    if float(along @ direction) > MIN_COSINE and off < max(MAX_OFF_RADII * shape.radius, MAX_OFF_MM):
+        return shape
+    session.report(f"{name}: the shaft is looked for along the stated links: carving it found another line")
+    base = frame_along(pivot, direction)
+    carved = carve_along(evidence, name, base, shape.level, generator, session.config.search)
+    return shape if carved is None else carved
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@ const DEGREE = Math.PI / 180;
 
 const element = (id) => document.getElementById(id);
 const degrees = (v) => `${(v / DEGREE).toFixed(1)}°`;
+const millimetres = (v) => `${v.toFixed(1)} mm`;
 
 function made(tag, properties = {}, ...children) {
   const node = Object.assign(document.createElement(tag), properties);
@@ -36,11 +37,11 @@ class Panel {
   instrument(instrument, index) {
     const { page } = this, group = this.group(instrument.name), own = () => page.wish.instruments[index];
     instrument.joints.forEach((joint, j) => {
-      const [low, high] = joint.range;
+      const [low, high] = joint.range, show = joint.slides ? millimetres : degrees;
       const read = () => own().joints[j] ?? standings(this.head, page.wish)[index].readings[j];
-      this.slider(group, joint.name, low, high, (high - low) / 200, degrees, read, (v) => { own().joints[j] = v; });
+      this.slider(group, joint.name, low, high, (high - low) / 200, show, read, (v) => { own().joints[j] = v; });
     });
-    this.slider(group, "slide", -30, 30, 0.5, (v) => `${v.toFixed(1)} mm`, () => own().slide, (v) => { own().slide = v; });
+    this.slider(group, "slide", -30, 30, 0.5, millimetres, () => own().slide, (v) => { own().slide = v; });
     for (const [name, most] of [["roll", 180], ["yaw", 30], ["pitch", 30]]) {
       this.slider(group, name, -most * DEGREE, most * DEGREE, 0.5 * DEGREE, degrees, () => own()[name], (v) => { own()[name] = v; });
     }

@@ -31,10 +31,10 @@ function wholeNumbers(fields, bytes, n) {
 function rasteriserInputs(head, raw, n) {
   const { ranges, light } = head;
   const count = (head.degree + 1) ** 2;
-  const joints = ranges.turn.length / 2;
+  const axes = ranges.turn.length / 2;
   const mean = new Float32Array(3 * n), scale = new Float32Array(3 * n), quat = new Float32Array(4 * n);
   const sh = new Float32Array(3 * n * count), falloff = new Float32Array(n), body = new Int32Array(n);
-  const turn = new Float32Array(2 * joints * n);
+  const turn = new Float32Array(2 * axes * n);
   let i = 0;
   head.counts.forEach((rows, b) => {
     const [low, high] = ranges.mean[b];
@@ -56,7 +56,7 @@ function rasteriserInputs(head, raw, n) {
       const unit = ranges.sh[Math.floor(Math.sqrt(m)) - 1] / 127;
       for (let k = 0; k < 3; k++) sh[3 * (i * count + m) + k] = raw.sh[3 * (i * (count - 1) + m - 1) + k] * unit;
     }
-    for (let k = 0; k < 2 * joints; k++) turn[2 * joints * i + k] = body[i] ? between(raw.turn[2 * joints * i + k], 65535, ranges.turn[k]) : 0;
+    for (let k = 0; k < 2 * axes; k++) turn[2 * axes * i + k] = body[i] ? between(raw.turn[2 * axes * i + k], 65535, ranges.turn[k]) : 0;
   }
   const lamps = Float32Array.from([...light.vignette, light.shadow_width, light.background, head.threshold, ...light.lamps.flat()]);
   const shares = (values) => Float32Array.from(values, (v) => v / 255);

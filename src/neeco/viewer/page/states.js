@@ -77,12 +77,12 @@ function standings(head, wish) {
   });
 }
 
-// The rasteriser's state: 8 poses of 16 numbers, then 8 times 4 axes of 7.
+// The rasteriser's state: 8 poses of 16 numbers, then 8 times 8 axes of 8.
 function packedState(head, wish) {
-  const state = new Float32Array(8 * 16 + 8 * 4 * 7);
+  const state = new Float32Array(8 * 16 + 8 * 8 * 8);
   standings(head, wish).forEach(({ pose, readings }, index) => {
     state.set([...pose, ...quaternion(pose)], 16 * index);
-    head.instruments[index].axes.forEach(({ pivot, axis, joint }, k) => state.set([...pivot, ...axis, readings[joint]], 128 + 28 * index + 7 * k));
+    head.instruments[index].axes.forEach(({ pivot, axis, joint, slides }, k) => state.set([...pivot, ...axis, readings[joint], +slides], 128 + 64 * index + 8 * k));
   });
   return state;
 }
