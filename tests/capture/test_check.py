@@ -413,3 +413,45 @@ def test_kinematics_are_kept_and_told_apart(folder, tmp_path):
     other = read_capture(folder.root)
     assert other.instruments != capture.instruments
     assert len({before, fingerprint(capture), fingerprint(other)}) == 3
+
+
+def _unrecorded(stated=None, pose_of=None, keep=False):
+    """The jaw's reading is taken out of the frames, and declared as not recorded."""
+
+    def edit(document):
+        _tree()(document)
+        instrument = document["instruments"][0]
+        instrument["joints"] = {"jaw_angle": stated or {"recorded": False, "limits": [0.0, 1.0]}}
+        if pose_of is not None:
+            instrument["kinematics"]["pose_of"] = pose_of
+        for frame in document["frames"] if not keep else ():
+            for state in frame["instruments"]:
+                state["joints"].pop("jaw_angle")
+
+    return edit
+
+
+def test_a_joint_that_nobody_recorded_stands_halfway_and_is_not_written(folder, tmp_path):
+    folder.edit(_unrecorded())
+    assert problems(folder) == []
+    capture = read_capture(folder.root)
+    (instrument,) = capture.instruments
+    assert instrument.unrecorded == ("jaw_angle",)
+    assert {frame.state.instruments[instrument.name].joints["jaw_angle"] for frame in capture.frames} == {0.5}
+    write_capture(capture, tmp_path / "again")
+    assert read_capture(tmp_path / "again").instruments == capture.instruments
+    assert '"jaw_angle": 0.5' not in (tmp_path / "again" / "transforms.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("edit", "field", "words"),
+    [
+        (_unrecorded({"recorded": False}), "instruments[0].joints.jaw_angle.limits", "is missing"),
+        (_unrecorded({"recorded": 0, "limits": [0, 1]}), "instruments[0].joints.jaw_angle.recorded", "true or false"),
+        (_unrecorded(pose_of="wrist"), "instruments", "the pose of 'wrist' depends on 'jaw_angle'"),
+        (_unrecorded(keep=True), "frames[0].instruments[0].joints.jaw_angle", "in the header as not recorded"),
+    ],
+)
+def test_a_joint_that_nobody_recorded_is_checked(folder, edit, field, words):
+    folder.edit(edit)
+    assert_found(folder, field, words)

@@ -81,7 +81,7 @@ def test_the_axes_given_to_other_renderers_move_what_is_posed(kind: str) -> None
 def test_an_encoders_offset_and_gain_are_taken_out() -> None:
     links = make_links(wrist())
     before = links.values(READINGS)
-    links.reading_offsets.copy_(torch.tensor([0.02, -0.03, 0.01]))
+    links.reading_offsets.copy_(torch.tensor([0.02, 0.0, 0.0]))  # pitch alone moves another axis
     links.reading_gains.copy_(torch.tensor([0.1, 0.0, -0.2]))
     offsets, gains = (
         dict(zip(links.reading_names, v.tolist(), strict=True)) for v in (links.reading_offsets, links.reading_gains)
@@ -89,7 +89,8 @@ def test_an_encoders_offset_and_gain_are_taken_out() -> None:
     read = {name: value / (1 + gains[name]) + offsets[name] for name, value in READINGS.items()}
     assert torch.allclose(links.values(read), before, atol=1e-6)
     assert float(links.prior()) > 0
-    assert links.describe("jaw")["offset"] == pytest.approx(-0.03)
+    assert links.describe("pitch")["offset"] == pytest.approx(0.02)
+    assert links.describe("jaw")["offset"] is None
 
 
 def test_keypoints_go_with_their_links() -> None:

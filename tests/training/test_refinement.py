@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Frame, Instrument, InstrumentState, State
 from neeco.raster.types import Camera
+from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
 from neeco.training.refinement import Refinement
 
@@ -58,3 +61,59 @@ def test_corrections_of_another_shape_are_not_taken_up() -> None:
     refinement.restore(kept)
     with pytest.raises(ValueError, match=r"latency: \[2\], not \[1\]"):
         refinement.restore(kept | {"latency": torch.zeros(2)})
+
+
+JAWS = KinematicTree((Link("shaft"), Link("jaw", "shaft", REVOLUTE, value={"jaw": 1.0})))
+
+
+def seen_twice(unrecorded: tuple[str, ...] = ()) -> tuple[tuple[Frame, ...], Instrument]:
+    """Every instant as two cameras see it, one after the other."""
+    frames = [
+        replace(frame, state=State({"rod": InstrumentState(frame.state.instruments["rod"].pose, {"jaw": 0.5})}, time))
+        for time, frame in enumerate(sliding_frames())
+        for _ in range(2)
+    ]
+    return tuple(frames), Instrument("rod", {"jaw": (0.0, 1.0)}, JAWS, unrecorded)
+
+
+def test_readings_are_corrected_once_for_all_cameras_of_an_instant() -> None:
+    frames, instrument = seen_twice()
+    refinement = Refinement(RefineConfig(frame_joints=True, start=0), frames, (instrument,), CPU)
+    state, _, penalty = refinement.apply(4, frames[4].state, CAMERA, 1)
+    (state.instruments["rod"].joints["jaw"] + penalty).backward()
+    refinement.step(4, 0.0)
+    states = [refinement.apply(k, frames[k].state, CAMERA, 1)[0] for k in range(12)]
+    readings = [float(torch.as_tensor(state.instruments["rod"].joints["jaw"]).detach()) for state in states]
+    assert readings[4] == readings[5] < 0.5
+    assert readings[:4] + readings[6:] == [0.5] * 10
+    recorded = Recorded.of(frames, (instrument,))
+    assert refinement.found(recorded, (instrument,)) is recorded  # what was recorded stays
+
+
+def test_a_joint_that_nobody_recorded_is_found_within_its_limits_and_told_beside() -> None:
+    frames, instrument = seen_twice(("jaw",))
+    refinement = Refinement(RefineConfig(frame_joints=True, start=0), frames, (instrument,), CPU)
+    refinement.joints += torch.tensor([-0.9, -0.2, 0.0, 0.1, 0.2, 0.9])[:, None]
+    found = refinement.found(Recorded.of(frames, (instrument,)), (instrument,))
+    values = [state.instruments["rod"].joints["jaw"] for state in found.states]
+    assert values[::2] == pytest.approx([0.0, 0.3, 0.5, 0.6, 0.7, 1.0])
+
+    def jaw(state: State) -> float:
+        return found.with_unrecorded(state, (instrument,)).instruments["rod"].joints["jaw"]
+
+    between = State({"rod": InstrumentState(frames[4].state.instruments["rod"].pose, {"jaw": 0.5})}, 2.0)
+    assert jaw(between) == pytest.approx(0.5, abs=1e-3)
+    beside = State({"rod": InstrumentState(frames[8].state.instruments["rod"].pose, {"jaw": 0.5})}, 4.0)
+    assert jaw(beside) == pytest.approx(0.7, abs=1e-3)
+    assert found.with_unrecorded(beside, (replace(instrument, unrecorded=()),)) is beside
+
+
+def test_a_joint_that_nobody_recorded_follows_the_instants_beside() -> None:
+    frames, instrument = seen_twice(("jaw",))
+    frames = tuple(replace(frame, state=replace(frame.state, time=0.04 * frame.state.time)) for frame in frames)
+    refinement = Refinement(RefineConfig(frame_joints=True, start=0), frames, (instrument,), CPU)
+    refinement.joints += 0.3
+    refinement.joints[2] = 0.0
+    before, after = (refinement.apply(k, frames[k].state, CAMERA, 1)[2] for k in (4, 8))
+    assert float(before) > 0
+    assert float(after) == 0

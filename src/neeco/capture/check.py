@@ -248,6 +248,11 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     largest: tuple[float, Node] | None = None
     for state_place, state in parsed.states_of(instrument.name):
         place = state_place.child("joints").child(joint)
+        if joint in instrument.unrecorded:
+            if joint in state.joints:
+                place.error("is stated here, and in the header as not recorded", "keep one of the two")
+                return
+            continue
         if joint not in state.joints:
             place.error("is missing", "give its value in every frame, or drop the frame")
             continue
@@ -272,8 +277,19 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
             "name the recorded readings under `value`",
         )
         return
-    states = [state for _, state in parsed.states_of(instrument.name) if set(tree.readings) <= set(state.joints)]
+    if unknown := [name for name in instrument.unrecorded if name not in tree.readings]:
+        place.error(f"{name}: nothing says what joint {printable(unknown[0])} moves", "name it in its kinematics")
+    if tree.pose_of is not None and (needed := tree.readings_of(tree.pose_of) & set(instrument.unrecorded)):
+        place.error(
+            f"kinematics of {name}: the pose of {printable(tree.pose_of)} depends on {printable(min(needed))}, which "
+            "nobody recorded",
+            "record the pose of a link before that joint",
+        )
+    known = set(tree.readings) - set(instrument.unrecorded)
+    states = [state for _, state in parsed.states_of(instrument.name) if known <= set(state.joints)]
     for link in tree.links:
+        if not set(link.value) <= known:
+            continue
         values = [link.joint_value(state.joints) for state in states]
         beyond = [value for value in values if passes_limits(value, link.limits)]
         if beyond:

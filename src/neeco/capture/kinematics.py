@@ -106,6 +106,13 @@ class KinematicTree:
             found[link.name] = here if link.parent is None else found[link.parent] @ here
         return found
 
+    def readings_of(self, name: str) -> set[str]:
+        """Readings that move a link against the root."""
+        chain = [self.links[self._index[name]]]
+        while (parent := chain[-1].parent) is not None:
+            chain.append(self.links[self._index[parent]])
+        return {reading for link in chain for reading in link.value}
+
     def world_from_root(self, pose: Array, readings: Mapping[str, float]) -> Array:
         """[4, 4] mm from the recorded pose of the link `pose_of`."""
         if self.pose_of is None:

@@ -75,11 +75,19 @@ class State:
 @dataclass(frozen=True)
 class Instrument:
     """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
-    or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known."""
+    or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
+    `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
+    they stand half way between these until they are found."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
+    unrecorded: tuple[str, ...] = ()
+
+    def halfway(self, joint: str) -> float:
+        """The middle of a joint's limits; 0 where none are stated."""
+        limits = self.joints[joint]
+        return 0.0 if limits is None else (limits[0] + limits[1]) / 2
 
     def slides(self, joint: str) -> bool:
         """Is a joint's reading a length in mm? As its kinematics state, else by its name."""

@@ -44,6 +44,8 @@ def capture_of(parsed: Parsed) -> Capture:
     if points is None:
         points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
     frames, instruments = tuple(parsed.frames), parsed.instruments
+    if any(item.unrecorded for item in instruments):
+        frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
     if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):
         frames = tuple(replace(frame, state=_of_roots(frame.state, instruments, parsed)) for frame in frames)
         instruments = tuple(
@@ -53,6 +55,16 @@ def capture_of(parsed: Parsed) -> Capture:
     return Capture(parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens)
 
 
+def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:
+    """The state with every joint that nobody recorded half way between its limits."""
+    filled = dict(state.instruments)
+    for item in instruments:
+        if item.unrecorded and item.name in filled:
+            halfway = {joint: item.halfway(joint) for joint in item.unrecorded}
+            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **halfway})
+    return replace(state, instruments=filled)
+
+
 def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -> State:
     """The state with poses of any other link of an instrument made those of its root, by its kinematics as stated."""
     moved = dict(state.instruments)
@@ -60,7 +72,7 @@ def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -
         tree, given = item.kinematics, state.instruments.get(item.name)
         if tree is None or tree.pose_of is None or given is None:
             continue
-        if missing := [name for name in tree.readings if name not in given.joints]:
+        if missing := [name for name in sorted(tree.readings_of(tree.pose_of)) if name not in given.joints]:
             raise NeecoError(
                 f"{parsed.root}: kinematics of {item.name}: reading {missing[0]!r} is missing in a frame; run `neeco "
                 "check` on the capture"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +106,21 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
             continue
         name = item.child("name").text()
         joints: dict[str, Limits] = {}
+        unrecorded = []
         for joint, node in (_joint_nodes(item) or {}).items():
-            has_limits = node.value is not None and node.is_object() and node.has("limits")
+            is_object = node.value is not None and node.is_object()
+            has_limits = is_object and node.has("limits")
             joints[joint] = node.child("limits").range("rad") if has_limits else None
+            if is_object and _is_unrecorded(node):
+                unrecorded.append(joint)
+                if not has_limits:
+                    node.child("limits").error("is missing", "state between which values to look for the joint")
         if name is None:
             continue
         if name in instruments:
             item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
         tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
-        instruments[name] = Instrument(name, joints, tree)
+        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded))
     return tuple(instruments.values())
 
 
@@ -126,8 +132,21 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
             known = joints.setdefault(name, {})
             for joint in state.joints:
                 known.setdefault(joint, None)
-    trees = {item.name: item.kinematics for item in declared}
-    return tuple(Instrument(name, limits, trees.get(name)) for name, limits in joints.items())
+    stated = {item.name: item for item in declared}
+    return tuple(
+        replace(stated[name], joints=limits) if name in stated else Instrument(name, limits)
+        for name, limits in joints.items()
+    )
+
+
+def _is_unrecorded(joint: Node) -> bool:
+    """Whether a joint of the header says `"recorded": false`."""
+    if not joint.has("recorded"):
+        return False
+    recorded = joint.child("recorded")
+    if not isinstance(recorded.value, bool):
+        recorded.error(f"expected true or false, found {printable(recorded.value)}", "correct it")
+    return recorded.value is False
 
 
 def _joint_nodes(item: Node) -> dict[str, Node] | None:
@@ -164,8 +183,11 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
     pose = None if camera.value is None else camera.rigid()
     # in the scene's order, so that files list them in one order, without joints that the scene does not have
     states = {
-        name: InstrumentState(given[name].pose, {joint: given[name].joints[joint] for joint in known[name].joints})
-        for name in known
+        name: InstrumentState(
+            given[name].pose,
+            {joint: given[name].joints.get(joint, item.halfway(joint)) for joint in item.joints},
+        )
+        for name, item in known.items()
     }
     return StateLine(State(states, time or 0.0), None if pose is None else swap_camera_axes(pose))
 
@@ -173,8 +195,8 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument]) -> Sta
 def _check_joints(item: Node, instrument: Instrument) -> None:
     """Refuse a state without one of its instrument's joints, or with one outside its limits."""
     joints = item.child("joints")
-    if not all(joints.has(joint) for joint in instrument.joints):
+    if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
         joints.error(f"expected these joints, in rad: {', '.join(instrument.joints)}")
     for joint, limits in instrument.joints.items():
-        if passes_limits(joints.value[joint], limits):
+        if joints.has(joint) and passes_limits(joints.value[joint], limits):
             joints.child(joint).error(f"{joints.value[joint]:.4g} rad is outside its limits {list(limits or ())}")

@@ -63,7 +63,8 @@ def write_capture(
         header["lens"] = capture.lens.to_json()
     pixels = [None] * len(names) if images is None else images
     header["frames"] = [
-        _write_frame(frame, name, path, image) for frame, name, image in zip(capture.frames, names, pixels, strict=True)
+        _write_frame(frame, name, path, image, capture.instruments)
+        for frame, name, image in zip(capture.frames, names, pixels, strict=True)
     ]
     if capture.points.measured:
         write_ply(path / "sparse.ply", capture.points)
@@ -92,7 +93,7 @@ def fingerprint(capture: Capture) -> str:
     digest.update(json.dumps([instruments, capture.registered, capture.timed]).encode())
     for item in capture.instruments:
         if item.kinematics is not None:  # captures without keep the fingerprint that older versions noted
-            digest.update(json.dumps(item.kinematics.to_json()).encode())
+            digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
     if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     for numbers in (capture.points.positions, capture.points.colors):
@@ -101,7 +102,11 @@ def fingerprint(capture: Capture) -> str:
 
 
 def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
-    joints = {joint: {} if limits is None else {"limits": list(limits)} for joint, limits in instrument.joints.items()}
+    joints: dict[str, dict[str, Any]] = {
+        joint: {} if limits is None else {"limits": list(limits)} for joint, limits in instrument.joints.items()
+    }
+    for joint in instrument.unrecorded:
+        joints[joint]["recorded"] = False
     written = {"name": instrument.name, "joints": joints}
     return written if instrument.kinematics is None else written | {"kinematics": instrument.kinematics.to_json()}
 
@@ -120,15 +125,20 @@ def _names(capture: Capture) -> list[str]:
     return names
 
 
-def _write_frame(frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None) -> dict[str, Any]:
+def _write_frame(
+    frame: Frame, name: str, path: Path, image: Tensor | np.ndarray | None, known: Sequence[Instrument]
+) -> dict[str, Any]:
     """Write a frame's files and return its JSON."""
     camera = frame.camera
+    unrecorded = {(item.name, joint) for item in known for joint in item.unrecorded}
     world_from_camera = _rigid(camera.world_from_camera, f"{frame.image_path}: world_from_camera")
     instruments = [
         {
             "name": instrument,
             "pose": _rigid(state.pose, f"{frame.image_path}: {instrument}: pose").tolist(),
-            "joints": {joint: _number(value) for joint, value in state.joints.items()},
+            "joints": {
+                joint: _number(value) for joint, value in state.joints.items() if (instrument, joint) not in unrecorded
+            },
         }
         for instrument, state in frame.state.instruments.items()
     ]

@@ -66,6 +66,16 @@ class _Level:
 
 
 @dataclass(frozen=True)
+class _Joint:
+    """A reading that is fitted."""
+
+    instrument: str
+    reading: str
+    slides: bool
+    spread: float | None  # rad or mm, of one that nobody recorded
+
+
+@dataclass(frozen=True)
 class _Problem:
     """What is fitted: one increment of 6 numbers per instrument, in the instrument's frame, then of every reading in
     stated kinematics, then one of 6 for the camera."""
@@ -73,7 +83,7 @@ class _Problem:
     scene: Scene
     state: State
     names: tuple[str, ...]
-    joints: tuple[tuple[str, str, bool], ...]  # instrument, reading, whether it slides
+    joints: tuple[_Joint, ...]
     config: AlignConfig
 
     @property
@@ -82,14 +92,15 @@ class _Problem:
         config = self.config
         instrument = [config.sigma_instrument_deg * torch.pi / 180] * 3 + [config.sigma_instrument_mm] * 3
         joints = [
-            config.sigma_joint_mm if slides else config.sigma_joint_deg * torch.pi / 180 for _, _, slides in self.joints
+            joint.spread or (config.sigma_joint_mm if joint.slides else config.sigma_joint_deg * torch.pi / 180)
+            for joint in self.joints
         ]
         camera = [config.sigma_camera_deg * torch.pi / 180] * 3 + [config.sigma_camera_mm] * 3
         return torch.tensor(instrument * len(self.names) + joints + camera, dtype=torch.float64)
 
     def steps(self, level: _Level) -> Tensor:
         """Finite difference of every parameter, [P]."""
-        joints = [level.step[3 if slides else 0] for _, _, slides in self.joints]
+        joints = [level.step[3 if joint.slides else 0] for joint in self.joints]
         return torch.cat([*[level.step] * len(self.names), torch.tensor(joints, dtype=torch.float64), level.step])
 
     @property
@@ -105,10 +116,10 @@ class _Problem:
             given = instruments[name]
             increment = rigid_from_vector(parameters[6 * index : 6 * index + 6])
             instruments[name] = replace(given, pose=given.pose.double() @ increment)
-        for (name, reading, _), change in zip(self.joints, parameters[6 * len(self.names) : -6], strict=True):
-            given = instruments[name]
-            joints = {**given.joints, reading: given.joints[reading] + float(change)}
-            instruments[name] = replace(given, joints=joints)
+        for joint, change in zip(self.joints, parameters[6 * len(self.names) : -6], strict=True):
+            given = instruments[joint.instrument]
+            joints = {**given.joints, joint.reading: given.joints[joint.reading] + float(change)}
+            instruments[joint.instrument] = replace(given, joints=joints)
         return replace(self.state, instruments=instruments)
 
     def moved_camera(self, camera: Camera, parameters: Tensor) -> Camera:
@@ -147,7 +158,8 @@ def fit_frame(
     """
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)
-    problem, mask = _Problem(scene, frame.state, names, _stated_joints(scene, names), config), frame.load_mask()
+    state = scene.recorded.with_unrecorded(frame.state, scene.instruments)
+    problem, mask = _Problem(scene, state, names, _stated_joints(scene, names), config), frame.load_mask()
     largest = min(1.0, math.sqrt(config.max_pixels / (frame.camera.width * frame.camera.height)))
     levels = [_level(frame.camera, image, mask, factor, largest, config) for factor in config.levels]
     increments = torch.zeros(len(problem.sigmas), dtype=torch.float64)
@@ -162,14 +174,17 @@ def fit_frame(
     return Fit(problem.moved_state(increments), problem.moved_camera(frame.camera, increments), increments)
 
 
-def _stated_joints(scene: Scene, names: tuple[str, ...]) -> tuple[tuple[str, str, bool], ...]:
-    """(instrument, reading, whether it slides) of every reading in stated kinematics."""
-    return tuple(
-        (item.name, reading, item.slides(reading))
-        for item in scene.instruments
-        if item.kinematics is not None and item.name in names
-        for reading in item.kinematics.readings
-    )
+def _stated_joints(scene: Scene, names: tuple[str, ...]) -> tuple[_Joint, ...]:
+    """Every reading in stated kinematics; of those that nobody recorded a quarter of their limits is their spread."""
+    found = []
+    for item in scene.instruments:
+        if item.kinematics is None or item.name not in names:
+            continue
+        for reading in item.kinematics.readings:
+            limits = item.joints[reading] if reading in item.unrecorded else None
+            spread = None if limits is None else (limits[1] - limits[0]) / 4
+            found.append(_Joint(item.name, reading, item.slides(reading), spread))
+    return tuple(found)
 
 
 def _level(

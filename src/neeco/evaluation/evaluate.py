@@ -144,7 +144,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
     recorded = _Recorded(image, mask, reference, unobserved, tissue, features)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
-        state, camera = frame.state, frame.camera
+        state, camera = scene.recorded.with_unrecorded(frame.state, scene.instruments), frame.camera
         if kind == "aligned":
             fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
             state, camera = fit.state, fit.camera

@@ -9,13 +9,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neeco.capture.lens import Lens
-from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
+from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, RecordedStates, State
 from neeco.raster.types import Rendering
 from neeco.scene.articulation import JointMotion
+
+BESIDE = 4  # training frames beside one of which a joint is not known
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,26 @@ class Recorded:
             states.append(State(chosen, frame.state.time))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
         return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens, scale)
+
+    def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
+        """A state of the recording with joints that nobody recorded as they were found at the training frames beside
+        it: nearest by pose, then by time."""
+        if not any(item.unrecorded for item in instruments) or not self.states:
+            return state
+        filled = dict(state.instruments)
+        for item in instruments:
+            if not item.unrecorded or item.name not in filled:
+                continue
+            far = RecordedStates(self.states, [item.name], joints=False).distances(state)
+            far = far + np.abs([state.time - other.time for other in self.states])
+            nearest = np.argsort(far, kind="stable")[:BESIDE]
+            shares = 1 / (far[nearest] + 1e-6)
+            found = {}
+            for joint in item.unrecorded:
+                values = [self.states[k].instruments[item.name].joints[joint] for k in nearest]
+                found[joint] = float(np.average(values, weights=shares))
+            filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **found})
+        return replace(state, instruments=filled)
 
     def as_learned(self, camera: Camera) -> Camera:
         """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs

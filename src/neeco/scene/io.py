@@ -177,9 +177,10 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
 
 def _described(instrument: Instrument) -> dict[str, Any]:
     """For the header; `_instrument` reads it."""
-    described = {"name": instrument.name, "joints": dict(instrument.joints)}
+    described: dict[str, Any] = {"name": instrument.name, "joints": dict(instrument.joints)}
     tree = instrument.kinematics
-    return described if tree is None else described | {"kinematics": tree.to_json()}
+    described |= {} if tree is None else {"kinematics": tree.to_json()}
+    return described | ({"unrecorded": list(instrument.unrecorded)} if instrument.unrecorded else {})
 
 
 def _instrument(entry: dict[str, Any]) -> Instrument:
@@ -187,7 +188,10 @@ def _instrument(entry: dict[str, Any]) -> Instrument:
     tree = kinematics_of(entry["kinematics"], "header") if "kinematics" in entry else None
     if tree is not None and not set(tree.readings) <= set(joints):
         raise ValueError("its kinematics take readings that are not joints of it")
-    return Instrument(entry["name"], joints, tree)
+    unrecorded = tuple(entry.get("unrecorded", ()))
+    if not set(unrecorded) <= set(joints):
+        raise ValueError("its unrecorded joints are no joints of it")
+    return Instrument(entry["name"], joints, tree, unrecorded)
 
 
 def _number(value: Any) -> float:

@@ -114,7 +114,9 @@ def _learned_instrument(
             f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
             "recorded readings, or train with --set deformation.kinematics=false"
         )
-    return replace(instrument, joints={reading: instrument.joints[reading] for reading in tree.readings})
+    unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
+    joints = {reading: instrument.joints[reading] for reading in tree.readings}
+    return replace(instrument, joints=joints, unrecorded=unrecorded)
 
 
 def moving_joints(
@@ -139,6 +141,9 @@ def moving_joints(
     design = np.column_stack([distinct - distinct.mean(0), np.ones(len(distinct))])
     moving = []
     for joint in instrument.joints:
+        if joint in instrument.unrecorded:
+            report(f"{instrument.name}: joint {joint} is not recorded; only with its kinematics can it be found")
+            continue
         reading = np.array([states[i].joints[joint] for i in first])
         spread = reading.var()
         fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]

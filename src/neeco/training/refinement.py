@@ -5,6 +5,7 @@ The constant tracker-to-world correction is the scene's own (`Scene.registration
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -15,17 +16,20 @@ from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, Stat
 from neeco.raster.optimizer import adam_update
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene.deformations.base import log_linear
+from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
 
 LEARNED = ("poses", "joints", "cameras", "latency")
+SMOOTH_S = 1.0  # s between instants that tell something of each other
 STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
 
 
 class Refinement:
     """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
 
-    Readings of joints in stated kinematics are corrected in rad or mm. Tensors: `poses` [F, I, 6], `joints` [F, R],
-    `cameras` [F, 6], `latency` [1].
+    Readings of joints in stated kinematics are corrected in rad or mm, those that nobody recorded are found from half
+    way between their limits on: once for frames of one instant, as several cameras see it, and smooth in time.
+    Tensors: `poses` [F, I, 6], `joints` [instants, R], `cameras` [F, 6], `latency` [1].
     """
 
     def __init__(
@@ -35,7 +39,12 @@ class Refinement:
         self.instruments = names = tuple(instrument.name for instrument in instruments)
         trees = [(item.name, item.kinematics) for item in instruments if item.kinematics is not None]
         self.readings = tuple((name, reading) for name, tree in trees for reading in tree.readings)
-        self.joints = torch.zeros(len(frames), len(self.readings), device=device)
+        missing = {(item.name, reading) for item in instruments for reading in item.unrecorded}
+        self.unrecorded = torch.tensor(
+            [reading in missing for reading in self.readings], dtype=torch.bool, device=device
+        )  # [R]
+        self.instants, self.beside = _instants(frames, names)
+        self.joints = torch.zeros(len(self.beside), len(self.readings), device=device)
         self.poses = torch.zeros(len(frames), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
@@ -43,10 +52,11 @@ class Refinement:
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),
-            "joints": torch.tensor(config.joint_rate, device=device),
+            "joints": torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
+        self.joint_sigma = torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
         self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
         self.moments = {
             f"{order}.{name}": torch.zeros_like(getattr(self, name))
@@ -76,8 +86,10 @@ class Refinement:
                 given = state.instruments[name]
                 moved[name] = InstrumentState(given.pose.to(offset) @ rigid_from_vector(offset[k]), given.joints)
             if self.config.frame_joints and self.readings:
-                leaf = self._leaves["joints"] = self.joints[index].clone().requires_grad_()
-                joint_penalty = self._prior(leaf, leaf.new_full((), self.config.prior_joint))
+                instant = self.instants[index]
+                leaf = self._leaves["joints"] = self.joints[instant].clone().requires_grad_()
+                expected = torch.where(self.unrecorded, self.joints[self.beside[instant]].mean(0), 0.0)
+                joint_penalty = self._prior(leaf - expected, self.joint_sigma)
                 penalty = joint_penalty if penalty is None else penalty + joint_penalty
                 for (name, reading), change in zip(self.readings, leaf, strict=True):
                     corrected_reading: Any = moved[name].joints[reading] + change
@@ -109,6 +121,8 @@ class Refinement:
             row, steps = (
                 (slice(None), self.frame_steps.sum()) if name == "latency" else (index, self.frame_steps[index])
             )
+            if name == "joints":
+                row = self.instants[index]
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
             update = adam_update(leaf.grad, first, second, float(steps), (0.9, 0.99), 1e-12)
             getattr(self, name)[row] -= decay * self.rates[name] * update
@@ -121,8 +135,25 @@ class Refinement:
         seen = (self.frame_steps > 0).nonzero()[:, 0].to(self.poses.device)
         if len(seen):
             self.poses[seen] -= self.poses[seen].mean(0)
-            self.joints[seen] -= self.joints[seen].mean(0)
+            self.joints -= self.joints.mean(0)
             self.cameras[seen] -= self.cameras[seen].mean(0)
+
+    def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
+        """The recording with joints that nobody recorded as they were found, within their limits."""
+        if not bool(self.unrecorded.any()):
+            return recorded
+        states = list(recorded.states)
+        by_name = {item.name: item for item in instruments}
+        for index, state in enumerate(states):
+            moved = dict(state.instruments)
+            changes = self.joints[self.instants[index]].tolist()
+            for (name, reading), change in zip(self.readings, changes, strict=True):
+                if reading in by_name[name].unrecorded:
+                    low, high = by_name[name].joints[reading] or (-math.inf, math.inf)
+                    value = min(max(by_name[name].halfway(reading) + change, low), high)
+                    moved[name] = replace(moved[name], joints={**moved[name].joints, reading: value})
+            states[index] = replace(state, instruments=moved)
+        return replace(recorded, states=tuple(states))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that changes, for a checkpoint."""
@@ -136,6 +167,22 @@ class Refinement:
         for name in STATE:
             setattr(self, name, tensors[name].cpu() if name == "frame_steps" else tensors[name])
         self.moments = {name: tensors[name] for name in self.moments}
+
+
+def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[list[int], list[list[int]]]:
+    """(which instant each frame shows, the instants beside each): frames of one time and one set of poses show one
+    instant; those beside follow or precede it in the recording within SMOOTH_S, itself where none does."""
+    numbers: dict[tuple[object, ...], int] = {}
+    shown: list[int] = []
+    times: list[float] = []
+    for frame in frames:
+        poses = [frame.state.instruments[name].pose.double().numpy().tobytes() for name in instruments]
+        number = numbers.setdefault((frame.state.time, *poses), len(numbers))
+        times += [frame.state.time] if number == len(times) else []
+        shown.append(number)
+    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < SMOOTH_S] or [i]
+            for i, t in enumerate(times)]  # fmt: skip
+    return shown, near
 
 
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:

@@ -32,14 +32,16 @@ class StatedLinks(Articulation):
 
     Joint j, of those of the tree that share an axis, turns about that axis (or slides along it): `axis_turns[j]` (rad)
     turns the stated axis and `axis_shifts[j]` (mm) shifts its pivot, in the root's frame at rest. A reading r counts as
-    `(1 + reading_gains[r]) * (reading - reading_offsets[r])`, offsets in rad or mm. Links that do not move against each
-    other are one, called like the first of them.
+    `(1 + reading_gains[r]) * (reading - reading_offsets[r])`, offsets in rad or mm. Of readings that move no other axis
+    no offset is learned: it would be the same as links of another shape. Links that do not move against each other are
+    one, called like the first of them.
     """
 
     points: Tensor  # [J, 3] mm, on the stated axes at rest, outermost first
     directions: Tensor  # [J, 3] unit
     gains: Tensor  # [J, L - 1, R] value of joint j for link l per unit of reading r
     constants: Tensor  # [J, L - 1] value at readings of 0
+    observable: Tensor  # [R] 1 where a reading's offset shows in axes that it moves, else 0
     tips: Tensor  # [L, 3] mm, at rest; nan: not measured, or another link follows
     rates: ClassVar[Mapping[str, float]] = {
         **Articulation.rates,
@@ -76,6 +78,9 @@ class StatedLinks(Articulation):
         self.axis_shifts = nn.Parameter(torch.zeros(len(first), 3))
         self.reading_offsets = nn.Parameter(torch.zeros(len(tree.readings)))
         self.reading_gains = nn.Parameter(torch.zeros(len(tree.readings)))
+        moving = {self._inner_joint(j) for j in range(len(first))}
+        carries = [any(bool(gains[j, :, r].any()) for j in moving if j >= 0) for r in range(len(tree.readings))]
+        self.register_buffer("observable", torch.tensor(carries, dtype=torch.float32), persistent=False)
         self._pivot_names = [_common_name([link.name for link in group]) for group in self.joint_groups]
         self._ends = [k for k, link in enumerate(links) if k and not any(o.parent == link.name for o in links)]
         self.skeleton = (("shaft_far", "shaft_near"), *self._bones())
@@ -124,7 +129,9 @@ class StatedLinks(Articulation):
 
     def values(self, readings: Mapping[str, float]) -> Tensor:
         given = torch.stack([torch.as_tensor(readings[name]).to(self.gains) for name in self.reading_names])
-        return self.constants + self.gains @ ((1 + self.reading_gains) * (given - self.reading_offsets))
+        return self.constants + self.gains @ (
+            (1 + self.reading_gains) * (given - self.observable * self.reading_offsets)
+        )
 
     def place(self, points: Tensor, link: int, readings: Mapping[str, float]) -> Tensor:
         """Points [M, 3] mm of one link at rest, as they stand at these readings, instrument frame."""
@@ -217,7 +224,7 @@ class StatedLinks(Articulation):
 
     def describe(self, reading: str) -> dict[str, Any]:
         """Of the outermost joint that the reading drives: axis and pivot at rest in the instrument's frame, and how far
-        they are from those stated; the reading's offset and gain."""
+        they are from those stated; the reading's offset (None: nothing shows it) and gain."""
         r = self.reading_names.index(reading)
         joint = next(j for j in range(len(self.points)) if bool(self.gains[j, :, r].any()))
         pivots, axes = self.axes()
@@ -230,7 +237,7 @@ class StatedLinks(Articulation):
             "pivot_mm": [round(float(v), 3) for v in pivots[joint]],
             "axis_moved_deg": round(float(turned), 3),
             "pivot_moved_mm": round(float(across.norm()), 3),
-            "offset": round(float(self.reading_offsets[r]), 5),
+            "offset": round(float(self.reading_offsets[r]), 5) if bool(self.observable[r]) else None,
             "gain": round(1 + float(self.reading_gains[r]), 5),
         }
 

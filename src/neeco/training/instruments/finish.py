@@ -34,6 +34,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
 
     Reports an instrument of which hardly anything was learned: its labels would stay empty without a message.
     """
+    session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     session.scene.canonical = drop_occluded(session.scene)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
@@ -73,7 +74,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     """
     scene = session.scene
     articulation, instrument = articulated.articulations[index], scene.instruments[index]
-    readings = torch.tensor([frame.state.instruments[instrument.name].joints[name] for frame in session.views.frames])
+    readings = torch.tensor([state.instruments[instrument.name].joints[name] for state in scene.recorded.states])
     ordered = readings.argsort()
     extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
     moving = _moving_weight(scene.canonical, articulated, index, name)
