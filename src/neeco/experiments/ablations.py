@@ -33,7 +33,8 @@ class AblationPlan:
     """Folder for tables, report.html and the runs."""
     tables: tuple[str, ...] = ("paper", "ours")
     """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, parts,
-    shadow, extrapolation, labels, frames, tracker-noise), or tables by name."""
+    shadow, extrapolation, labels, frames, tracker-noise), or tables by name; kinematics, of captures that state the
+    links of an instrument, by name only."""
     iterations: int = 1_000
     """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
     kinematic_iterations: int | None = None
@@ -108,7 +109,7 @@ class Ablation:
     """
 
     name: str
-    group: Literal["paper", "ours"]
+    group: Literal["paper", "ours", "links"]
     title: str
     question: str
     comparisons: tuple[Comparison, ...]
