@@ -455,3 +455,16 @@ def test_a_joint_that_nobody_recorded_stands_halfway_and_is_not_written(folder, 
 def test_a_joint_that_nobody_recorded_is_checked(folder, edit, field, words):
     folder.edit(edit)
     assert_found(folder, field, words)
+
+
+def test_a_reading_that_the_others_tell_is_said(folder):
+    def edit(document):
+        _tree(value={"jaw_angle": 1.0, "elbow": 0.5})(document)
+        frames = document["frames"] = [dict(frame) for frame in document["frames"] * 2]
+        for k, frame in enumerate(frames):
+            (state,) = frame["instruments"] = [dict(frame["instruments"][0])]
+            state["joints"] = {"jaw_angle": 0.1 * k, "elbow": 0.3 - 0.2 * k + 0.1 * (k % 3)}
+
+    folder.edit(edit)
+    assert_found(folder, "instruments", "joint 'elbow' of", "warning")
+    assert_found(folder, "instruments", "follows from the others (99", "warning")

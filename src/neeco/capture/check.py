@@ -9,6 +9,7 @@ import hashlib
 import math
 import os
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import torch
 from neeco.capture.check_geometry import check_geometry
 from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
 from neeco.capture.kinematics import KinematicTree
-from neeco.capture.model import STILL, Capture, Frame, Instrument
+from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.statefile import passes_limits
 from neeco.errors import NeecoError
@@ -28,6 +29,8 @@ from neeco.errors import NeecoError
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 FULL_TURN = 2 * math.pi
+COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
+MIN_COUPLED_STATES = 12  # fewer tell each other anyway
 
 
 @dataclass(frozen=True)
@@ -287,6 +290,7 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
         )
     known = set(tree.readings) - set(instrument.unrecorded)
     states = [state for _, state in parsed.states_of(instrument.name) if known <= set(state.joints)]
+    _check_coupling(parsed, name, sorted(known), states)
     for link in tree.links:
         if not set(link.value) <= known:
             continue
@@ -296,6 +300,23 @@ def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTre
             low, high = link.limits or (0.0, 0.0)
             message = f"joint of link {printable(link.name)} of {name}: {beyond[0]:g} in {len(beyond)} of {len(values)}"
             place.warning(f"{message} frames, outside its limits {low:g} .. {high:g}", "check its gains and offset")
+
+
+def _check_coupling(parsed: Parsed, name: str, known: Sequence[str], states: Sequence[InstrumentState]) -> None:
+    """Readings that the others tell: what they move cannot be told apart from what those move."""
+    if len(states) < MIN_COUPLED_STATES:
+        return
+    readings = np.array([[state.joints[joint] for joint in known] for state in states])  # [S, R]
+    readings = readings - readings.mean(0)
+    for index, joint in enumerate(known):
+        own, others = readings[:, index], np.delete(readings, index, 1)
+        if own.std() < STILL or not others.shape[1]:
+            continue
+        rest = own - others @ np.linalg.lstsq(others, own, rcond=1e-6)[0]
+        explained = 1 - rest.var() / own.var()
+        if explained > COUPLED:
+            message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
+            parsed.header("instruments").warning(message, "move joints one by one, too, or their axes mix")
 
 
 def _check_changes(parsed: Parsed) -> None:

@@ -22,7 +22,9 @@ PIVOT_SIGMA = 2.0  # mm
 OFFSET_SIGMA = {False: 0.1, True: 2.0}  # rad where the joint turns, mm where it slides
 GAIN_SIGMA = 0.03
 SIDE_LOGITS = 2.0  # for each link of a joint, per radius by which a Gaussian lies on the wrong side of it
-SIDE_AT = 0.4  # radii beyond the pivot: a link holds the next one between its prongs
+# radii beyond the pivot where sides change, and how much farther at the ends of its axis: a link holds the next one
+# between its prongs
+SIDE_AT, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
 MIN_STEP = 1.0  # mm between two pivots that tell a direction
 WRIST_WITHIN = 2.5  # radii behind the first joint in which the shaft's end is believed
 
@@ -96,7 +98,7 @@ class StatedLinks(Articulation):
     def _sides(self, points: Tensor) -> Tensor:
         """[M, L] logits, at most 0, of Gaussians at points [M, 3] mm."""
         sides = points.new_zeros(len(points), self.link_count)
-        pivots, _ = self.axes()
+        pivots, axes = self.axes()
         directions: dict[int, Tensor] = {}
         for joint in reversed(range(len(pivots))):  # the innermost first
             if self.slides[joint]:
@@ -106,7 +108,9 @@ class StatedLinks(Articulation):
             if inner in directions and float((step := pivots[joint] - pivots[inner]).norm()) > MIN_STEP:
                 directions[joint] = nn.functional.normalize(step, dim=0)
             along = (points - pivots[joint]) @ directions[joint]  # [M] mm
-            beyond = SIDE_LOGITS * (along / self.radius - SIDE_AT)
+            aside = ((points - pivots[joint]) @ axes[joint]).abs() / self.radius  # [M]
+            prongs = PRONGS * ((aside - PRONGS_FROM) / (PRONGS_TO - PRONGS_FROM)).clamp(0, 1)
+            beyond = SIDE_LOGITS * (along / self.radius - SIDE_AT - prongs)
             sides[:, 1:][:, self._moves(joint)] += beyond.clamp_max(0)[:, None]
             sides[:, self._link_of(self.joint_groups[joint][0].parent)] -= beyond.clamp_min(0)
         return sides
