@@ -26,6 +26,7 @@ TOLERANCE = 0.03  # of evidence, by which another link may be likelier
 # a carved shaft is believed where it agrees so well with the line of the links at rest
 MIN_COSINE = 0.85
 MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
+NEAR_BEST = 0.85  # of the best evidence that a point of a link has: stated axes may be off, and all points with them
 MIN_SEEN = 0.05  # share of the frames that must see a seed
 
 
@@ -120,7 +121,7 @@ def _on_link(
     likely, score = likely[fits], own[likely][fits]
     if not len(likely):  # nothing tells: about its pivot, for the training to sort out
         return points[:count] * 0 + centers[:1] + 0.5 * (points[:count] - centers[which[:count]])
-    best = likely[score >= min(POSSIBLE, 0.85 * float(score.max()))]
+    best = likely[score >= NEAR_BEST * float(score.max())]
     again = torch.randint(len(best), (max(0, count - len(best)),), generator=generator, device=generator.device)
     jitter = 0.1 * radius * torch.randn(len(again), 3, generator=generator, device=generator.device).to(points)
     order = torch.randperm(len(best), generator=generator, device=generator.device).to(device)[:count]

@@ -1,0 +1,102 @@
+"""Seeds lie on the links with which they must move to stay on evidence."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from evidence_world import make_evidence
+from torch import Tensor
+from wristed_world import shifted
+
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
+from neeco.scene.articulation.stated import StatedLinks
+from neeco.training.config import SearchConfig
+from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
+from neeco.training.instruments.link_seeds import along_links, start_links
+
+SEARCH = SearchConfig(seeds=600)
+PITCH_AT, YAW_AT, TIP, RADIUS = 4.0, 14.0, 30.0, 3.0  # mm along the shaft
+
+
+def driver_tree() -> KinematicTree:
+    jaws = (("jaw_left", 0.5), ("jaw_right", -0.5))
+    return KinematicTree(
+        (
+            Link("shaft"),
+            Link("wrist", "shaft", REVOLUTE, shifted(0, 0, PITCH_AT), np.array([0, 1.0, 0]), {"pitch": 1.0}),
+            *(
+                Link(name, "wrist", REVOLUTE, shifted(0, 0, YAW_AT - PITCH_AT), np.array([1.0, 0, 0]), {"jaw": gain})
+                for name, gain in jaws
+            ),
+        )
+    )
+
+
+def resting(link: str, count: int = 2500) -> Tensor:
+    """[P, 3] mm, of one link at rest."""
+    generator = torch.Generator().manual_seed(len(link))
+    near, far, radius = {"shaft": (-40, PITCH_AT, RADIUS), "wrist": (PITCH_AT, YAW_AT, 2.5)}.get(
+        link, (YAW_AT, TIP, 0.9)
+    )
+    turn, along, out = torch.rand(3, count, generator=generator)
+    out, turn = radius * out.sqrt(), 2 * torch.pi * turn
+    return torch.stack([out * turn.cos(), out * turn.sin(), near + (far - near) * along], -1)
+
+
+def driver(rng: np.random.Generator) -> tuple[dict[str, float], Tensor]:
+    readings = {"pitch": float(rng.uniform(-0.7, 0.7)), "jaw": float(rng.uniform(0.3, 1.4))}
+    links = StatedLinks(driver_tree()).requires_grad_(False)
+    return readings, torch.cat([links.place(resting(name), k, readings) for k, name in enumerate(links.part_names)])
+
+
+@pytest.fixture(scope="module")
+def carved() -> tuple[Evidence, CarvedShape]:
+    evidence = make_evidence(torch.eye(4, dtype=torch.float64), 60, instrument=driver)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
+    assert shape is not None
+    return evidence, shape
+
+
+def session() -> Any:
+    said: list[str] = []
+    return cast(Any, SimpleNamespace(config=SimpleNamespace(search=SEARCH), report=said.append, said=said))
+
+
+def started(carved: tuple[Evidence, CarvedShape]) -> StatedLinks:
+    links = StatedLinks(driver_tree()).requires_grad_(False)
+    links.base.copy_(carved[1].instrument_from_shaft)
+    links.radius.fill_(carved[1].radius)
+    return links
+
+
+def test_every_link_is_seeded_where_it_is(carved: tuple[Evidence, CarvedShape]) -> None:
+    links, generator = started(carved), torch.Generator().manual_seed(0)
+    seeds, logits = start_links(session(), links, carved[0], "tool", carved[1], 4, generator)
+    assert logits.shape == (len(seeds), 4)
+    owners = logits.argmax(1)
+    for k, (near, far) in enumerate(((-45, PITCH_AT), (PITCH_AT, YAW_AT), (YAW_AT, TIP), (YAW_AT, TIP))):
+        own = seeds[owners == k]
+        assert len(own) > 80
+        along, away = own[:, 2], own[:, :2].norm(dim=1)
+        inside = (along > near - 4) & (along < far + 4) & (away < 2 * RADIUS)
+        assert float(inside.float().mean()) > 0.7, links.part_names[k]
+        assert near - 2 < float(along.median()) < far + 2
+
+
+def test_a_carved_line_is_kept_where_the_links_agree_and_else_theirs_is_taken(
+    carved: tuple[Evidence, CarvedShape],
+) -> None:
+    evidence, shape = carved
+    links, kept, told = started(carved), session(), session()
+    assert along_links(kept, links, evidence, "tool", shape, torch.Generator().manual_seed(0)) is shape
+    astray = CarvedShape(**vars(shape) | {"instrument_from_shaft": torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))})
+    again = along_links(told, links, evidence, "tool", astray, torch.Generator().manual_seed(0))
+    assert told.said
+    assert not kept.said
+    assert float(again.instrument_from_shaft[2, 2]) > 0.99
+    assert again.near < -20 < PITCH_AT < again.tip
+    assert float(again.seeds[:, :2].norm(dim=1).median()) < 2 * RADIUS
