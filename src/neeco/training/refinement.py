@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -135,24 +136,34 @@ class Refinement:
         seen = (self.frame_steps > 0).nonzero()[:, 0].to(self.poses.device)
         if len(seen):
             self.poses[seen] -= self.poses[seen].mean(0)
-            self.joints -= self.joints.mean(0)
+            self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             self.cameras[seen] -= self.cameras[seen].mean(0)
+
+    @torch.no_grad()
+    def start_unrecorded(self, instrument: Instrument, reading: str, frames: dict[int, float]) -> None:
+        """Begin with these values of a joint that nobody recorded, by frame; instants between them in proportion."""
+        column = self.readings.index((instrument.name, reading))
+        known = {self.instants[index]: value - instrument.halfway(reading) for index, value in frames.items()}
+        places = sorted(known)
+        values = np.interp(range(len(self.joints)), places, [known[place] for place in places])
+        self.joints[:, column] = torch.from_numpy(values).to(self.joints)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """The recording with joints that nobody recorded as they were found, within their limits."""
         if not bool(self.unrecorded.any()):
             return recorded
         states = list(recorded.states)
-        by_name = {item.name: item for item in instruments}
-        for index, state in enumerate(states):
-            moved = dict(state.instruments)
-            changes = self.joints[self.instants[index]].tolist()
-            for (name, reading), change in zip(self.readings, changes, strict=True):
-                if reading in by_name[name].unrecorded:
-                    low, high = by_name[name].joints[reading] or (-math.inf, math.inf)
-                    value = min(max(by_name[name].halfway(reading) + change, low), high)
-                    moved[name] = replace(moved[name], joints={**moved[name].joints, reading: value})
-            states[index] = replace(state, instruments=moved)
+        for item in instruments:
+            for reading in item.unrecorded:
+                column = self.readings.index((item.name, reading))
+                low, high = item.joints[reading] or (-math.inf, math.inf)
+                for index, instant in enumerate(self.instants):
+                    given = states[index].instruments[item.name]
+                    value = min(max(item.halfway(reading) + float(self.joints[instant, column]), low), high)
+                    changed = replace(given, joints={**given.joints, reading: value})
+                    states[index] = replace(
+                        states[index], instruments={**states[index].instruments, item.name: changed}
+                    )
         return replace(recorded, states=tuple(states))
 
     def tensors(self) -> dict[str, Tensor]:

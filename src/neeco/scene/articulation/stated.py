@@ -161,6 +161,20 @@ class StatedLinks(Articulation):
         half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + beside for j in beyond])
         return middle, half
 
+    def sticks(self, reading: str, reach: float) -> list[tuple[int, Tensor]]:
+        """(link, points [Q, 3] mm at rest) of every outermost link that a reading moves: from its pivot on along the
+        links behind it, to half of `reach`."""
+        pivots, _ = self.axes()
+        line = self.rest_line()
+        direction = self.shaft()[1] if line is None else line[1]
+        along = torch.linspace(0.15, 0.5, 12, device=pivots.device)[:, None] * reach
+        found = []
+        for link in self._ends:
+            joint = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
+            if bool(self.gains[:, link - 1, self.reading_names.index(reading)].any()):
+                found.append((link, pivots[joint] + along * direction))
+        return found
+
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
         """The pivot of every joint, `pivot_` and the name of what it moves, and the tip of every link that none
         follows, `tip_` and its name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -11,6 +12,7 @@ from neeco.training.instruments.evidence import (
     CarvedShape,
     Evidence,
     PosedViews,
+    camera_from_instrument,
     carve_along,
     frame_along,
     posed_views,
@@ -27,6 +29,8 @@ TOLERANCE = 0.03  # of evidence, by which another link may be likelier
 MIN_COSINE = 0.85
 MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
 NEAR_BEST = 0.85  # of the best evidence that a point of a link has: stated axes may be off, and all points with them
+STICK_VALUES = 17  # tried of a joint that nobody recorded, between its limits
+STICK_STEP, STICK_SMOOTH = 0.15, 0.2  # share of them that a joint may move from frame to frame at little cost
 MIN_SEEN = 0.05  # share of the frames that must see a seed
 
 
@@ -71,8 +75,9 @@ def start_links(
     A point belongs to the link with which it must move to stay on evidence.
     """
     search = session.config.search
+    find_unrecorded(session, links, evidence, name, shape.radius)
     links.wrist_start.fill_(float(links.first_joint()) - shape.radius)
-    moved = link_motions(links, evidence, name)  # [F, L, 4, 4]
+    moved = link_motions(links, readings_of(session, evidence, name))  # [F, L, 4, 4]
     views = [posed_views(evidence, name, search, moved[:, k]) for k in range(links.link_count)]
     behind = links.along_shaft(shape.seeds) < links.first_joint()
     of_shaft = shape.seeds[behind] if bool(behind.any()) else shape.seeds
@@ -89,19 +94,70 @@ def start_links(
     return points, logits + LINK_LOGIT * nn.functional.one_hot(owner, columns)
 
 
-def link_motions(links: StatedLinks, evidence: Evidence, name: str) -> Tensor:
+def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list[dict[str, float]]:
+    """The readings of every frame of the evidence; of joints that nobody recorded as found so far."""
+    recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
+    by_name = dict(zip(recorded.names, recorded.states, strict=True))
+    return [dict(by_name[frame.name].instruments[name].joints) for frame in evidence.frames]
+
+
+def find_unrecorded(session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float) -> None:
+    """Begin every joint that nobody recorded where the links that it moves, as sticks along the chain at rest, stay on
+    evidence, smooth in time (Viterbi 1967)."""
+    instrument = next(item for item in session.scene.instruments if item.name == name)
+    frame_numbers = {frame.name: index for index, frame in enumerate(session.full_views.frames)}
+    for reading in instrument.unrecorded:
+        limits = instrument.joints[reading]
+        assert limits is not None
+        values = np.linspace(*limits, STICK_VALUES)
+        readings = readings_of(session, evidence, name)
+        sticks = links.sticks(reading, REACH_RADII * radius)
+        camera_from_instrument_of = camera_from_instrument(evidence, name)  # [F, 4, 4]
+        scores = np.zeros((len(readings), len(values)))
+        for k, value in enumerate(values):
+            points = torch.stack(
+                [
+                    torch.cat([links.place(own, link, {**given, reading: float(value)}) for link, own in sticks])
+                    for given in readings
+                ]
+            )  # [F, Q, 3]
+            rotation, shift = camera_from_instrument_of[:, :3, :3], camera_from_instrument_of[:, None, :3, 3]
+            hits, inside = evidence.look_up_camera(points @ rotation.transpose(1, 2) + shift)
+            scores[:, k] = ((hits * inside).sum(1) / inside.sum(1).clamp_min(1)).cpu().numpy()
+        path = _smooth_path(scores, values, (limits[1] - limits[0]) * STICK_STEP)
+        found = {frame_numbers[frame.name]: value for frame, value in zip(evidence.frames, path, strict=True)}
+        session.refinement.start_unrecorded(instrument, reading, found)
+
+
+def _smooth_path(scores: np.ndarray, values: np.ndarray, sigma: float) -> list[float]:
+    """The values [F] of most evidence `scores` [F, V], in the order of the frames, that move by about `sigma` from one
+    to the next."""
+    steps = (STICK_SMOOTH * (values[:, None] - values[None]) / sigma) ** 2  # [V, V]
+    best, came = scores[0], []
+    for own in scores[1:]:
+        through = best[None] - steps  # [to, from]
+        came.append(through.argmax(1))
+        best = own + through.max(1)
+    place = int(best.argmax())
+    path = [place]
+    for before in reversed(came):
+        place = int(before[place])
+        path.append(place)
+    return [float(values[k]) for k in reversed(path)]
+
+
+def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor:
     """[F, L, 4, 4] instrument frame: how every link has moved from rest at each frame's readings."""
     frame = torch.eye(4, device=links.points.device)[:, :3]  # origin and axes, as points
     corners = torch.cat([frame[3:4], frame[:3]])  # [4, 3]
     moved = []
-    for given in evidence.frames:
-        joints = given.state.instruments[name].joints
+    for joints in readings:
         for link in range(links.link_count):
             origin, *ends = links.place(corners, link, joints)
             rigid = torch.eye(4, device=corners.device)
             rigid[:3, :3], rigid[:3, 3] = torch.stack(ends, 1) - origin[:, None], origin
             moved.append(rigid)
-    return torch.stack(moved).reshape(len(evidence.frames), links.link_count, 4, 4)
+    return torch.stack(moved).reshape(len(readings), links.link_count, 4, 4)
 
 
 def _on_link(
