@@ -14,7 +14,7 @@ from neeco.settings import Device
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write a run's scene in one state as a file that other viewers of Gaussians open. They know neither hinges nor
+    """Write a run's scene in one state as a file that other viewers of Gaussians open. They know neither joints nor
     lamps nor labels: nothing moves there, and the light is that of one camera."""
 
     run: tyro.conf.Positional[Path]
@@ -45,5 +45,5 @@ def run(arguments: Arguments) -> int:
         splats = splats_of(scene, *exported_state(scene, arguments.frame, arguments.states))
     output = arguments.output or arguments.run / f"scene.{arguments.format}"
     write_splats(splats, output, arguments.format)
-    print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without hinges and labels")
+    print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without joints and labels")
     return 0

@@ -64,7 +64,7 @@ LABELS_FILE = "label_ways.json"
 MIN_WARM_UP_STEPS = 100  # with the network off: trained on a nearly empty image it moves Gaussians out of sight
 MAX_WARM_UP = 0.25  # share of the run
 INITIAL_SHARE = 0.25  # of the tissue's budget: density control can only differ where it has room to grow
-MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and hinges to learn after 600
+MIN_KINEMATIC_STEPS = 1_000  # steps: the shaft starts to spin and joints to learn after 600
 EVEN_DB = 0.1  # smaller differences do not count as a direction
 RENAMED_TABLES = {"rim": "extrapolation"}
 FINAL_SCORES = ("psnr", "psnr_instrument", "mask_iou")
@@ -264,7 +264,7 @@ def _shortcomings(method: str, steps: int, log_interval: int) -> list[str]:
         )
     if method == "kinematic" and steps < MIN_KINEMATIC_STEPS:
         notes.append(
-            f"kinematic: {steps} steps are few: hinges begin to learn and the shaft to spin after 600, labels to "
+            f"kinematic: {steps} steps are few: joints begin to learn and the shaft to spin after 600, labels to "
             f"sharpen after 1,000; give --kinematic-iterations {MIN_KINEMATIC_STEPS} or more"
         )
     return notes

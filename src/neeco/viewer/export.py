@@ -1,7 +1,7 @@
 """`neeco view RUN --export FILE.html`: one file that carries the scene and draws it, without server, network or GPU.
 
 The scene is packed as `neeco-page/1` (docs/viewer.md): every number of a Gaussian becomes a plane of its own, low bytes
-before high ones, so that deflate finds the likeness of neighbours. What moves rigidly about hinges can be packed; what
+before high ones, so that deflate finds the likeness of neighbours. What joints move can be packed; what
 a network moves cannot.
 """
 

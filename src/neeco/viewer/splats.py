@@ -1,6 +1,6 @@
 """`neeco export`: a scene in one state, as files that other viewers of Gaussians open.
 
-They know neither hinges nor lamps nor labels: instruments stand still, and the light is baked into the colours as one
+They know neither joints nor lamps nor labels: instruments stand still, and the light is baked into the colours as one
 camera has it. Coordinates are those of the capture's world (mm); viewers take their own view of which way is up.
 """
 
