@@ -130,6 +130,16 @@ class Articulation(nn.Module):
         """Logits [M, link_count or more] with what the places [M, 3] mm of Gaussians say of them."""
         return logits
 
+    def misplaced(self, points: Tensor, weights: Tensor) -> Tensor | None:
+        """[M] at least 0: how far Gaussians at points [M, 3] mm with link weights [M, link_count] belong to links that
+        their places speak against; None where places say nothing."""
+        return None
+
+    def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """([M] shares of Gaussians that look like the shaft's surface, by their link weights; [] mm along the shaft as
+        far as they do)."""
+        return weights[:, 0], self.first_joint()
+
     def longest(self, weights: Tensor) -> Tensor:
         """[M, 1] mm: largest standard deviation of Gaussians by their link weights [M, link_count]; what does not move
         is not limited."""

@@ -25,8 +25,9 @@ SIDE_LOGITS = 2.0  # for each link of a joint, per radius by which a Gaussian li
 # radii beyond the pivot where sides change, and how much farther at the ends of its axis: a link holds the next one
 # between its prongs
 SIDE_AT, PRONGS, PRONGS_FROM, PRONGS_TO = 0.4, 0.7, 0.3, 0.7  # the ends: radii along the axis
+MOST_SIDE = 4.0  # of the logits that count in a penalty
 MIN_STEP = 1.0  # mm between two pivots that tell a direction
-WRIST_WITHIN = 2.5  # radii behind the first joint in which the shaft's end is believed
+WRIST_WITHIN = 1.5  # radii behind the first joint in which the shaft's end is believed
 
 
 class StatedLinks(Articulation):
@@ -94,6 +95,13 @@ class StatedLinks(Articulation):
         joint it lies: of a plane across the links at rest."""
         return nn.functional.pad(self._sides(points), (0, logits.shape[1] - self.link_count)) + logits
 
+    def misplaced(self, points: Tensor, weights: Tensor) -> Tensor:
+        return -(weights * self._sides(points).clamp_min(-MOST_SIDE)).sum(1)
+
+    def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """What follows the shaft turns about a ball or pin that looks like its end."""
+        return weights[:, 0] + weights[:, self._following], self.first_joint() + self.radius
+
     @torch.no_grad()
     def _sides(self, points: Tensor) -> Tensor:
         """[M, L] logits, at most 0, of Gaussians at points [M, 3] mm."""
@@ -114,6 +122,11 @@ class StatedLinks(Articulation):
             sides[:, 1:][:, self._moves(joint)] += beyond.clamp_max(0)[:, None]
             sides[:, self._link_of(self.joint_groups[joint][0].parent)] -= beyond.clamp_min(0)
         return sides
+
+    @property
+    def _following(self) -> int:
+        """The link that follows the shaft."""
+        return next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
 
     def _inner_joint(self, joint: int) -> int:
         """The joint that moves the axis of another; -1: none."""
@@ -195,8 +208,7 @@ class StatedLinks(Articulation):
         found = (self.wrist_start > first - WRIST_WITHIN * self.radius) & (self.wrist_start <= first)
         end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
         beyond = weights[:, 0] * (self.along_shaft(points) > end)
-        following = next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
-        moved = nn.functional.one_hot(torch.tensor([0, following]), self.link_count).to(weights)
+        moved = nn.functional.one_hot(torch.tensor([0, self._following]), self.link_count).to(weights)
         return weights + beyond[:, None] * (moved[1] - moved[0])
 
     def rest_line(self) -> tuple[Tensor, Tensor] | None:

@@ -249,10 +249,16 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         return sum(terms[1:], terms[0]) if terms else None
 
     def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
-        """How mixed one instrument's Gaussians are of its parts, a scalar in [0, 1)."""
+        """How mixed one instrument's Gaussians are of its links, and how far they are of links that their places speak
+        against, a scalar of at least 0."""
         weights = self.link_weights(canonical, index)
-        opacities = torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]).detach()
-        return (opacities * (1 - weights.square().sum(1))).sum() / opacities.sum().clamp_min(1e-6)
+        rows = canonical.body(index + 1)
+        opacities = torch.sigmoid(canonical.opacity_logits[rows]).detach()
+        mixed = 1 - weights.square().sum(1)
+        misplaced = self.articulations[index].misplaced(canonical.means[rows].detach(), weights)
+        if misplaced is not None:
+            mixed = mixed + misplaced
+        return (opacities * mixed).sum() / opacities.sum().clamp_min(1e-6)
 
     def between_steps(self, training: GaussianTraining, before: float) -> None:
         passed = [mark for mark in (WRISTS_AT, *WRISTS_AGAIN_AT) if before < mark <= training.progress]

@@ -101,12 +101,13 @@ def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments
     articulation = articulated.articulations[index]
     radius = float(articulation.radius)
     rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
-    count = int((float(articulation.first_joint()) - rear) / (radius / BINS_PER_RADIUS))
+    like, end = articulation.shaft_like(articulated.link_weights(session.scene.canonical, index))
+    count = int((float(end) - rear) / (radius / BINS_PER_RADIUS))
     if not count > 2 * BINS_PER_RADIUS:
         return None
     edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
     frames = session.frames_along_poses(session.config.search.border_frames)
-    steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges)) for frame in frames])
+    steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges, like)) for frame in frames])
     seen = steps.isfinite().all(2).sum(0)  # [count + 1] frames
     enough = seen >= MIN_FRAME_SHARE * len(steps)
     if int(enough.sum()) < BINS_PER_RADIUS:
@@ -135,14 +136,19 @@ def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _profile(
-    session: GaussianSession, articulated: ArticulatedInstruments, index: int, frame_index: int, edges: Tensor
+    session: GaussianSession,
+    articulated: ArticulatedInstruments,
+    index: int,
+    frame_index: int,
+    edges: Tensor,
+    like: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """A recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and
-    two log ratios, to which the light's colour and distance add constants."""
+    two log ratios, to which the light's colour and distance add constants; where Gaussians are `like` [M] the shaft."""
     scene = session.scene
     state, camera = session.corrected(frame_index)
     body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
-    body[scene.canonical.body(index + 1), 0] = articulated.link_weights(scene.canonical, index)[:, 0]
+    body[scene.canonical.body(index + 1), 0] = like
     channels = rasterize(scene.at(state), camera, channels=body).channels
     assert channels is not None
     pose = scene.registered(state).instruments[scene.instruments[index].name].pose
