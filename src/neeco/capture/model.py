@@ -16,7 +16,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from neeco.capture.images import read_image, read_mask
+from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
@@ -119,6 +119,10 @@ class Frame:
     def load_image(self) -> Tensor:
         """float32 [H, W, 3] in [0, 1], sRGB as stored. Raises NeecoError when unreadable or of another size."""
         return read_image(self.image_path, (self.camera.width, self.camera.height), self.background)
+
+    def load_image_bytes(self) -> Tensor:
+        """`load_image` in uint8 [H, W, 3]."""
+        return read_image_bytes(self.image_path, (self.camera.width, self.camera.height), self.background)
 
     def load_mask(self) -> Tensor | None:
         """bool [H, W], True where the loss counts, or None when the frame has no mask. Raises NeecoError."""

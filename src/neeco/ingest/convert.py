@@ -15,7 +15,7 @@ import torch
 
 from neeco.capture.documents import Parsed, ProblemReport
 from neeco.capture.endonerf import MASKS, folder_images
-from neeco.capture.images import read_mask, to_bytes, write_labels
+from neeco.capture.images import read_mask, write_labels
 from neeco.capture.model import Frame, evenly_spaced
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
@@ -63,7 +63,7 @@ def _shared_border(frames: Sequence[Frame]) -> np.ndarray | None:
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
     chosen = evenly_spaced(len(frames), BORDER_SAMPLES, floor=True)
-    border = find_border(to_bytes(frames[index].load_image()).numpy() for index in chosen)
+    border = find_border(frames[index].load_image_bytes().numpy() for index in chosen)
     return None if border is None else visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
 
 

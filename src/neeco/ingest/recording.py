@@ -16,6 +16,7 @@ from neeco.capture.dvrk import READINGS as DVRK_READINGS
 from neeco.capture.dvrk import read_dvrk_tool
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.kinematicsfile import parse_kinematics
+from neeco.capture.urdf import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest import columns as named
@@ -341,7 +342,7 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
 
 
 def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:
-    """The links of an instrument: a tool file of the dVRK, or as transforms.json has them."""
+    """The links of an instrument: a tool file of the dVRK, a URDF, or as transforms.json has them."""
     value = instrument.value.get("kinematics")
     if value is None:
         return None
@@ -350,6 +351,12 @@ def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree |
         readings = section.section("readings", DVRK_READINGS)
         names = {joint: readings.text(joint, required=True) for joint in readings.value}
         tree: KinematicTree | None = read_dvrk_tool(section.path("dvrk_tool", required=True), names)
+    elif isinstance(value, dict) and "urdf" in value:
+        section = instrument.section("kinematics", ("urdf", "root", "pose_of", "readings"))
+        given = section.value.get("readings") or {}
+        if not isinstance(given, dict) or not all(isinstance(item, str) for item in (*given, *given.values())):
+            raise section.error("readings", "must be a mapping of the URDF's joints to the recording's, {joint: name}")
+        tree = read_urdf(section.path("urdf", required=True), section.text("root"), section.text("pose_of"), given)
     else:
         tree = parse_kinematics(instrument.node.child("kinematics"))
     assert tree is not None

@@ -10,7 +10,6 @@ import cv2
 import torch
 from torch import Tensor
 
-from neeco.capture.images import to_bytes
 from neeco.capture.model import Camera, Frame
 
 MAX_MEMORY_SHARE = 0.5  # of a CUDA device's free memory that all pixels may take
@@ -33,7 +32,7 @@ class TrainingViews:
     def read(cls, frames: Sequence[Frame], scale: float = 1.0) -> TrainingViews:
         """Load every frame's pixels, at `scale` times their size (see `scaled`). Raises NeecoError where a file cannot
         be read."""
-        read = [cls((frame,), (to_bytes(frame.load_image()),), (frame.load_mask(),)).scaled(scale) for frame in frames]
+        read = [cls((frame,), (frame.load_image_bytes(),), (frame.load_mask(),)).scaled(scale) for frame in frames]
         return cls(
             tuple(view.frames[0] for view in read),
             tuple(view.images[0] for view in read),

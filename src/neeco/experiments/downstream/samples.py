@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image, read_labels, to_bytes
+from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file
@@ -87,7 +87,7 @@ class RecordedSample:
         """Raises NeecoError where the labels differ from the image in size, or have an id without a class."""
         ids, file = self.masks.load(self.name), self.masks.files[self.name]
         self.label_map.check(ids, file, "correct the mask, or leave its frame out")
-        pixels = to_bytes(self.frame.load_image()).numpy()
+        pixels = self.frame.load_image_bytes().numpy()
         valid = self.frame.load_mask()
         if ids.shape != pixels.shape[:2]:
             raise NeecoError(
@@ -124,7 +124,7 @@ class SyntheticSample:
         size = image_size(self.image)
         ids = read_labels(self.labels, size).numpy()
         self.label_map.check(ids, self.labels, f"name it in {DATASET_FILE}, or synthesize the set again")
-        pixels = to_bytes(read_image(self.image)).numpy()
+        pixels = read_image_bytes(self.image).numpy()
         valid = None if self.ignore is None else _read_grey(self.ignore, size) < 128
         coverage = None if self.soft is None else _read_grey(self.soft, size).astype(np.float32) / 255
         return Example(pixels, self.label_map.classes[ids], self.label_map.instruments[ids], valid, coverage)

@@ -37,13 +37,14 @@ THRESHOLD = 0.5  # of the labels then: half of a pixel
 
 @dataclass(frozen=True)
 class _View:
-    """One training frame with what the scene draws there."""
+    """One training frame with what the scene draws there: its P pixels in which there is anything of an instrument, all
+    that a frame of 1920x1080 can be kept of."""
 
     index: int  # of the frame
-    image: np.ndarray  # [H, W, 3] as recorded
-    tissue: np.ndarray  # [H, W, 3] drawn without instruments
-    inside: np.ndarray  # [H, W] bool: surely instrument
-    counted: np.ndarray  # [H, W] bool: not masked
+    pixels: np.ndarray  # [H, W] bool: which these are
+    image: np.ndarray  # [P, 3] as recorded
+    tissue: np.ndarray  # [P, 3] drawn without instruments
+    inside: np.ndarray  # [P] bool: surely instrument
 
 
 def store_label_shares(session: GaussianSession) -> None:
@@ -76,9 +77,12 @@ def _label_shares(session: GaussianSession, views: list[_View], probable: list[n
     for view, probability in zip(views, probable, strict=True):
         state, camera = session.corrected(view.index)
         posed = scene.at(state)
-        counted = torch.from_numpy(view.counted).to(shown)
+        mask = session.views.mask(view.index)
+        counted = shown.new_ones(view.pixels.shape) if mask is None else mask.to(shown)
+        likely = torch.zeros_like(counted)
+        likely[torch.from_numpy(view.pixels).to(shown.device)] = torch.from_numpy(probability).to(shown)
         shown += visible_pixels(posed, camera, counted)
-        as_instrument += visible_pixels(posed, camera, torch.from_numpy(probability).to(shown) * counted)
+        as_instrument += visible_pixels(posed, camera, likely * counted)
     share = ((as_instrument / shown.clamp_min(MIN_PIXELS) - LOW) / (HIGH - LOW)).clamp(0, 1)
     share[~scene.canonical.of_instruments | (shown < MIN_PIXELS)] = 1
     return share
@@ -97,8 +101,10 @@ def _view(session: GaussianSession, index: int) -> _View:
     inside = cv2.erode((share > INSIDE).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
     image, mask = session.views.target(index).cpu().numpy(), session.views.mask(index)
-    counted = np.ones(share.shape, bool) if mask is None else mask.cpu().numpy()
-    return _View(index, image, tissue, inside & counted, counted)
+    if mask is not None:
+        inside &= mask.cpu().numpy()
+    pixels = share > 0
+    return _View(index, pixels, image[pixels], tissue[pixels], inside[pixels])
 
 
 def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -117,7 +123,7 @@ def _color_density(views: list[_View]) -> np.ndarray:
 
 
 def _probability(view: _View, colors: np.ndarray) -> np.ndarray:
-    """[H, W] in (0, 1) that a pixel shows an instrument and no tissue, both equally likely beforehand.
+    """[P] in (0, 1) that a pixel shows an instrument and no tissue, both equally likely beforehand.
 
     Tissue in an unknown shade: uniform along the segment of its colour's shades, normal across it.
     """
