@@ -47,6 +47,10 @@ scene is one more entry in `scenes.SCENES`.
               8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
               wrist_yaw with the encoders' offsets, play and noise; `kinematics` states every axis 5 degrees
               and every pivot 2 mm off; truth/kinematics.json instead of hinge.json
+    bowel-wristed-swapped
+              the same with the names of wrist_pitch and wrist_yaw swapped: what a mistake in the logs looks like
+    bowel-sliding
+              8 mm grey shaft out of which a rod with two jaws slides; reading extension, mm
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ hinge at (0, 0, `hinge`) with its axis along x; the first jaw opens towards +y, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -73,6 +74,8 @@ class Design:
     jaws: tuple[Blade, Blade]
     shares: tuple[float, float]
     materials: tuple[Material, Material, Material]
+
+    wrist_joints: ClassVar[tuple[str, ...]] = ()  # readings beside the jaws'
 
     @property
     def reach(self) -> float:

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
+from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from rendered.hinge import JAW_LEFT, JAW_RIGHT, truth_ids
 from rendered.motion import Array
 from rendered.scenes import SceneSpec
-from rendered.wristed import WristedDesign
+from rendered.wristed import SlidingDesign, WristedDesign
 
-PITCH, YAW = "wrist_pitch", "wrist_yaw"
 JAW_NAMES = {JAW_LEFT: "jaw_left", JAW_RIGHT: "jaw_right"}
 # by which every axis and every pivot is stated wrongly
 AXIS_ERROR, PIVOT_ERROR = math.radians(5.0), 2.0
@@ -25,26 +24,31 @@ def true_kinematics(spec: SceneSpec) -> KinematicTree:
     """The links in the true sensor frame, mm, with the encoders' offsets taken out: what a perfect search would find.
     Link frames are parallel to the sensor's where the wrist is straight and the jaws are closed."""
     design, encoders = spec.design, spec.encoders
-    assert isinstance(design, WristedDesign)
+    assert isinstance(design, WristedDesign | SlidingDesign)
     assert encoders is not None
     sensor_from_mechanical = np.linalg.inv(spec.mount.mechanical_from_sensor())
     rotation, shift = sensor_from_mechanical[:3, :3], sensor_from_mechanical[:3, 3]
-    pitch_at = rotation @ np.array([0.0, 0.0, design.pitch_at]) + shift
-    yaw_at = rotation @ np.array([0.0, 0.0, design.hinge - design.pitch_at])
-    wrist = Link("wrist", "shaft", REVOLUTE, _shift(pitch_at), rotation[:, 1], {PITCH: 1.0}, -encoders.pitch_offset)
-    links = [Link("shaft"), wrist]
+    first, *others = design.wrist_joints
+    slides = isinstance(design, SlidingDesign)
+    start = 0.0 if slides else design.pitch_at
+    kind, axis = (PRISMATIC, rotation[:, 2]) if slides else (REVOLUTE, rotation[:, 1])
+    origin = _shift(rotation @ np.array([0.0, 0.0, start]) + shift)
+    links = [Link("shaft"), Link("wrist", "shaft", kind, origin, axis, {first: 1.0}, -encoders.offsets[0])]
+    hinge = _shift(rotation @ np.array([0.0, 0.0, design.hinge - start]))
     for part, sense, share in zip(truth_ids(spec), (-1, 1), design.shares, strict=True):
         gain = sense * share * spec.joint.sign  # per reading of the jaw
-        offset = -gain * spec.joint.zero - encoders.yaw_offset
-        value = {YAW: 1.0, "jaw_angle": gain}
-        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, _shift(yaw_at), rotation[:, 0], value, offset))
+        offset = -gain * spec.joint.zero - sum(encoders.offsets[1:])
+        value = dict.fromkeys(others, 1.0) | {"jaw_angle": gain}
+        links.append(Link(JAW_NAMES[part], "wrist", REVOLUTE, hinge, rotation[:, 0], value, offset))
     return KinematicTree(tuple(links))
 
 
 def stated_kinematics(spec: SceneSpec) -> KinematicTree:
     """The links as a drawing of the instrument and a ruler on its sensor give them: axes turned by AXIS_ERROR and
     pivots shifted by PIVOT_ERROR mm, each some way of its own, and encoders thought to be without an offset."""
-    exact = true_kinematics(replace(spec, encoders=replace(spec.encoders, pitch_offset=0.0, yaw_offset=0.0)))
+    assert spec.encoders is not None
+    without = replace(spec.encoders, offsets=(0.0,) * len(spec.encoders.offsets))
+    exact = true_kinematics(replace(spec, encoders=without))
     generator = np.random.default_rng((spec.seed, 4))
     errors: dict[str, tuple[Array, Array]] = {}  # by parent: the links that it carries share an axis
     links = []

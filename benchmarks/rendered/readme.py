@@ -16,7 +16,7 @@ def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[
     path, joint = spec.path, spec.joint
     counts = ", ".join(f"{name} {len(capture.split(name))}" for name in capture.splits)
     size = f"{capture.frames[0].camera.width}x{capture.frames[0].camera.height}"
-    wristed = "" if spec.encoders is None else _wrist(spec.encoders)
+    wristed = "" if spec.encoders is None else _wrist(spec, spec.encoders)
     links = (
         "hinge.json (hinge and shaft, sensor frame)"
         if spec.encoders is None
@@ -46,12 +46,20 @@ Errors of transforms.json against the truth (rms; the reconstruction's scale is 
 """
 
 
-def _wrist(encoders: Encoders) -> str:
+def _wrist(spec: SceneSpec, encoders: Encoders) -> str:
     """What the readings of a wrist are."""
-    pitch, yaw, play = (math.degrees(v) for v in (encoders.pitch_offset, encoders.yaw_offset, encoders.play))
+    if spec.design.wrist_joints == ("extension",):
+        told = f"""Reading `extension`: mm, plus an offset of {encoders.offsets[0]:.1f} mm, less play of \
+{encoders.play:.1f} mm either way."""
+    else:
+        pitch, yaw, play = (math.degrees(v) for v in (*encoders.offsets, encoders.play))
+        told = f"""Readings `wrist_pitch` and `wrist_yaw`: the angle, rad, plus an offset of {pitch:.1f} and {yaw:.1f} \
+degrees, less play of {play:.1f} degrees either way."""
+    if spec.swapped:
+        told += "\nTheir names are swapped: no tool that believes them can be right."
     return f"""
-Readings `wrist_pitch` and `wrist_yaw`: the angle, rad, plus an offset of {pitch:.1f} and {yaw:.1f} degrees, less play
-of {play:.1f} degrees either way. `kinematics` states the links without offsets, every axis \
+{told}
+`kinematics` states the links without offsets, every axis \
 {math.degrees(AXIS_ERROR):.0f} degrees and every pivot {PIVOT_ERROR:.0f} mm off."""
 
 

@@ -12,7 +12,7 @@ from rendered.errors import ErrorModel
 from rendered.instrument import Blade, Design, Material
 from rendered.motion import Array, Path, rigid
 from rendered.render import Lamps
-from rendered.wristed import Encoders, WristedDesign
+from rendered.wristed import Encoders, SlidingDesign, WristedDesign
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,17 @@ class SceneSpec:
     world_shift: tuple[float, float, float]  # … and shift
     errors: ErrorModel = field(default_factory=ErrorModel)
     encoders: Encoders | None = None  # of the wrist, where there is one
+    swapped: bool = False  # whether the wrist's readings go by each other's names
 
     def with_rolling_camera(self) -> SceneSpec:
         """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
         return replace(self, path=replace(self.path, camera_rolling=0.3))
+
+    @property
+    def reading_names(self) -> tuple[str, ...]:
+        """Of the wrist's joints, as they are logged."""
+        names = self.design.wrist_joints
+        return names[::-1] if self.swapped else names
 
     def world_from_scene(self) -> Array:
         """[4, 4]."""
@@ -266,7 +273,39 @@ SCENES |= {
         words=f"{organ} under an 8 mm black shaft whose steel wrist pitches and, 9 mm further, yaws two unequal jaws",
     )
     for organ, seed, encoders in (
-        ("bowel", 71, Encoders(1.6 * DEGREE, -1.1 * DEGREE, 0.8 * DEGREE, 0.3 * DEGREE)),
-        ("stomach", 83, Encoders(-1.2 * DEGREE, 1.9 * DEGREE, 0.6 * DEGREE, 0.3 * DEGREE)),
+        ("bowel", 71, Encoders((1.6 * DEGREE, -1.1 * DEGREE), 0.8 * DEGREE, 0.3 * DEGREE)),
+        ("stomach", 83, Encoders((-1.2 * DEGREE, 1.9 * DEGREE), 0.6 * DEGREE, 0.3 * DEGREE)),
     )
 }
+SCENES["bowel-wristed-swapped"] = replace(SCENES["bowel-wristed"], swapped=True)
+
+# A grasper on a rod that slides out of its shaft, as telescoping instruments have it.
+TELESCOPE = SlidingDesign(
+    name="telescope",
+    radius=4.0,
+    hinge=12.0,
+    collar=9.0,
+    wrist_radius=2.9,
+    prong_half_x=(1.7, 2.6),
+    prong_half_y=2.3,
+    pin=1.1,
+    jaws=(
+        Blade(13.0, 1.8, (1.5, 1.1), (1.45, 0.9), 0.0, 1.45, 0.0, 0.4, 0.4),
+        Blade(12.0, 1.8, (1.5, 1.2), (1.35, 0.9), 0.0, -1.35, 0.0, -0.2, 0.4),
+    ),
+    shares=(0.5, 0.5),
+    materials=(
+        Material((0.16, 0.165, 0.18), 0.9, 0.14, 18.0),
+        Material((0.30, 0.33, 0.42), 0.50, 0.35, 30.0),
+        Material((0.62, 0.58, 0.48), 0.46, 0.45, 30.0),
+    ),
+)
+
+SCENES["bowel-sliding"] = replace(
+    SCENES["bowel-wristed"],
+    design=TELESCOPE,
+    path=replace(SCENES["bowel-wristed"].path, wrist_train=(5.0,), wrist_most=(8.0,)),
+    encoders=Encoders((0.8,), 0.3, 0.1),
+    seed=98,
+    words="bowel under an 8 mm grey shaft out of which a rod with two unequal jaws slides",
+)

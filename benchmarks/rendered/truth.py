@@ -14,7 +14,6 @@ from rendered.render import Lens
 from rendered.scenes import SceneSpec
 
 JOINT = "jaw_angle"
-WRIST_JOINTS = ("wrist_pitch", "wrist_yaw")
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ def truth_document(world: World, lens: Lens) -> dict[str, Any]:
 def _truth_frame(world: World, shot: Shot, middle: Array) -> dict[str, Any]:
     spec, moment = world.spec, shot.moment
     joints = {JOINT: round(spec.joint.reading(moment.opening), 6)}
-    if moment.wrist is not None:
-        joints |= {name: round(angle, 6) for name, angle in zip(WRIST_JOINTS, moment.wrist, strict=True)}
+    if moment.wrist:
+        joints |= {name: round(v, 6) for name, v in zip(spec.design.wrist_joints, moment.wrist, strict=True)}
     yaw, pitch, insertion = _trocar_state(spec, moment, middle)
     state = {"yaw": yaw, "pitch": pitch, "insertion_mm": insertion, "roll": moment.roll, **joints}
     entry: dict[str, Any] = {

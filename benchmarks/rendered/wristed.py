@@ -1,24 +1,28 @@
-"""A wristed instrument, as robots carry: a clevis that pitches at the shaft's end, and two jaws that yaw on it.
+"""Instruments of more joints than jaws: a wrist as robots carry, a clevis that pitches at the shaft's end and two jaws
+that yaw on it; and a working end that slides out of the shaft.
 
 Mechanical frame as `rendered.instrument` has it, the wrist straight: the pitch axis along y at (0, 0, `pitch_at`), the
-yaw axis along x at (0, 0, `hinge`). Pitch and yaw are right-handed turns about those axes.
+yaw axis along x at (0, 0, `hinge`). Pitch and yaw are right-handed turns about those axes; extension is along z.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rendered.instrument import WRIST, Design, rounded
-from rendered.motion import Array, Bend
+from rendered.motion import Array, Bend, Extension
 
 
 @dataclass(frozen=True)
 class WristedDesign(Design):
     """Geometry of the clevis: a ball in the shaft's end, then a block that narrows to two prongs."""
+
+    wrist_joints: ClassVar[tuple[str, ...]] = ("wrist_pitch", "wrist_yaw")
 
     pitch_at: float = 1.5  # mm from the end of the shaft
     ball: float = 3.5  # radius
@@ -76,21 +80,70 @@ class WristedDesign(Design):
 
 
 @dataclass(frozen=True)
-class Encoders:
-    """What the wrist's encoders say: the angle plus an offset, play that lags behind the motion, and noise; rad."""
+class SlidingDesign(Design):
+    """A working end on a rod that slides out of the shaft, as it stands in the middle of its range."""
 
-    pitch_offset: float
-    yaw_offset: float
+    wrist_joints: ClassVar[tuple[str, ...]] = ("extension",)
+
+    rod: float = 24.0  # mm of it inside the shaft
+    farthest: float = 9.0  # mm that it slides either way, at most
+
+    @property
+    def reach(self) -> float:
+        """As `Design` has it, however far it slides, with the rod that balls cover."""
+        return max(super().reach + self.farthest, self.hinge + 2 * self.farthest + self.radius)
+
+    def balls(self, joints: Extension) -> tuple[Tensor, Tensor]:
+        """Centres [K, 3] and radii [K] of balls that together hold wrist and jaws."""
+        end = self.hinge + self.prong_half_y
+        middle = torch.zeros(8, 3)
+        middle[:, 2] = torch.linspace(-self.farthest, end, 8)
+        centers, radii = self._jaw_balls(joints.opening)
+        rod = torch.full((8,), (end + self.farthest) / 14 + self.wrist_radius + 1.0)
+        return torch.cat([middle, centers]) + self._shift(joints), torch.cat([rod, radii])
+
+    def distances(self, points: Tensor, joints: Extension) -> Tensor:
+        """Lower bounds [M, 3] mm of the distances of points [M, 3] to wrist, first jaw and second jaw."""
+        return super().distances(points - self._shift(joints), joints.opening)
+
+    def _wrist(self, points: Tensor) -> Tensor:
+        x, y, z = points.unbind(-1)
+        across = (x.square() + y.square()).sqrt()
+        half = (self.collar + self.rod) / 2
+        rod = rounded(torch.stack([across - self.wrist_radius, (z + self.rod - half).abs() - half], -1), 0.3)
+        return torch.minimum(rod, self._prongs(points, self.collar - 1.0))
+
+    def on_link(self, joints: Extension, points: Tensor, parts: Tensor) -> Tensor:
+        """Points [M, 3] on the given parts [M] as they lie in the middle of the range with the jaws closed, from the
+        hinge."""
+        back = torch.where((parts >= WRIST)[:, None], points - self._shift(joints), points)
+        return self.turn_to_link(joints, back - torch.tensor([0.0, 0.0, self.hinge]), parts)
+
+    def turn_to_link(self, joints: Extension, vectors: Tensor, parts: Tensor, sense: int = 1) -> Tensor:
+        """Vectors [M, 3] as they are with the jaws closed; sense -1: the other way round."""
+        return super().turn_to_link(joints.opening, vectors, parts, sense)
+
+    @staticmethod
+    def _shift(joints: Extension) -> Tensor:
+        return torch.tensor([0.0, 0.0, joints.extension])
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What the encoders of a wrist's joints say: the angle (rad) or length (mm) plus an offset, play that lags behind
+    the motion, and noise."""
+
+    offsets: tuple[float, ...]
     play: float  # half of it, either way
     noise: float
 
-    def readings(self, pitch: Array, yaw: Array, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Readings [F] of pitch and of yaw angles [F], in the order of the frames."""
+    def readings(self, values: Array, generator: np.random.Generator) -> Array:
+        """Readings [F, J] of values [F, J], in the order of the frames."""
         found = []
-        for angles, offset in ((pitch, self.pitch_offset), (yaw, self.yaw_offset)):
-            lag = self.play * np.tanh(np.gradient(angles) / max(1e-6, float(np.abs(np.gradient(angles)).mean())))
-            found.append(angles + offset - lag + generator.normal(0, self.noise, len(angles)))
-        return found[0], found[1]
+        for column, offset in zip(values.T, self.offsets, strict=True):
+            lag = self.play * np.tanh(np.gradient(column) / max(1e-6, float(np.abs(np.gradient(column)).mean())))
+            found.append(column + offset - lag + generator.normal(0, self.noise, len(column)))
+        return np.stack(found, 1)
 
 
 def _turn_y(points: Tensor, angle: float) -> Tensor:

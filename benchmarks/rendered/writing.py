@@ -27,7 +27,7 @@ from rendered.readme import readme
 from rendered.recording import write_raw_recording
 from rendered.render import Lens, Place
 from rendered.scenes import SceneSpec
-from rendered.truth import JOINT, WRIST_JOINTS, World, truth_document
+from rendered.truth import JOINT, World, truth_document
 
 SEEN, UNSEEN = 230, 45
 Report = Callable[[str], None]
@@ -123,8 +123,8 @@ def _wrist_readings(spec: SceneSpec, moments: Sequence[Moment], generator: np.ra
     """What the wrist's encoders say at each moment, by name; nothing without a wrist."""
     if spec.encoders is None:
         return {}
-    pitch, yaw = np.array([moment.wrist for moment in moments]).T
-    return dict(zip(WRIST_JOINTS, spec.encoders.readings(pitch, yaw, generator), strict=True))
+    readings = spec.encoders.readings(np.array([moment.wrist for moment in moments]), generator)
+    return dict(zip(spec.reading_names, readings.T, strict=True))
 
 
 def _state(pose: Array, spec: SceneSpec, opening: float, wrist: dict[str, float]) -> InstrumentState:

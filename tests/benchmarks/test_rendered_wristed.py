@@ -1,4 +1,4 @@
-"""A rendered wristed instrument stands where its stated links say, in its depth and its masks."""
+"""A rendered wristed or telescoping instrument stands where its stated links say, in its depth and its masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOCAL, WIDTH, HEIGHT = 54.0, 64, 48
 WRIST = 2
 
 
-@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed"])
+@pytest.fixture(scope="module", params=["bowel-wristed", "stomach-wristed", "bowel-sliding"])
 def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eleven frames of a scene."""
     from rendered.frames import Settings
@@ -32,9 +32,10 @@ def capture(request: pytest.FixtureRequest, benchmarks: ModuleType, tmp_path_fac
     return path
 
 
-def test_the_capture_records_three_readings(capture: Path) -> None:
+def test_the_capture_records_every_reading(capture: Path) -> None:
     recorded = read_capture(capture)
-    assert set(recorded.instruments[0].joints) == {"jaw_angle", "wrist_pitch", "wrist_yaw"}
+    wrist = {"extension"} if "sliding" in capture.name else {"wrist_pitch", "wrist_yaw"}
+    assert set(recorded.instruments[0].joints) == {"jaw_angle"} | wrist
     assert errors_only(check_capture(capture)) == []
 
 
@@ -49,8 +50,9 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
     spec = SCENES[capture.name.rstrip("0123456789")]
     rotation = spec.mount.mechanical_from_sensor()[:3, :3]
     first, second = (JAW_NAMES[part] for part in truth_ids(spec))
+    start = getattr(spec.design, "pitch_at", 0.0)
     solids = {
-        "wrist": lambda points: spec.design._wrist(points + torch.tensor([0.0, 0.0, spec.design.pitch_at])),
+        "wrist": lambda points: spec.design._wrist(points + torch.tensor([0.0, 0.0, start])),
         first: spec.design.jaws[0].distance,
         second: spec.design.jaws[1].distance,
     }
@@ -59,8 +61,8 @@ def test_what_is_seen_lies_on_the_link_that_it_is_labelled_as(capture: Path) -> 
     for frame in frames_with_depth(capture):
         points, ids = seen_points(capture, frame)
         joints = dict(frame["instruments"][0]["joints"])
-        joints["wrist_pitch"] += spec.encoders.pitch_offset  # as the encoders read without play and noise
-        joints["wrist_yaw"] += spec.encoders.yaw_offset
+        for name, offset in zip(spec.reading_names, spec.encoders.offsets, strict=True):
+            joints[name] += offset  # as the encoders read without play and noise
         poses = tree.poses(joints)
         for link, part in parts.items():
             back = np.linalg.inv(poses[link])
@@ -90,7 +92,7 @@ def test_readings_err_by_their_offsets_play_and_noise(capture: Path) -> None:
     spec = SCENES[capture.name.rstrip("0123456789")]
     truth = truth_of(capture)
     recorded = json.loads((capture / "transforms.json").read_text())
-    for name, offset in (("wrist_pitch", spec.encoders.pitch_offset), ("wrist_yaw", spec.encoders.yaw_offset)):
+    for name, offset in zip(spec.reading_names, spec.encoders.offsets, strict=True):
         errors = np.array(
             [
                 ours["instruments"][0]["joints"][name] - theirs["instruments"][0]["joints"][name]
@@ -110,11 +112,27 @@ def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(capture:
     reached = {"seen": 0.0, "unseen": 0.0}
     for frame in truth["frames"]:
         joints = frame["instruments"][0]["joints"]
-        most = np.abs(np.array([joints["wrist_pitch"], joints["wrist_yaw"]]) / spec.path.wrist_train).max()
+        most = np.abs(np.array([joints[name] for name in spec.reading_names]) / spec.path.wrist_train).max()
         kind = "unseen" if frame["split"] == "unseen" else "seen"
         reached[kind] = max(reached[kind], most)
     assert 0.5 < reached["seen"] <= 1.0
     assert reached["unseen"] > 1.1
+
+
+def test_swapped_names_hold_each_others_readings(benchmarks: ModuleType) -> None:
+    from rendered.motion import plan
+    from rendered.scenes import SCENES
+    from rendered.writing import _wrist_readings
+
+    found = {}
+    for name in ("bowel-wristed", "bowel-wristed-swapped"):
+        spec = SCENES[name]
+        trajectory = plan(spec.path, spec.design.hinge, 40, 8, spec.seed)
+        moments = [trajectory.at(time) for time in trajectory.times]
+        found[name] = _wrist_readings(spec, moments, np.random.default_rng(0))
+    right, swapped = found.values()
+    assert np.array_equal(right["wrist_pitch"], swapped["wrist_yaw"])
+    assert np.array_equal(right["wrist_yaw"], swapped["wrist_pitch"])
 
 
 def test_logs_of_a_wrist_are_refused(benchmarks: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,11 +143,14 @@ def test_logs_of_a_wrist_are_refused(benchmarks: ModuleType, capsys: pytest.Capt
 
 
 def test_all_that_casts_a_shadow_lies_within_reach(benchmarks: ModuleType) -> None:
-    from rendered.motion import Bend
+    from rendered.motion import Bend, Extension
     from rendered.scenes import SCENES
 
-    design = SCENES["bowel-wristed"].design
-    for pitch, yaw in ((0.0, 0.0), (1.0, 0.9), (-1.0, 0.9), (1.0, -0.9)):
-        centers, _ = design.balls(Bend(1.3, pitch, yaw))
-        away = (centers - torch.tensor([0.0, 0.0, design.hinge])).norm(dim=1)
-        assert float(away.max()) < design.reach
+    bends = [Bend(1.3, pitch, yaw) for pitch, yaw in ((0.0, 0.0), (1.0, 0.9), (-1.0, 0.9), (1.0, -0.9))]
+    slides = [Extension(1.3, extension) for extension in (-8.0, 0.0, 8.0)]
+    for name, joints in (("bowel-wristed", bends), ("bowel-sliding", slides)):
+        design = SCENES[name].design
+        for each in joints:
+            centers, _ = design.balls(each)
+            away = (centers - torch.tensor([0.0, 0.0, design.hinge])).norm(dim=1)
+            assert float(away.max()) < design.reach
