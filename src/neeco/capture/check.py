@@ -244,7 +244,7 @@ def _check_states(parsed: Parsed) -> None:
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     limits = instrument.joints[joint]
-    is_length = joint.endswith("_mm")  # a sliding joint
+    is_length = instrument.slides(joint)
     if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
         message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
         parsed.header("instruments").error(message, "give radians")

@@ -64,7 +64,7 @@ def degrees_of_freedom(capture: Capture, main_axes: Mapping[str, np.ndarray]) ->
         columns += [(name, "deg", turns[:, index]) for index, name in enumerate(("pitch", "yaw", "roll"))]
         for joint in instrument.joints:
             values = np.array([state.joints.get(joint, np.nan) for state in states])
-            sliding = joint.endswith("_mm")
+            sliding = instrument.slides(joint)
             columns.append((joint, "mm" if sliding else "deg", values if sliding else np.degrees(values)))
         for name, unit, values in columns:
             known = np.isfinite(values)

@@ -65,14 +65,14 @@ class RefineConfig:
     rotation_rate: float = 6e-4  # rad, Adam's learning rate of frame_poses
     translation_rate: float = 4e-2  # mm
     camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
-    joint_rate: float = 2e-3  # rad, or mm where a joint slides
+    joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
     unrecorded_rate: float = 1e-2  # of joints that nobody recorded
     latency_rate: float = 2e-5  # s
     prior_weight: float = 2e-5
     prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg
     prior_translation: float = 0.3  # mm
-    prior_joint: float = 1.5e-2  # rad or mm: play and noise of encoders
-    prior_unrecorded: float = 0.1  # rad or mm by which a joint that nobody recorded departs from the instants beside
+    prior_joint: float = 1.5e-2  # rad: play and noise of encoders
+    prior_unrecorded: float = 0.1  # rad by which a joint that nobody recorded departs from the instants beside
     registration_rotation_rate: float = 1e-4  # rad
     registration_translation_rate: float = 1e-2  # mm
     registration_scale_rate: float = 1e-4  # of the log scale

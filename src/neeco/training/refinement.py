@@ -21,6 +21,7 @@ from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
 
 LEARNED = ("poses", "joints", "cameras", "latency")
+MM_PER_RAD = 20.0  # what a joint that slides is taken to move as one that turns does
 SMOOTH_S = 1.0  # s between instants that tell something of each other
 STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
 
@@ -44,6 +45,8 @@ class Refinement:
         self.unrecorded = torch.tensor(
             [reading in missing for reading in self.readings], dtype=torch.bool, device=device
         )  # [R]
+        sliding = {(item.name, reading) for item in instruments for reading in item.joints if item.slides(reading)}
+        per_rad = torch.tensor([MM_PER_RAD if reading in sliding else 1.0 for reading in self.readings], device=device)
         self.instants, self.beside = _instants(frames, names)
         self.joints = torch.zeros(len(self.beside), len(self.readings), device=device)
         self.poses = torch.zeros(len(frames), len(names), 6, device=device)
@@ -53,11 +56,11 @@ class Refinement:
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),
-            "joints": torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
+            "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
-        self.joint_sigma = torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
+        self.joint_sigma = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
         self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
         self.moments = {
             f"{order}.{name}": torch.zeros_like(getattr(self, name))

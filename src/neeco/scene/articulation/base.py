@@ -100,15 +100,19 @@ class Articulation(nn.Module):
         """Of each joint, whether it slides; shorter: the others turn."""
         return ()
 
+    def round_until(self) -> Tensor:
+        """[] mm along the shaft up to where all is spun with it."""
+        return self.wrist_start
+
     def body(self, world_from_instrument: Tensor, readings: Mapping[str, float], roll: float = 0.0) -> ArticulatedBody:
-        """How the instrument's Gaussians stand at these readings, all that lies behind the wrist spun by `roll` rad."""
+        """How the instrument's Gaussians stand at these readings, the round part of its shaft spun by `roll` rad."""
         shaft = self.shaft()
         return ArticulatedBody(
             world_from_instrument,
             *self.axes(shaft),
             self.values(readings),
             *shaft,
-            self.wrist_start,
+            self.round_until(),
             *self._gate(),
             MAX_SCALE * self.radius,
             roll,

@@ -103,6 +103,12 @@ class StatedLinks(Articulation):
         return weights[:, 0] + weights[:, self._following], self.first_joint() + self.radius
 
     @torch.no_grad()
+    def round_until(self) -> Tensor:
+        """The shaft's end, short of what moves with the first joint: spun with the shaft, that would turn its axis
+        off."""
+        return torch.minimum(self.wrist_start, self.first_joint() - self.radius)
+
+    @torch.no_grad()
     def _sides(self, points: Tensor) -> Tensor:
         """[M, L] logits, at most 0, of Gaussians at points [M, 3] mm."""
         sides = points.new_zeros(len(points), self.link_count)
