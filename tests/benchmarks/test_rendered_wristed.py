@@ -117,7 +117,7 @@ def test_the_wrist_goes_beyond_its_training_range_in_unseen_frames_only(benchmar
         most = np.abs(np.array(trajectory.at(time).wrist) / spec.path.wrist_train).max()
         kind = "unseen" if split == "unseen" else "seen"
         reached[kind] = max(reached[kind], most)
-    assert 0.5 < reached["seen"] <= 1.0
+    assert 0.5 < reached["seen"] <= 1.02  # a spline passes its knots by a little
     assert reached["unseen"] > 1.1
 
 
