@@ -21,6 +21,7 @@ from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig, SearchConfig
 from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
 from neeco.training.instruments.link_seeds import along_links, find_unrecorded, readings_of, start_links
+from neeco.training.instruments.reading_doubts import doubt_readings
 from neeco.training.refinement import Refinement
 
 SEARCH = SearchConfig(seeds=600)
@@ -76,10 +77,12 @@ def session(evidence: Evidence, unrecorded: tuple[str, ...] = ()) -> Any:
     return cast(
         Any,
         SimpleNamespace(
-            config=SimpleNamespace(search=SEARCH),
+            config=SimpleNamespace(search=SEARCH, seed=0),
             report=said.append,
             said=said,
-            scene=SimpleNamespace(instruments=(instrument,), recorded=Recorded.of(frames, (instrument,))),
+            scene=SimpleNamespace(
+                instruments=(instrument,), recorded=Recorded.of(frames, (instrument,)), diagnostics={}
+            ),
             refinement=Refinement(RefineConfig(frame_joints=True), frames, (instrument,), torch.device("cpu")),
             full_views=SimpleNamespace(frames=frames),
         ),
@@ -145,3 +148,26 @@ def test_a_joint_that_nobody_recorded_begins_where_sticks_stay_on_evidence() -> 
     found = [given["jaw"] for given in readings_of(asked, evidence, "tool")]
     assert np.corrcoef(found, truth)[0, 1] > 0.9
     assert np.abs(np.array(found) - truth).mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("change", "doubted", "words"),
+    [
+        (lambda given: given, set(), ""),
+        (
+            lambda given: {"pitch": given["jaw"], "jaw": given["pitch"]},
+            {"tool.pitch", "tool.jaw"},
+            "with the readings of pitch and jaw exchanged",
+        ),
+        (lambda given: {**given, "pitch": -given["pitch"]}, {"tool.pitch"}, "with the sign of pitch reversed"),
+    ],
+)
+def test_readings_that_drive_other_joints_than_they_say_are_doubted(
+    carved: tuple[Evidence, CarvedShape], change: Any, doubted: set[str], words: str
+) -> None:
+    asked = session(carved[0])
+    readings = [change(given) for given in readings_of(asked, carved[0], "tool")]
+    doubt_readings(asked, started(carved), carved[0], asked.scene.instruments[0], readings)
+    assert set(asked.scene.diagnostics.get("doubted_readings", {})) == doubted
+    assert all(words in line for line in asked.said)
+    assert len(asked.said) == bool(doubted)

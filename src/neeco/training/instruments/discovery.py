@@ -28,7 +28,8 @@ from neeco.training.instruments.evidence import (
     score_points,
 )
 from neeco.training.instruments.hinge_search import start_hinges
-from neeco.training.instruments.link_seeds import along_links, start_links
+from neeco.training.instruments.link_seeds import along_links, readings_of, start_links
+from neeco.training.instruments.reading_doubts import doubt_readings
 from neeco.training.session import GaussianSession, new_session
 
 MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
@@ -72,6 +73,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         columns = articulated.logit_count
         if isinstance(articulation, StatedLinks):
             seeds, logits = start_links(session, articulation, evidence, instrument.name, shape, columns, generator)
+            doubt_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
         else:
             assert isinstance(articulation, Hinges)
             seeds, logits = start_hinges(session, articulation, evidence, instrument.name, shape, columns, generator)

@@ -93,17 +93,22 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
         errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
         given, middle = given + errors[0], middle + errors[1]
     explained = 1 - given / middle if middle > 0 else 0.0
-    found = bool(explained > session.config.search.min_joint_explained and math.isfinite(explained))
+    explains = bool(explained > session.config.search.min_joint_explained and math.isfinite(explained))
+    doubt = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
+    if doubt is not None:
+        verdict = f"NOT found: {doubt}"
+    elif explains:
+        verdict = f"found: the reading explains {explained:.0%} of the moving parts' error"
+    else:
+        verdict = (
+            f"NOT found: the reading explains only {explained:.0%} of the moving parts' error; "
+            "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
+        )
     return {
-        "found": found,
+        "found": explains and doubt is None,
         "explained": round(explained, 4),
         **articulation.describe(name),
-        "verdict": (
-            f"found: the reading explains {explained:.0%} of the moving parts' error"
-            if found
-            else f"NOT found: the reading explains only {explained:.0%} of the moving parts' error; "
-            "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
-        ),
+        "verdict": verdict,
     }
 
 
