@@ -1,4 +1,4 @@
-// The rasteriser for a page: one scene of bodies with hinges, posed and drawn into RGBA. A page gives every worker of its
+// The rasteriser for a page: one scene of bodies with joints, posed and drawn into RGBA. A page gives every worker of its
 // own the scene, and rows of the image to draw. Compiled to WebAssembly by `make viewer`; page/worker.js calls it.
 #define NEECO_VARIANT wasm
 #define NEECO_WIDTH 4
@@ -71,7 +71,7 @@ void turn_by(const float* turn, float* quat) {
     std::memcpy(quat, product, sizeof product);
 }
 
-// A point p, the Gaussian's orientation r and the turn of its harmonics, about a hinge by `angle` (Rodrigues).
+// A point p, the Gaussian's orientation r and the turn of its harmonics, about a joint by `angle` (Rodrigues).
 // Moves a Gaussian by `amount` about an axis, rad, or along one that slides, mm.
 void move(const float* pivot, float amount, float* p, float* r, float* turned) {
     if (pivot[7] != 0) {

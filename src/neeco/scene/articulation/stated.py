@@ -99,8 +99,12 @@ class StatedLinks(Articulation):
         return -(weights * self._sides(points).clamp_min(-MOST_SIDE)).sum(1)
 
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """What follows the shaft turns about a ball or pin that looks like its end."""
-        return weights[:, 0] + weights[:, self._following], self.first_joint() + self.radius
+        """What follows the shaft turns about a ball or pin that looks like its end, or slides out of it."""
+        return weights[:, 0] + weights[:, self._following], self._latest_end() + self.radius
+
+    def _latest_end(self) -> Tensor:
+        """[] mm along the shaft: its end lies at the first joint, or where that slides, by a radius of it."""
+        return self.first_joint() + self.slides[-1] * self.radius
 
     @torch.no_grad()
     def round_until(self) -> Tensor:
@@ -208,10 +212,11 @@ class StatedLinks(Articulation):
         return found
 
     def parts(self, points: Tensor, weights: Tensor) -> Tensor:
-        """What turns about a ball or pin looks the same on either side of it: of what moves with the shaft, all beyond
-        the shaft's end (where its colour or its symmetry ends) is labelled as the link that follows."""
+        """What turns about a ball or pin looks the same on either side of it, and a rod that slides as it did before:
+        of what moves with the shaft, all beyond the shaft's end (where its colour or its symmetry ends) is labelled as
+        the link that follows."""
         first = self.first_joint()
-        found = (self.wrist_start > first - WRIST_WITHIN * self.radius) & (self.wrist_start <= first)
+        found = (self.wrist_start > first - WRIST_WITHIN * self.radius) & (self.wrist_start <= self._latest_end())
         end = torch.where(found, self.wrist_start, torch.full_like(first, torch.inf))
         beyond = weights[:, 0] * (self.along_shaft(points) > end)
         moved = nn.functional.one_hot(torch.tensor([0, self._following]), self.link_count).to(weights)
