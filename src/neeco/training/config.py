@@ -66,7 +66,7 @@ class RefineConfig:
     translation_rate: float = 4e-2  # mm
     camera_rate: float = 0.2  # times the rates of poses: SfM cameras are better than tracked instruments
     joint_rate: float = 2e-3  # rad; where a joint slides, this and its priors count as so much at 20 mm from a pivot
-    unrecorded_rate: float = 1e-2  # of joints that nobody recorded
+    unrecorded_rate: float = 2e-2  # of joints that nobody recorded
     latency_rate: float = 2e-5  # s
     prior_weight: float = 2e-5
     prior_rotation: float = 4.4e-3  # rad, standard deviation of the prior: a tracker's 0.25 deg

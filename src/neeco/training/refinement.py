@@ -9,7 +9,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -141,15 +140,6 @@ class Refinement:
             self.poses[seen] -= self.poses[seen].mean(0)
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             self.cameras[seen] -= self.cameras[seen].mean(0)
-
-    @torch.no_grad()
-    def start_unrecorded(self, instrument: Instrument, reading: str, frames: dict[int, float]) -> None:
-        """Begin with these values of a joint that nobody recorded, by frame; instants between them in proportion."""
-        column = self.readings.index((instrument.name, reading))
-        known = {self.instants[index]: value - instrument.halfway(reading) for index, value in frames.items()}
-        places = sorted(known)
-        values = np.interp(range(len(self.joints)), places, [known[place] for place in places])
-        self.joints[:, column] = torch.from_numpy(values).to(self.joints)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """The recording with joints that nobody recorded as they were found, within their limits."""

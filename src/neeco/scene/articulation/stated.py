@@ -184,19 +184,20 @@ class StatedLinks(Articulation):
         half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + beside for j in beyond])
         return middle, half
 
-    def sticks(self, reading: str, reach: float) -> list[tuple[int, Tensor]]:
-        """(link, points [Q, 3] mm at rest) of every outermost link that a reading moves: from its pivot on along the
-        links behind it, to half of `reach`."""
-        pivots, _ = self.axes()
+    @torch.no_grad()
+    def opens_to(self, link: int, unrecorded: Sequence[str]) -> tuple[Tensor, Tensor] | None:
+        """(its pivot [3] mm, unit direction [3]) at rest: to which side a link turns as one of the `unrecorded`
+        readings grows that turns another about the same axis the other way; None where there is none."""
+        pivots, axes = self.axes()
         line = self.rest_line()
-        direction = self.shaft()[1] if line is None else line[1]
-        along = torch.linspace(0.15, 0.5, 12, device=pivots.device)[:, None] * reach
-        found = []
-        for link in self._ends:
-            joint = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
-            if bool(self.gains[:, link - 1, self.reading_names.index(reading)].any()):
-                found.append((link, pivots[joint] + along * direction))
-        return found
+        along = self.shaft()[1] if line is None else line[1]
+        for name in unrecorded:
+            gains = self.gains[:, :, self.reading_names.index(name)]  # [J, L - 1]
+            for joint, own in enumerate(gains):
+                if own[link - 1] != 0 and bool((own * own[link - 1] < 0).any()) and not self.slides[joint]:
+                    towards = torch.linalg.cross(axes[joint], along) * own[link - 1].sign()
+                    return pivots[joint], nn.functional.normalize(towards, dim=0)
+        return None
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
         """The pivot of every joint, `pivot_` and the name of what it moves, and the tip of every link that none
@@ -205,6 +206,9 @@ class StatedLinks(Articulation):
         pivots, _ = self.axes()
         for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots.flip(0), strict=True):
             carrier = self._link_of(group[0].parent)
+            if group[0].type == PRISMATIC:  # where across the axis it lies, no image shows: on the shaft's
+                origin, direction = self.shaft()
+                pivot = origin + ((pivot - origin) @ direction) * direction
             found[f"pivot_{name}"] = self.place(pivot[None], carrier, readings)[0]
         for link in self._ends:
             if bool(self.tips[link].isfinite().all()):
@@ -223,8 +227,8 @@ class StatedLinks(Articulation):
         return weights + beyond[:, None] * (moved[1] - moved[0])
 
     def rest_line(self) -> tuple[Tensor, Tensor] | None:
-        """(point [3] mm, unit direction [3]) along which the links lie at rest: from the first pivot to the one that it
-        carries; None where there are not two."""
+        """(point [3] mm, step [3] mm) of the line along which the links lie at rest: from the first pivot to the one
+        that it carries; None where there are not two."""
         pivots, _ = self.axes()
         for joint in reversed(range(len(pivots))):
             inner = self._inner_joint(joint)
@@ -232,7 +236,7 @@ class StatedLinks(Articulation):
                 continue
             step = pivots[joint] - pivots[inner]
             if float(step.norm()) > MIN_STEP:
-                return pivots[inner], nn.functional.normalize(step, dim=0)
+                return pivots[inner], step
         return None
 
     def moved_by(self, reading: str, weights: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +13,6 @@ from neeco.training.instruments.evidence import (
     CarvedShape,
     Evidence,
     PosedViews,
-    camera_from_instrument,
     carve_along,
     frame_along,
     posed_views,
@@ -29,8 +29,8 @@ TOLERANCE = 0.03  # of evidence, by which another link may be likelier
 MIN_COSINE = 0.85
 MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
 NEAR_BEST = 0.85  # of the best evidence that a point of a link has: stated axes may be off, and all points with them
-STICK_VALUES = 17  # tried of a joint that nobody recorded, between its limits
-STICK_STEP, STICK_SMOOTH = 0.15, 0.2  # share of them that a joint may move from frame to frame at little cost
+MIN_RADIUS = 0.33  # of the shaft, of the distance between the first pivots
+ACROSS_RADII = 0.3  # how far on the other side of its pivot a link may lie that opens to one side
 MIN_SEEN = 0.05  # share of the frames that must see a seed
 
 
@@ -44,20 +44,24 @@ def along_links(
     generator: torch.Generator,
 ) -> CarvedShape:
     """`shape`, or where its line is not that of the links at rest, one carved about theirs: an instrument that hardly
-    turns leaves evidence along its lines of sight, too."""
+    turns leaves evidence along its lines of sight, too. Not thinner than the links are near each other: where the fit
+    of the tissue took a dark shaft in, little evidence is left of it."""
     line = links.rest_line()
     if line is None:
         return shape
-    pivot, direction = line
+    pivot, step = line
+    direction = nn.functional.normalize(step, dim=0)
+    thickness = MIN_RADIUS * float(step.norm())
     origin, along = shape.instrument_from_shaft[:3, 3], shape.instrument_from_shaft[:3, 2]
     apart = pivot - origin
     off = float((apart - (apart @ along) * along).norm())
     if float(along @ direction) > MIN_COSINE and off < max(MAX_OFF_RADII * shape.radius, MAX_OFF_MM):
-        return shape
+        return replace(shape, radius=max(shape.radius, thickness))
     session.report(f"{name}: the shaft is looked for along the stated links: carving it found another line")
     base = frame_along(pivot, direction)
     carved = carve_along(evidence, name, base, shape.level, generator, session.config.search)
-    return shape if carved is None else carved
+    found = shape if carved is None else carved
+    return replace(found, radius=max(found.radius, thickness))
 
 
 @torch.no_grad()
@@ -72,10 +76,11 @@ def start_links(
 ) -> tuple[Tensor, Tensor]:
     """Seeds [M, 3] mm at rest on every link, and their link logits [M, columns].
 
-    A point belongs to the link with which it must move to stay on evidence.
+    A point belongs to the link with which it must move to stay on evidence. Where nobody recorded how far two links
+    open, each is looked for on the side to which it does: mirrored they would look as well.
     """
     search = session.config.search
-    find_unrecorded(session, links, evidence, name, shape.radius)
+    instrument = next(item for item in session.scene.instruments if item.name == name)
     links.wrist_start.fill_(float(links.first_joint()) - shape.radius)
     moved = link_motions(links, readings_of(session, evidence, name))  # [F, L, 4, 4]
     views = [posed_views(evidence, name, search, moved[:, k]) for k in range(links.link_count)]
@@ -86,7 +91,8 @@ def start_links(
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (search.seeds - count) // max(links.link_count - 1, 1)
     for link in range(1, links.link_count):
-        found = _on_link(views, links, link, shape.radius, each, generator)
+        side = links.opens_to(link, instrument.unrecorded)
+        found = _on_link(views, links, link, shape.radius, each, generator, side)
         seeds.append(found)
         owners.append(torch.full((len(found),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
@@ -99,51 +105,6 @@ def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list
     recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
     by_name = dict(zip(recorded.names, recorded.states, strict=True))
     return [dict(by_name[frame.name].instruments[name].joints) for frame in evidence.frames]
-
-
-def find_unrecorded(session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float) -> None:
-    """Begin every joint that nobody recorded where the links that it moves, as sticks along the chain at rest, stay on
-    evidence, smooth in time (Viterbi 1967)."""
-    instrument = next(item for item in session.scene.instruments if item.name == name)
-    frame_numbers = {frame.name: index for index, frame in enumerate(session.full_views.frames)}
-    for reading in instrument.unrecorded:
-        limits = instrument.joints[reading]
-        assert limits is not None
-        values = np.linspace(*limits, STICK_VALUES)
-        readings = readings_of(session, evidence, name)
-        sticks = links.sticks(reading, REACH_RADII * radius)
-        camera_from_instrument_of = camera_from_instrument(evidence, name)  # [F, 4, 4]
-        scores = np.zeros((len(readings), len(values)))
-        for k, value in enumerate(values):
-            points = torch.stack(
-                [
-                    torch.cat([links.place(own, link, {**given, reading: float(value)}) for link, own in sticks])
-                    for given in readings
-                ]
-            )  # [F, Q, 3]
-            rotation, shift = camera_from_instrument_of[:, :3, :3], camera_from_instrument_of[:, None, :3, 3]
-            hits, inside = evidence.look_up_camera(points @ rotation.transpose(1, 2) + shift)
-            scores[:, k] = ((hits * inside).sum(1) / inside.sum(1).clamp_min(1)).cpu().numpy()
-        path = _smooth_path(scores, values, (limits[1] - limits[0]) * STICK_STEP)
-        found = {frame_numbers[frame.name]: value for frame, value in zip(evidence.frames, path, strict=True)}
-        session.refinement.start_unrecorded(instrument, reading, found)
-
-
-def _smooth_path(scores: np.ndarray, values: np.ndarray, sigma: float) -> list[float]:
-    """The values [F] of most evidence `scores` [F, V], in the order of the frames, that move by about `sigma` from one
-    to the next."""
-    steps = (STICK_SMOOTH * (values[:, None] - values[None]) / sigma) ** 2  # [V, V]
-    best, came = scores[0], []
-    for own in scores[1:]:
-        through = best[None] - steps  # [to, from]
-        came.append(through.argmax(1))
-        best = own + through.max(1)
-    place = int(best.argmax())
-    path = [place]
-    for before in reversed(came):
-        place = int(before[place])
-        path.append(place)
-    return [float(values[k]) for k in reversed(path)]
 
 
 def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor:
@@ -161,15 +122,26 @@ def link_motions(links: StatedLinks, readings: list[dict[str, float]]) -> Tensor
 
 
 def _on_link(
-    views: list[PosedViews], links: StatedLinks, link: int, radius: float, count: int, generator: torch.Generator
+    views: list[PosedViews],
+    links: StatedLinks,
+    link: int,
+    radius: float,
+    count: int,
+    generator: torch.Generator,
+    side: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """[count, 3] mm at rest: points that stay on evidence when moved with a link, and better than with any other."""
+    """[count, 3] mm at rest: points that stay on evidence when moved with a link, and better than with any other; on
+    the `side` of a place (mm, unit direction) where that is given."""
     device = links.points.device
     centers, reaches = (part.to(device) for part in links.where(link, REACH_RADII * radius, BESIDE_RADII * radius))
     total = CANDIDATES * count
     random = torch.rand(total, 4, generator=generator, device=generator.device).to(device)
     which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
     points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
+    if side is not None:
+        place, direction = (part.to(device) for part in side)
+        across = (points - place) @ direction + ACROSS_RADII * radius
+        points = points - 2 * across.clamp_max(0)[:, None] * direction  # mirrored into it
     own, seen = views[link].scores(points)
     likely = torch.nonzero((own > 0.5 * POSSIBLE) & (seen > MIN_SEEN))[:, 0]
     others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
