@@ -51,7 +51,8 @@ class PoseColumns:
 
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
-    column of which only the values `good` mark measured rows; rate_hz: where time counts frames.
+    column of which only the values `good` mark measured rows; rate_hz: where time counts frames; tool: which, by port,
+    name or serial number, in an NDI export of several.
     """
 
     path: Path
@@ -65,6 +66,7 @@ class PoseColumns:
     good: tuple[str, ...] = ("OK",)
     units: Units = field(default_factory=Units)
     rate_hz: float | None = None
+    tool: str | None = None
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from neeco.errors import NeecoError
 from neeco.ingest import columns as named
 from neeco.ingest.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
 from neeco.ingest.formats import Table, column_index, count_rows, list_lines, numbers, read_table
+from neeco.ingest.ndi import tool_columns
 from neeco.raster.rotations import rotation_error
 
 MIN_SAMPLES = 4  # of a usable log
@@ -94,7 +95,7 @@ class Rows:
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
-    table = read_table(source.path)
+    table = tool_columns(read_table(source.path), source)
     found = named.recognise_pose(table.header)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)

@@ -377,7 +377,7 @@ def _joints_of(section: Section) -> dict[str, Any]:
 
 def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
     """A log of poses: a file's name, or a mapping."""
-    section, file = _log(parent, key, value)
+    section, file = _log(parent, key, value, ("tool",))
     keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
     columns = section.section("columns", keys)
     forms = [form for form in ("quaternion", *FORMS) if columns.value.get(form) is not None]
@@ -403,6 +403,7 @@ def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
     return PoseColumns(
         file, section.text("clock") or TRACKER_CLOCK, columns.names("time", (1, 2)), columns.names("position", (3,)),
         rotation, form, convention, columns.text("state"), goods, _units(section), section.number("rate_hz", above=0.0),
+        section.text("tool"),
     )  # fmt: skip
 
 
