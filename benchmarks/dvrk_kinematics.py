@@ -1,6 +1,7 @@
 """State the links of the da Vinci arms of a capture whose poses are those of `measured_cp`, as the dVRK logs them.
 
-The wrist's joints are recorded as wrist_pitch_rad and wrist_yaw_rad; how far the jaws are open is not.
+The wrist's joints are recorded as wrist_pitch_rad and wrist_yaw_rad; how far the jaws are open is not, and is found
+from the images.
 
     python benchmarks/dvrk_kinematics.py CAPTURE OUTPUT TOOL.json [--transforms transforms_registered.json]
 
@@ -19,6 +20,9 @@ from neeco.capture.dvrk import read_dvrk_tool
 from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 
 
+JAW_LIMITS = (0.0, 1.2)  # rad
+
+
 def main() -> None:
     """Read, state the links, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -29,7 +33,11 @@ def main() -> None:
     given = parser.parse_args()
     tree = read_dvrk_tool(given.tool, {"wrist_pitch": "wrist_pitch_rad", "wrist_yaw": "wrist_yaw_rad"})
     capture = read_capture(given.capture, given.transforms)
-    instruments = tuple(replace(item, kinematics=tree) for item in capture.instruments)
+    missing = dict.fromkeys(set(tree.readings) - set(capture.instruments[0].joints), JAW_LIMITS)
+    instruments = tuple(
+        replace(item, joints={**item.joints, **missing}, kinematics=tree, unrecorded=tuple(missing))
+        for item in capture.instruments
+    )
     write_capture(replace(capture, instruments=instruments), given.output)
     references = given.capture / REFERENCE_FOLDER
     if references.is_dir():  # hand-made masks that `neeco evaluate` scores against
