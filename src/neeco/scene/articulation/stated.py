@@ -45,6 +45,8 @@ class StatedLinks(Articulation):
     gains: Tensor  # [J, L - 1, R] value of joint j for link l per unit of reading r
     constants: Tensor  # [J, L - 1] value at readings of 0
     observable: Tensor  # [R] 1 where a reading's offset shows in axes that it moves, else 0
+    outer: Tensor  # [J, L] 1 for links beyond a joint that turns, else 0
+    inner: Tensor  # [J, L] 1 for the link that carries it, else 0
     tips: Tensor  # [L, 3] mm, at rest; nan: not measured, or another link follows
     rates: ClassVar[Mapping[str, float]] = {
         **Articulation.rates,
@@ -81,9 +83,20 @@ class StatedLinks(Articulation):
         self.axis_shifts = nn.Parameter(torch.zeros(len(first), 3))
         self.reading_offsets = nn.Parameter(torch.zeros(len(tree.readings)))
         self.reading_gains = nn.Parameter(torch.zeros(len(tree.readings)))
-        moving = {self._inner_joint(j) for j in range(len(first))}
+        parents = [group[0].parent for group in self.joint_groups]
+        # of every joint, that which moves its axis; -1: none
+        self.inner_joints = tuple(
+            next((j for j, group in enumerate(self.joint_groups) if any(one.name == parent for one in group)), -1)
+            for parent in parents
+        )
+        moving = set(self.inner_joints)
         carries = [any(bool(gains[j, :, r].any()) for j in moving if j >= 0) for r in range(len(tree.readings))]
         self.register_buffer("observable", torch.tensor(carries, dtype=torch.float32), persistent=False)
+        turns = torch.tensor([not slides for slides in self.slides], dtype=torch.float32)[:, None]
+        moved = torch.stack([self._moves(j) for j in range(len(first))]) if first else torch.zeros(0, len(links) - 1)
+        carrier = torch.tensor([self._link_of(parent) for parent in parents], dtype=torch.long)
+        self.register_buffer("outer", turns * nn.functional.pad(moved.float(), (1, 0)), persistent=False)
+        self.register_buffer("inner", turns * nn.functional.one_hot(carrier, len(links)), persistent=False)
         self._pivot_names = [_common_name([link.name for link in group]) for group in self.joint_groups]
         self._ends = [k for k, link in enumerate(links) if k and not any(o.parent == link.name for o in links)]
         self.skeleton = (("shaft_far", "shaft_near"), *self._bones())
@@ -115,33 +128,29 @@ class StatedLinks(Articulation):
     @torch.no_grad()
     def _sides(self, points: Tensor) -> Tensor:
         """[M, L] logits, at most 0, of Gaussians at points [M, 3] mm."""
-        sides = points.new_zeros(len(points), self.link_count)
         pivots, axes = self.axes()
-        directions: dict[int, Tensor] = {}
+        directions = self._link_directions(pivots)
+        along = (points @ directions.T - (pivots * directions).sum(1)) / self.radius  # [M, J]
+        aside = (points @ axes.T - (pivots * axes).sum(1)).abs() / self.radius  # [M, J]
+        prongs = PRONGS * ((aside - PRONGS_FROM) / (PRONGS_TO - PRONGS_FROM)).clamp(0, 1)
+        beyond = SIDE_LOGITS * (along - SIDE_AT - prongs)
+        return beyond.clamp_max(0) @ self.outer - beyond.clamp_min(0) @ self.inner
+
+    def _link_directions(self, pivots: Tensor) -> Tensor:
+        """[J, 3] unit: of the links at every joint at rest, from the joint's own carrier's pivot; else the shaft's."""
+        directions = [self.shaft()[1]] * len(pivots)
         for joint in reversed(range(len(pivots))):  # the innermost first
-            if self.slides[joint]:
-                continue
-            inner = self._inner_joint(joint)
-            directions[joint] = directions.get(inner, self.shaft()[1])
-            if inner in directions and float((step := pivots[joint] - pivots[inner]).norm()) > MIN_STEP:
-                directions[joint] = nn.functional.normalize(step, dim=0)
-            along = (points - pivots[joint]) @ directions[joint]  # [M] mm
-            aside = ((points - pivots[joint]) @ axes[joint]).abs() / self.radius  # [M]
-            prongs = PRONGS * ((aside - PRONGS_FROM) / (PRONGS_TO - PRONGS_FROM)).clamp(0, 1)
-            beyond = SIDE_LOGITS * (along / self.radius - SIDE_AT - prongs)
-            sides[:, 1:][:, self._moves(joint)] += beyond.clamp_max(0)[:, None]
-            sides[:, self._link_of(self.joint_groups[joint][0].parent)] -= beyond.clamp_min(0)
-        return sides
+            inner = self.inner_joints[joint]
+            if inner >= 0 and not self.slides[joint]:
+                step = pivots[joint] - pivots[inner]
+                far = float(step.norm()) > MIN_STEP
+                directions[joint] = nn.functional.normalize(step, dim=0) if far else directions[inner]
+        return torch.stack(directions)
 
     @property
     def _following(self) -> int:
         """The link that follows the shaft."""
         return next(k for k in range(1, self.link_count) if bool(self._moves(len(self.points) - 1)[k - 1]))
-
-    def _inner_joint(self, joint: int) -> int:
-        """The joint that moves the axis of another; -1: none."""
-        parent = self.joint_groups[joint][0].parent
-        return next((j for j, group in enumerate(self.joint_groups) if any(one.name == parent for one in group)), -1)
 
     @property
     def slides(self) -> tuple[bool, ...]:
@@ -231,7 +240,7 @@ class StatedLinks(Articulation):
         that it carries; None where there are not two."""
         pivots, _ = self.axes()
         for joint in reversed(range(len(pivots))):
-            inner = self._inner_joint(joint)
+            inner = self.inner_joints[joint]
             if inner < 0 or self.slides[joint] or self.slides[inner]:
                 continue
             step = pivots[joint] - pivots[inner]
@@ -302,9 +311,12 @@ class StatedLinks(Articulation):
         return (self.gains[joint].abs().amax(1) > 0) | (self.constants[joint] != 0)
 
     def _link_of(self, name: str | None) -> int:
-        """Index of the link that moves as `name` does."""
-        moves = _signature(self.tree, name)
-        return next(k for k, part in enumerate(self.part_names) if _signature(self.tree, part) == moves)
+        """Index of the link that moves as `name` does; of a frame that none does, as what carries it."""
+        numbers = {_signature(self.tree, part): k for k, part in reversed(list(enumerate(self.part_names)))}
+        parents = {link.name: link.parent for link in self.tree.links}
+        while name is not None and _signature(self.tree, name) not in numbers:
+            name = parents[name]
+        return 0 if name is None else numbers[_signature(self.tree, name)]
 
     def _bones(self) -> list[tuple[str, str]]:
         """Lines from every pivot to those it carries and to the tips beyond."""
