@@ -53,9 +53,9 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
         )
         raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
     first = min(tool.columns[0] for tool in tools)
-    kept = [*range(first), *chosen[0].columns]
-    header = tuple(_NUMBERED.sub("", table.header[index]) for index in kept)
-    rows = [[cells[index] if index < len(cells) else "" for index in kept] for cells in table.rows]
+    columns = [*range(first), *chosen[0].columns]
+    header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)
+    rows = [[cells[index] if index < len(cells) else "" for index in columns] for cells in table.rows]
     return replace(table, header=header, rows=rows)
 
 

@@ -51,14 +51,14 @@ def _errors(
     """[V] summed error of a frame's image with every value of the joint, where what it moves is with any of them."""
     state, camera = session.corrected(frame)
     target, mask = session.views.target(frame), session.views.mask(frame)
-    drawn = []
+    renderings = []
     for value in values.tolist():
         variant = with_reading(state, instrument.name, reading, value)
-        drawn.append(rasterize(session.scene.at(variant), camera, channels=moving))
-    covered = torch.stack([one.channels[..., 0] for one in drawn if one.channels is not None]).amax(0) > COVERED
+        renderings.append(rasterize(session.scene.at(variant), camera, channels=moving))
+    covered = torch.stack([one.channels[..., 0] for one in renderings if one.channels is not None]).amax(0) > COVERED
     if mask is not None:
         covered &= mask
-    return np.array([float((one.color - target).abs().mean(-1)[covered].sum()) for one in drawn])
+    return np.array([float((one.color - target).abs().mean(-1)[covered].sum()) for one in renderings])
 
 
 def smooth_path(costs: np.ndarray, values: np.ndarray, sigma: float) -> list[float]:
