@@ -19,7 +19,6 @@ from neeco.capture import read_capture, write_capture
 from neeco.capture.dvrk import read_dvrk_tool
 from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 
-
 JAW_LIMITS = (0.0, 1.2)  # rad
 
 

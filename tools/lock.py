@@ -47,7 +47,9 @@ def groups() -> dict[str, Group]:
         "neeco": Group("what neeco needs to run", includes=()),
         "build": Group("what neeco is built with", None, build, ()),
         **{extra: Group(f"the extra {extra}", (extra,)) for extra in extras},
-        "dev": Group("the extra dev", ("dev",), includes=("neeco", "build", "docs", "downstream", "ingest", "urdf", "view")),
+        "dev": Group(
+            "the extra dev", ("dev",), includes=("neeco", "build", "docs", "downstream", "ingest", "urdf", "view")
+        ),
         "nvidia": Group("PyTorch's CUDA build, which PyPI has for Linux", ("triton",), includes=("triton",)),
         "wasm": Group("make viewer", None, ("ziglang",), ()),
     }

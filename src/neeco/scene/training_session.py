@@ -143,8 +143,6 @@ class InstrumentSearch:
     place_wrists: Callable[[ArticulatedInstruments], None]
     # find it again, and move a wrist where spinning the shaft behind it costs no more than before
     replace_wrists: Callable[[ArticulatedInstruments], None]
-    # find the values of joints that nobody recorded
-    find_unrecorded: Callable[[ArticulatedInstruments], None]
     # find lamps that explain the instruments' shadows, beside those found before
     find_shadow: Callable[[], None]
     # find how far each of the instruments' Gaussians counts as instrument, by the images' colours

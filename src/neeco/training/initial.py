@@ -23,7 +23,6 @@ from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.label_shares import store_label_shares
 from neeco.training.instruments.shadow import find_shadow
-from neeco.training.instruments.unrecorded import find_unrecorded
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
 
@@ -47,7 +46,6 @@ def begin_session(
         bound=_searching(session, bound_volume),
         place_wrists=_searching(session, place_wrists),
         replace_wrists=_searching(session, replace_wrists),
-        find_unrecorded=_searching(session, find_unrecorded, as_learned=True),
         find_shadow=_searching(session, find_shadow, as_learned=True),
         weigh_labels=partial(store_label_shares, session),  # in full: reduced pixels mix thin Gaussians with tissue
         conclude=partial(conclude, session),

@@ -141,12 +141,6 @@ class Refinement:
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             self.cameras[seen] -= self.cameras[seen].mean(0)
 
-    @torch.no_grad()
-    def set_unrecorded(self, instrument: Instrument, reading: str, values: list[float]) -> None:
-        """Put a joint that nobody recorded to these values, one per instant."""
-        column = self.readings.index((instrument.name, reading))
-        self.joints[:, column] = torch.tensor(values).to(self.joints) - instrument.halfway(reading)
-
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
         """The recording with joints that nobody recorded as they were found, within their limits."""
         if not bool(self.unrecorded.any()):

@@ -47,7 +47,6 @@ from neeco.scene.visibility import extrapolate_tissue, outside_all_views
 
 WRISTS_AT = 0.4  # of the run: the shape is there, and time is left to learn
 WRISTS_AGAIN_AT = (0.6, 0.8)  # of the run
-UNRECORDED_AT = (0.2, 0.3, 0.4, 0.5)  # of the run: joints that nobody recorded are looked for
 PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
 
 
@@ -265,8 +264,6 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
         passed = [mark for mark in (WRISTS_AT, *WRISTS_AGAIN_AT) if before < mark <= training.progress]
         if self.settings.shadow and (passed or any(map(training.reached, self.settings.shadow_at))):
             training.instruments.find_shadow()
-        if any(before < mark <= training.progress for mark in UNRECORDED_AT):
-            training.instruments.find_unrecorded(self)
         if WRISTS_AT in passed:
             training.instruments.place_wrists(self)
         elif passed and self.settings.refine_wrists:

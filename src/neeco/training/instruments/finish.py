@@ -77,14 +77,14 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     readings = torch.tensor([state.instruments[instrument.name].joints[name] for state in scene.recorded.states])
     ordered = readings.argsort()
     extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
-    moving = moving_weight(scene.canonical, articulated, index, name)
+    moving = _moving_weight(scene.canonical, articulated, index, name)
     given = middle = 0.0
     for frame_index in extremes:
         state, camera = session.corrected(frame_index)
         target = session.views.target(frame_index)
         renderings = [
             rasterize(scene.at(variant), camera, channels=moving)
-            for variant in (state, with_reading(state, instrument.name, name, float(readings.mean())))
+            for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
         ]
         covered = torch.maximum(*(r.channels[..., 0] for r in renderings if r.channels is not None)) > 0.3
         mask = session.views.mask(frame_index)
@@ -112,7 +112,7 @@ def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, inde
     }
 
 
-def moving_weight(
+def _moving_weight(
     canonical: CanonicalGaussians, articulated: ArticulatedInstruments, index: int, reading: str
 ) -> Tensor:
     """[N, 1] share of each Gaussian of instrument `index` that a reading moves."""
@@ -122,8 +122,7 @@ def moving_weight(
     return weight
 
 
-def with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
-    """The state with one joint of an instrument at another reading."""
+def _with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
     given = state.instruments[instrument]
     changed = InstrumentState(given.pose, {**given.joints, joint: reading})
     return State({**state.instruments, instrument: changed}, state.time)
