@@ -94,7 +94,7 @@ class StatedLinks(Articulation):
         self.register_buffer("observable", torch.tensor(carries, dtype=torch.float32), persistent=False)
         turns = torch.tensor([not slides for slides in self.slides], dtype=torch.float32)[:, None]
         moved = torch.stack([self._moves(j) for j in range(len(first))]) if first else torch.zeros(0, len(links) - 1)
-        carrier = torch.tensor([self._link_of(parent) for parent in parents], dtype=torch.long)
+        carrier = torch.tensor([self.link_of(parent) for parent in parents], dtype=torch.long)
         self.register_buffer("outer", turns * nn.functional.pad(moved.float(), (1, 0)), persistent=False)
         self.register_buffer("inner", turns * nn.functional.one_hot(carrier, len(links)), persistent=False)
         self._pivot_names = [_common_name([link.name for link in group]) for group in self.joint_groups]
@@ -186,7 +186,7 @@ class StatedLinks(Articulation):
         where no link follows it, else as far as the pivots beyond and `beside` those."""
         pivots, _ = self.axes()
         own = next(j for j in range(len(pivots)) if bool(self._moves(j)[link - 1]))
-        beyond = [j for j, group in enumerate(self.joint_groups) if self._link_of(group[0].parent) == link]
+        beyond = [j for j, group in enumerate(self.joint_groups) if self.link_of(group[0].parent) == link]
         if not beyond:
             return pivots[own][None], pivots.new_tensor([reach])
         middle = torch.stack([(pivots[own] + pivots[j]) / 2 for j in beyond])
@@ -214,7 +214,7 @@ class StatedLinks(Articulation):
         found = {}
         pivots, _ = self.axes()
         for name, group, pivot in zip(self._pivot_names[::-1], self.joint_groups[::-1], pivots.flip(0), strict=True):
-            carrier = self._link_of(group[0].parent)
+            carrier = self.link_of(group[0].parent)
             if group[0].type == PRISMATIC:  # where across the axis it lies, no image shows: on the shaft's
                 origin, direction = self.shaft()
                 pivot = origin + ((pivot - origin) @ direction) * direction
@@ -310,7 +310,7 @@ class StatedLinks(Articulation):
         """[L - 1] bool: which links a joint moves."""
         return (self.gains[joint].abs().amax(1) > 0) | (self.constants[joint] != 0)
 
-    def _link_of(self, name: str | None) -> int:
+    def link_of(self, name: str | None) -> int:
         """Index of the link that moves as `name` does; of a frame that none does, as what carries it."""
         numbers = {_signature(self.tree, part): k for k, part in reversed(list(enumerate(self.part_names)))}
         parents = {link.name: link.parent for link in self.tree.links}
