@@ -18,7 +18,7 @@ from lock import ROOT, groups, locked
 NOTICE = ROOT / "NOTICE"
 PART = "Part 2. What is installed beside neeco, none of it passed on with it"
 # what neeco imports when it runs; with the rest it is built, tested and looked after
-IMPORTED = ("neeco", "cluster", "cuda", "downstream", "ingest", "triton", "view")
+IMPORTED = ("neeco", "cluster", "cuda", "downstream", "ingest", "triton", "urdf", "view")
 
 ALLOWED = re.compile(
     r"((the )?mit\b|mit-cmu|apache|(3-clause )?bsd|freebsd|0bsd|isc\b|zlib|cc0|bsl-1|psf|python software foundation"
@@ -33,6 +33,7 @@ FOUND = {
 # what a package's own licence does not tell
 REMARKS = {
     "av": "its wheels bring FFmpeg (LGPL) linked to x264 and x265 (GPL-2.0-or-later); neeco passes none of it on",
+    "lxml": "its wheels bring libxml2 and libxslt (MIT); neeco passes none of it on",
     "opencv-python-headless": "its wheels bring FFmpeg (LGPL-2.1-or-later)",
 }
 
