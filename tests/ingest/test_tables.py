@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neeco.errors import NeecoError
-from neeco.ingest.formats import log_formats, read_table
+from neeco.ingest.formats import read_table, recording_formats
 from neeco.ingest.logs import Rows
 
 
@@ -40,6 +40,11 @@ def test_a_file_that_no_other_format_claims_is_delimited_text(tmp_path, name):
     assert table.lines.tolist() == [3, 4]
 
 
-def test_every_format_says_which_suffixes_it_reads():
-    assert {".csv", ".tsv", ".txt"} <= set(log_formats())
-    assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in log_formats())
+def test_every_format_says_what_it_reads():
+    formats = recording_formats()
+    assert formats[-1].format == "delimited text"
+    assert {".csv", ".tsv", ".txt"} <= {suffix for known in formats for suffix in known.suffixes}
+    for known in formats:
+        assert known.holds
+        assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in known.suffixes)
+        assert (known.package is None) == (known.extra is None)

@@ -25,7 +25,8 @@ class Ingest:
     """Make a capture from a recording: video and tracker logs; says how good it is in CAPTURE/ingest.html."""
 
     source: Annotated[Path | None, tyro.conf.Positional] = None
-    """recording.yaml, or a folder in another format to convert (nerfstudio, Blender, COLMAP, EndoNeRF)."""
+    """recording.yaml, or a folder in another format to convert (nerfstudio, Blender, COLMAP, EndoNeRF); with --init, a
+    recording's folder or file."""
     output: Path | None = None
     """Folder of the capture to write; must not exist."""
     video: Path | None = None
@@ -47,7 +48,10 @@ class Ingest:
     frames: int | None = None
     """How many frames to keep, spread over states and views."""
     init: bool = False
-    """Look at the files in SOURCE (a folder; default: here) and write a commented recording.yaml into it."""
+    """Look at the files in SOURCE (a folder; default: here), or into a file of several streams, and write a commented
+    recording.yaml into it, or beside it."""
+    formats: bool = False
+    """List the formats that recordings are read from."""
     json: bool = False
     """Print the numbers as JSON."""
 
@@ -56,6 +60,9 @@ def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
     from neeco.errors import NeecoError
 
+    if args.formats:
+        _refuse_beside(args, "--formats", keep=("formats",))
+        return _list_formats()
     if args.init:
         _refuse_beside(args, "--init", keep=())
         return _init(args.source or Path())
@@ -79,12 +86,24 @@ def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
             raise NeecoError(f"{what}, and --{option.name} would be ignored beside it; leave one of them out")
 
 
+def _list_formats() -> int:
+    from rich.table import Table
+
+    from neeco.ingest.formats import recording_formats
+
+    table = Table("format", "read of it", "needs")
+    for known in recording_formats():
+        table.add_row(known.format, known.holds, f"neeco[{known.extra}]" if known.extra else "")
+    Console().print(table)
+    return 0
+
+
 def _init(folder: Path) -> int:
     from neeco.errors import NeecoError
     from neeco.files import write_text
-    from neeco.ingest.template import write_template
+    from neeco.ingest.template import holds_streams, write_template
 
-    path = folder / RECORDING
+    path = (folder.parent if holds_streams(folder) else folder) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     write_text(path, write_template(folder))

@@ -10,6 +10,7 @@ from pathlib import Path
 from neeco.errors import NeecoError
 
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
+VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same file
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
 FORMS = {
@@ -52,7 +53,7 @@ class PoseColumns:
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
     column of which only the values `good` mark measured rows; rate_hz: where time counts frames; tool: which, by port,
-    name or serial number, in an NDI export of several.
+    name or serial number, in an NDI export of several; stream: which, of a file that holds several.
     """
 
     path: Path
@@ -67,12 +68,13 @@ class PoseColumns:
     units: Units = field(default_factory=Units)
     rate_hz: float | None = None
     tool: str | None = None
+    stream: str | None = None
 
 
 @dataclass(frozen=True)
 class JointColumns:
     """A log of one joint sensor. calibration: a table from its counts to angles (None: the column holds angles);
-    limits: of the joint, rad, for the capture."""
+    limits: of the joint, rad, for the capture; stream: which, of a file that holds several."""
 
     path: Path
     clock: str
@@ -82,6 +84,7 @@ class JointColumns:
     rate_hz: float | None = None
     calibration: Path | None = None
     limits: tuple[float, float] | None = None
+    stream: str | None = None
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Rows:
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
-    table = tool_columns(read_table(source.path), source)
+    table = tool_columns(read_table(source.path, source.stream), source)
     found = named.recognise_pose(table.header)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
@@ -112,7 +112,7 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
 def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
-    table = read_table(source.path)
+    table = read_table(source.path, source.stream)
     value, found = named.recognise_value(table.header)
     value = source.value or value
     if value is None:

@@ -19,7 +19,7 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.convert import staged
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
-from neeco.ingest.lens import BORDER_SAMPLES, find_border, read_lens, visible_mask
+from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, Recording, Splits
 from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
@@ -140,20 +140,13 @@ class _Ingest:
 
     def _read_lens(self) -> Lens | None:
         """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
-        given = self.recording.intrinsics
-        where = given if isinstance(given, Path) else f"{self.recording.path}: intrinsics"
-        try:
-            lens = read_lens(given)
-            if lens is not None:
-                lens.check_size(self.size, where)
+        lens, where = self.recording.read_lens()
+        if lens is not None:
+            lens.check_size(self.size, where)
+            try:
                 lens.pinhole(self.size)
-        except NeecoError as error:
-            message = str(error)
-            for name in ("intrinsics", "lens"):  # which is all that numbers and distortion know of where they came from
-                message = (
-                    f"{where}: {message.removeprefix(f'{name}: ')}" if message.startswith(f"{name}: ") else message
-                )
-            raise NeecoError(message) from error
+            except NeecoError as error:  # it knows nothing of where it came from
+                raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
         return lens
 
     def _choose(self) -> np.ndarray:

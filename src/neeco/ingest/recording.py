@@ -16,12 +16,15 @@ from neeco.capture.dvrk import READINGS as DVRK_READINGS
 from neeco.capture.dvrk import read_dvrk_tool
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.kinematicsfile import parse_kinematics
+from neeco.capture.lens import Lens
 from neeco.capture.urdf import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest import columns as named
-from neeco.ingest.columns import FORMS, TRACKER_CLOCK, JointColumns, PoseColumns, Units
-from neeco.ingest.video import VideoSource, open_images, open_video
+from neeco.ingest.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
+from neeco.ingest.formats import VideoSource, format_of
+from neeco.ingest.lens import read_lens
+from neeco.ingest.video import open_images, open_video
 
 MIN_FRAMES = 10  # that cameras can be found from
 LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
@@ -71,9 +74,10 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class Recording:
-    """What was recorded. path: the file that said so (for messages). One of video and images is given; fps: overrides
-    a video's own times; times: a CSV of the images' times; intrinsics: a calibration file, (fl_x, fl_y, cx, cy) px or
-    None (estimated); sync: t_log = t_video + offset s of each clock that is known; frames: how many to keep."""
+    """What was recorded. path: the file that said so (for messages). One of video and images is given; stream: which,
+    where `video` holds several; fps: overrides a video's own times; times: a CSV of the images' times; intrinsics: a
+    calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s
+    of each clock that is known; frames: how many to keep."""
 
     path: Path
     video: Path | None = None
@@ -88,6 +92,7 @@ class Recording:
     splits: Splits | None = None
     notes: tuple[str, ...] = ()
     settings: IngestSettings = field(default_factory=IngestSettings)
+    stream: str | None = None
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -97,9 +102,25 @@ class Recording:
     def open(self) -> VideoSource:
         """The frames. Raises NeecoError."""
         if self.video is not None:
+            known = format_of(self.video)
+            if known is not None:
+                known.require_package(self.video)
+                return known.open_images(self.video, self.stream)
             return open_video(self.video, self.fps)
         assert self.images is not None
         return open_images(self.images, self.fps, self.times)
+
+    def read_lens(self) -> tuple[Lens | None, str]:
+        """The lens given, else that which the images' file states (None: to be estimated), and what says so. Raises
+        NeecoError."""
+        if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
+            return known.lens(self.video, self.stream), str(self.video)
+        where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else f"{self.path}: intrinsics"
+        try:
+            return read_lens(self.intrinsics), where
+        except NeecoError as error:
+            # numbers know nothing of where they came from
+            raise NeecoError(f"{where}: {str(error).removeprefix('intrinsics: ')}") from error
 
 
 def read_recording(path: Path) -> Recording:
@@ -107,14 +128,14 @@ def read_recording(path: Path) -> Recording:
     path = Path(path)
     keys = ("video", "images", "intrinsics", "instruments", "laparoscope", "sync", "frames", "splits", "settings")
     top = Section(path, "", _load(path), keys)
-    video, images, fps, times = _frames_from(top)
-    instruments = _instruments(top)
+    video, images, fps, times, stream = _frames_from(top)
+    instruments = _instruments(top, video)
     laparoscope = top.value.get("laparoscope")
-    scope = None if laparoscope is None else _pose_columns(top, "laparoscope", laparoscope)
+    scope = None if laparoscope is None else _pose_columns(top, "laparoscope", laparoscope, video)
     sync, notes = _sync(top, _clocks(instruments, scope))
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
-        top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top),
+        top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
     )  # fmt: skip
 
 
@@ -288,22 +309,25 @@ def _load(path: Path) -> Any:
     return document
 
 
-def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, Path | None]:
-    """Video, images, fps and times of images."""
+def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, Path | None, str | None]:
+    """Video, images, fps, times of images, and which stream of the video's file."""
     video, images = top.value.get("video"), top.value.get("images")
     if (video is None) == (images is None):
         raise top.error("video", "missing or twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`")
-    key, keys = ("video", ("file", "fps")) if images is None else ("images", ("folder", "fps", "times"))
+    key, keys = ("video", ("file", "fps", "stream")) if images is None else ("images", ("folder", "fps", "times"))
     value = top.value[key]
     section = Section(top.file, key, value if isinstance(value, dict) else {keys[0]: value}, keys)
     source = section.path(keys[0], required=True)
     fps = section.number("fps", above=0.0)
     if images is None:
-        return source, None, fps, None
+        stream = section.text("stream")
+        if stream is not None and format_of(source) is None:
+            raise section.error("stream", "a video has one; leave it out")
+        return source, None, fps, None, stream
     times = section.path("times")
     if fps is None and times is None:
         raise section.error("fps", "when were the images taken? Give fps or times (a CSV file)")
-    return None, source, fps, times
+    return None, source, fps, times, None
 
 
 def _intrinsics(top: Section) -> Path | tuple[float, ...] | None:
@@ -315,7 +339,7 @@ def _intrinsics(top: Section) -> Path | tuple[float, ...] | None:
     return tuple(numbers)
 
 
-def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
+def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]:
     value = top.value.get("instruments")
     if value is None:
         return ()
@@ -332,11 +356,11 @@ def _instruments(top: Section) -> tuple[InstrumentLogs, ...]:
         if names.count(name) > 1:
             raise section.error("name", f"{printable(name)} names two instruments; give each its own")
         poses = section.value.get("poses")
-        columns = None if poses is None else _pose_columns(section, "poses", poses)
+        columns = None if poses is None else _pose_columns(section, "poses", poses, video)
         joints = {}
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
-            joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns)
+            joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
         found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints))))
     return tuple(found)
 
@@ -375,8 +399,8 @@ def _joints_of(section: Section) -> dict[str, Any]:
     return value
 
 
-def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
-    """A log of poses: a file's name, or a mapping."""
+def _pose_columns(parent: Section, key: str, value: Any, video: Path | None) -> PoseColumns:
+    """A log of poses: a file's name, or a mapping. In the file of the images it shares their clock."""
     section, file = _log(parent, key, value, ("tool",))
     keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
     columns = section.section("columns", keys)
@@ -400,31 +424,39 @@ def _pose_columns(parent: Section, key: str, value: Any) -> PoseColumns:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
     good = columns.value.get("good")
     goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
+    clock = section.text("clock") or (VIDEO_CLOCK if file == video else TRACKER_CLOCK)
     return PoseColumns(
-        file, section.text("clock") or TRACKER_CLOCK, columns.names("time", (1, 2)), columns.names("position", (3,)),
+        file, clock, columns.names("time", (1, 2)), columns.names("position", (3,)),
         rotation, form, convention, columns.text("state"), goods, _units(section), section.number("rate_hz", above=0.0),
-        section.text("tool"),
+        section.text("tool"), section.text("stream"),
     )  # fmt: skip
 
 
-def _joint_columns(parent: Section, key: str, value: Any, clock: str, poses: PoseColumns | None) -> JointColumns:
-    """A log of a joint: a file's name, or a mapping. In the file of the poses it shares their clock."""
+def _joint_columns(
+    parent: Section, key: str, value: Any, clock: str, poses: PoseColumns | None, video: Path | None
+) -> JointColumns:
+    """A log of a joint: a file's name, or a mapping. In the file of the poses, or of the images, it shares their
+    clock."""
     section, file = _log(parent, key, value, ("calibration", "limits"))
     if poses is not None and file == poses.path:
         clock = poses.clock
+    elif file == video:
+        clock = VIDEO_CLOCK
     columns = section.section("columns", ("time", "value"))
     names = columns.names("value", (1,))
     limits = section.node.child("limits").range("rad") if section.node.has("limits") else None
     return JointColumns(
         file, section.text("clock") or clock, columns.names("time", (1, 2)), names[0] if names else None,
         _units(section), section.number("rate_hz", above=0.0), section.path("calibration"), limits,
+        section.text("stream"),
     )  # fmt: skip
 
 
 def _log(parent: Section, key: str, value: Any, more: tuple[str, ...] = ()) -> tuple[Section, Path]:
     """What the recording says of one log, and the log's file. more: keys that only this kind of log has."""
     value = value if isinstance(value, dict) else {"file": value}
-    section = Section(parent.file, parent.at(key), value, ("file", "clock", "columns", "units", "rate_hz", *more))
+    keys = ("file", "stream", "clock", "columns", "units", "rate_hz", *more)
+    section = Section(parent.file, parent.at(key), value, keys)
     return section, section.path("file", required=True)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
+from neeco.ingest.columns import VIDEO_CLOCK
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
@@ -46,6 +47,8 @@ class SynchronizedRecording:
             self.note("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
         self._check_video()
         self.clocks = {name: ClockOffset(float(seconds), 0.0, "given") for name, seconds in recording.sync.items()}
+        if VIDEO_CLOCK in recording.clocks:
+            self.clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
         self._assume_joint_clocks()
 
     def note(self, note: str) -> None:

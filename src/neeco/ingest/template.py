@@ -15,8 +15,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError
 from neeco.files import read_json
-from neeco.ingest.columns import MATRIX, RecognisedColumns, recognise_pose, recognise_value, split_unit
-from neeco.ingest.formats import log_formats, read_table
+from neeco.ingest.columns import MATRIX, RecognisedColumns, recognise_pose, recognise_time, recognise_value, split_unit
+from neeco.ingest.formats import IMAGES as IMAGE_STREAMS
+from neeco.ingest.formats import OTHER, POSES, READINGS, Stream, format_of, read_table
 from neeco.ingest.lens import read_lens
 from neeco.ingest.video import IMAGES
 
@@ -24,40 +25,63 @@ VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts
 MAX_FILES = 400  # looked at; a folder with more is not one recording
 MIN_IMAGES = 10  # in a folder of frames
 MAX_CALIBRATION_ROWS = 200
+MAX_OTHERS = 60  # listed as not used
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Log:
+    """A log: its file, relative to the folder, and which stream of it."""
+
+    file: str
+    stream: str | None = None
+
+    @property
+    def stem(self) -> str:
+        """What it may be called."""
+        return Path(self.file).stem if self.stream is None else re.sub(r"[^A-Za-z0-9]+", "_", self.stream).strip("_")
+
+    def lines(self) -> list[str]:
+        return [f"file: {_scalar(self.file)}", *([] if self.stream is None else [f"stream: {_scalar(self.stream)}"])]
 
 
 @dataclass
 class _FolderFiles:
     """What the files of a folder seem to be, as paths relative to it."""
 
-    videos: list[str] = field(default_factory=list)
+    videos: list[_Log] = field(default_factory=list)
     images: list[str] = field(default_factory=list)
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
-    poses: list[tuple[str, RecognisedColumns]] = field(default_factory=list)
-    joints: list[tuple[str, RecognisedColumns, str]] = field(default_factory=list)
+    poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
+    joints: list[tuple[_Log, RecognisedColumns, str]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
 
 
-def write_template(folder: Path) -> str:
-    """The text of a recording.yaml for the files in a folder and its subfolders; `read_recording` accepts it.
+def write_template(source: Path) -> str:
+    """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
+    several streams, to stand beside it; `read_recording` accepts it.
 
-    Raises NeecoError when the folder holds no video and no images.
+    Raises NeecoError when there are no images.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise NeecoError(f"{folder}: {'is a file' if folder.exists() else 'not there'}; give the recording's folder")
-    found = _find_files(folder)
+    source = Path(source)
+    known = format_of(source)
+    if known is not None and source.exists():
+        known.require_package(source)
+    if source.is_file() and (known is None or not known.streams(source)):
+        raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
+    if not source.exists():
+        raise NeecoError(f"{source}: not there; give the recording's folder")
+    found = _find_files(source)
     if not found.videos and not found.images:
-        raise NeecoError(f"{folder}: holds no video and no folder of images; put the recording's video there")
-    frames = [f"video: {_scalar(file)}" for file in found.videos]
+        raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
+    frames = [_frames_line(log) for log in found.videos]
     frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
     if not found.videos:
         frames[0] += "   # the rate is a guess: correct it"
-    poses = [(file, columns) for file, columns in found.poses if not _SCOPE.search(Path(file).stem)]
-    scopes = [(file, columns) for file, columns in found.poses if _SCOPE.search(Path(file).stem)]
+    poses = [(log, columns) for log, columns in found.poses if not _SCOPE.search(log.stem)]
+    scopes = [(log, columns) for log, columns in found.poses if _SCOPE.search(log.stem)]
     environment = Environment(
         loader=PackageLoader("neeco.ingest", ""),
         undefined=StrictUndefined,
@@ -71,25 +95,38 @@ def write_template(folder: Path) -> str:
         lenses=found.lenses,
         instruments=_instruments(found, poses),
         scope=_pose_lines(*scopes[0]) if scopes else None,
-        other_scopes=[file for file, _ in scopes[1:]],
+        other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
-        others=found.others[:20],
+        others=found.others[:MAX_OTHERS],
     )
 
 
-def _find_files(folder: Path) -> _FolderFiles:
+def holds_streams(source: Path) -> bool:
+    """Is the path a recording in itself (a bag, a data set's folder), rather than a folder of a recording's files?"""
+    return source.is_file() or format_of(source) is not None
+
+
+def _find_files(source: Path) -> _FolderFiles:
     found = _FolderFiles()
+    if _add_streams(found, source, source.name):
+        return found
+    folder = source
+    for inner in sorted(entry for pattern in ("*", "*/*") for entry in folder.glob(pattern) if entry.is_dir()):
+        _add_streams(found, inner, inner.relative_to(folder).as_posix())
+    held = [folder / log.file for log in [*found.videos, *(log for log, _ in found.poses)]]
     files = sorted(file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.is_file())
     files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
+    files = [file for file in files if not any(other in file.parents for other in held)]
     for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
         if count >= MIN_IMAGES:
             found.images.append(parent.relative_to(folder).as_posix())
     for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
         name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
         if suffix in VIDEOS:
-            found.videos.append(name)
-        elif suffix in log_formats():
-            _classify_table(found, name, file)
+            found.videos.append(_Log(name))
+        elif format_of(file) is not None:
+            if not _add_streams(found, file, name):
+                _classify_table(found, _Log(name), file)
         elif suffix == ".json" and _is_sync(file):
             found.syncs.append(name)
         elif suffix in (".yaml", ".yml", ".json") and _is_lens(file):
@@ -97,7 +134,46 @@ def _find_files(folder: Path) -> _FolderFiles:
     return found
 
 
-def _classify_table(found: _FolderFiles, name: str, file: Path) -> None:
+def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
+    """Add the streams of what holds several, and all of them as a list to choose from."""
+    known = format_of(path)
+    if known is None:
+        return False
+    try:
+        known.require_package(path)
+        streams = known.streams(path)
+    except NeecoError as error:
+        found.others.append(" ".join(str(error).replace(str(path), name).split()))
+        return path.is_dir()
+    for stream in streams:
+        log = _Log(name, stream.name)
+        if stream.kind == IMAGE_STREAMS:
+            found.videos.append(log)
+        elif stream.kind in (POSES, READINGS) and stream.count:
+            _classify_stream(found, log, stream, path)
+        rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
+        if stream.kind == OTHER:
+            found.others.append(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+    return bool(streams)
+
+
+def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path) -> None:
+    table = read_table(path, stream.name)
+    when = recognise_time(table.header)
+    if stream.kind == POSES:
+        found.poses.append((log, recognise_pose(table.header)))
+        return
+    for column in table.header:  # every angle is a joint
+        if split_unit(column, "angle")[1] and column not in (when.time or ()):
+            found.joints.append((log, when, column))
+
+
+def _frames_line(log: _Log) -> str:
+    return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
+
+
+def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
+    name = log.file
     try:
         table = read_table(file)
     except NeecoError as error:
@@ -108,9 +184,9 @@ def _classify_table(found: _FolderFiles, name: str, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        found.poses.append((name, pose))
+        found.poses.append((log, pose))
     elif value and when.time:
-        found.joints.append((name, when, value))
+        found.joints.append((log, when, value))
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
@@ -130,19 +206,20 @@ def _is_lens(file: Path) -> bool:
     return False
 
 
-def _instruments(found: _FolderFiles, poses: Sequence[tuple[str, RecognisedColumns]]) -> list[dict[str, Any]]:
+def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColumns]]) -> list[dict[str, Any]]:
     """Name, lines of the pose log and (name, lines) of the joints of every instrument."""
     if not poses and not found.joints:
         return []
-    names = _unique([Path(file).stem for file, _ in poses]) or ["instrument"]
+    names = _unique([log.stem for log, _ in poses]) or ["instrument"]
     # a joint's log belongs to the instrument that its name begins with, else to the first
     owners = {
-        file: next((name for name in names if Path(file).stem.startswith(name)), names[0]) for file, *_ in found.joints
+        log: next((name for name in names if log.stem.startswith(name.split("_")[0])), names[0])
+        for log, *_ in found.joints
     }
     instruments = []
     for index, name in enumerate(names):
         logs = [log for log in found.joints if owners[log[0]] == name]
-        joints = _unique([_joint_name(file) for file, *_ in logs])
+        joints = _unique([_joint_name(log, value) for log, _, value in logs])
         instruments.append(
             {
                 "name": name,
@@ -153,8 +230,8 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[str, RecognisedColum
     return instruments
 
 
-def _pose_lines(file: str, columns: RecognisedColumns) -> list[str]:
-    lines = [f"file: {_scalar(file)}", "clock: em"]
+def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
+    lines = [*log.lines(), *(["clock: em"] if log.stream is None else [])]
     given = [
         ("time", columns.time),
         ("position", columns.position),
@@ -169,9 +246,9 @@ def _pose_lines(file: str, columns: RecognisedColumns) -> list[str]:
     return lines + _unit_lines(columns, {"length": of_length})
 
 
-def _joint_lines(found: _FolderFiles, file: str, when: RecognisedColumns, value: str) -> list[str]:
-    lines = [f"file: {_scalar(file)}", "columns:", f"  time: {_list(when.time or ())}", f"  value: {_scalar(value)}"]
-    stem = Path(file).stem.lower()
+def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str) -> list[str]:
+    lines = [*log.lines(), "columns:", f"  time: {_list(when.time or ())}", f"  value: {_scalar(value)}"]
+    stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
     tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
     if tables:
@@ -200,8 +277,10 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
     return lines
 
 
-def _joint_name(file: str) -> str:
-    stem = re.sub(r"[^A-Za-z0-9_]+", "_", Path(file).stem)
+def _joint_name(log: _Log, value: str) -> str:
+    if log.stream is not None:
+        return re.sub(r"[^A-Za-z0-9_]+", "_", split_unit(value, "angle")[0]).strip("_")
+    stem = re.sub(r"[^A-Za-z0-9_]+", "_", log.stem)
     return stem if stem.endswith("angle") else f"{stem}_angle"
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.ingest.columns import recognise_time, scale_of
-from neeco.ingest.formats import numbers, read_table
+from neeco.ingest.formats import VideoSource, numbers, read_table
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MIN_IMAGES = 2
@@ -24,21 +24,6 @@ def require_installed(name: str) -> None:
     """Raise NeecoError saying what to install when `name` ("av", "pycolmap") is absent; imports nothing."""
     if importlib.util.find_spec(name) is None:
         raise NeecoError("ingest: needs PyAV and pycolmap; pip install 'neeco[ingest]'")
-
-
-@dataclass(frozen=True)
-class VideoSource:
-    """Frames with their times. size: (width, height) px; notes: what could not be read, in words; times [N] s,
-    increasing, of a video from its first frame."""
-
-    path: Path
-    size: tuple[int, int]
-    notes: tuple[str, ...]
-    times: np.ndarray
-
-    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
-        raise NotImplementedError
 
 
 def open_video(path: Path, fps: float | None = None) -> VideoSource:

@@ -1,14 +1,17 @@
-"""Log files as tables: one module of this folder per file format.
+"""What recordings come in: one module of this folder per format of files or folders.
 
-A format is a subclass of `LogFormat`; `read_table` chooses it by the file's suffix, and nothing else names it. What the
-columns mean is the same for all formats (`columns.py`, `logs.py`).
+A format is a subclass of `RecordingFormat`; `format_of` chooses it by what the file is called and holds, and nothing
+else names it. Whatever holds several streams (a bag, an episode, a sequence of images with transforms) lists them, and
+gives each as what the rest of the program takes: poses and readings as a table, images with their times, a lens. What a
+table's columns mean is the same for all formats (`columns.py`, `logs.py`).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import ABC
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,6 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from neeco.capture.documents import printable
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.registry import named_classes
 
@@ -24,6 +28,7 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
+DELIMITED = (".csv", ".tsv", ".txt")
 
 
 @dataclass(frozen=True)
@@ -37,28 +42,113 @@ class Table:
     decimal_comma: bool = False
 
 
-class LogFormat(ABC):
-    """A file format of logs. Subclasses set `format` and `suffixes` and have a constructor without arguments."""
+@dataclass(frozen=True)
+class Stream:
+    """One of what a file holds. name: as a recording says it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
+    type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows."""
+
+    name: str
+    kind: str
+    type: str
+    count: int
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True)
+class VideoSource:
+    """Frames with their times. size: (width, height) px; notes: what could not be read, in words; times [N] s,
+    increasing, of a video from its first frame."""
+
+    path: Path
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    times: np.ndarray
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
+        raise NotImplementedError
+
+
+class RecordingFormat(ABC):
+    """A format of what was recorded. Subclasses set `format`, `holds` and, unless they look into the files, `suffixes`,
+    and have a constructor without arguments.
+
+    Every method raises NeecoError naming the file, the place and the remedy.
+    """
 
     format: ClassVar[str]  # what the format is called
-    suffixes: ClassVar[tuple[str, ...]]  # of its files, in small letters
+    holds: ClassVar[str]  # what is read of it, in one line
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of its files, in small letters
+    package: ClassVar[str | None] = None  # a module that it needs
+    extra: ClassVar[str | None] = None  # of neeco, that installs this module
 
-    @abstractmethod
-    def read(self, path: Path) -> Table:
-        """The file as a table. Raises NeecoError naming the file, the place and the remedy."""
+    def claims(self, path: Path) -> bool:
+        """Is the file or folder in this format? Looks at little of it, and raises nothing."""
+        return path.suffix.lower() in self.suffixes
+
+    def require_package(self, path: Path) -> None:
+        """Raise NeecoError saying what to install when the module it needs is absent; imports nothing."""
+        if self.package is not None and importlib.util.find_spec(self.package) is None:
+            raise NeecoError(f"{path}: {self.format}: needs {self.package}; pip install 'neeco[{self.extra}]'")
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        """What the file holds; () where it is one table."""
+        return ()
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        """Poses or readings as a table. stream: which, where there are several."""
+        raise NeecoError(f"{path}: {self.format} holds no poses and no readings; name a log")
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        """Its images, with times on the clock that its tables share."""
+        raise NeecoError(f"{path}: {self.format} holds no images; name a video or a folder of images")
+
+    def lens(self, path: Path, stream: str | None = None) -> Lens | None:
+        """The lens that the images of `stream` were taken through, where the file says it."""
+        return None
+
+
+POSES, READINGS, IMAGES, OTHER = "poses", "readings", "images", "other"  # kinds of streams
 
 
 @cache
-def log_formats() -> dict[str, LogFormat]:
-    """The format for every file suffix that one reads."""
-    kinds = named_classes(LogFormat, "format", sys.modules[__name__])  # type: ignore[type-abstract]
-    return {suffix: kind() for kind in kinds.values() for suffix in kind.suffixes}
+def recording_formats() -> tuple[RecordingFormat, ...]:
+    """All formats; delimited text, which claims by its suffix what others know by what it holds, last."""
+    kinds = named_classes(RecordingFormat, "format", sys.modules[__name__])
+    return tuple(sorted((kind() for kind in kinds.values()), key=lambda kind: kind.suffixes == DELIMITED))
 
 
-def read_table(path: Path) -> Table:
-    """Read a log file; with a suffix that no format claims, as delimited text. Raises NeecoError."""
-    formats = log_formats()
-    return formats.get(Path(path).suffix.lower(), formats[".csv"]).read(Path(path))
+def format_of(path: Path) -> RecordingFormat | None:
+    """The format of a file or folder; None where no format claims it."""
+    return next((known for known in recording_formats() if known.claims(path)), None)
+
+
+def read_table(path: Path, stream: str | None = None) -> Table:
+    """Read a log; what no format claims, as delimited text. stream: which, of a file that holds several. Raises
+    NeecoError."""
+    path = Path(path)
+    known = format_of(path) or recording_formats()[-1]
+    known.require_package(path)
+    return known.read(path, stream)
+
+
+def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kinds: Sequence[str]) -> Stream:
+    """The stream that is wanted, or the only one of these kinds. Raises NeecoError listing what there is."""
+    fitting = [stream for stream in streams if stream.kind in kinds]
+    listed = printable(", ".join(stream.name for stream in fitting), 400).strip("'") or "none"
+    if wanted is None:
+        if len(fitting) == 1:
+            return fitting[0]
+        raise NeecoError(
+            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream`: {listed}"
+        )
+    found = next((stream for stream in streams if stream.name == wanted), None)
+    if found is None:
+        raise NeecoError(f"{path}: stream: holds no {printable(wanted)}; name one of {listed}")
+    if found not in fitting:
+        kind = f"{found.type}, not {' or '.join(kinds)}"
+        raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
+    return found
 
 
 def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:

@@ -11,19 +11,22 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
-from neeco.ingest.formats import LogFormat, Table, parse_number
+from neeco.ingest.formats import DELIMITED, RecordingFormat, Table, parse_number
 
 EXPECTED = "CSV with a header line"
 
 
-class DelimitedText(LogFormat):
+class DelimitedText(RecordingFormat):
     """CSV and its relatives. Lines that begin with # are skipped; columns of one name become `Tx`, `Tx#2`, `Tx#3`."""
 
     format = "delimited text"
-    suffixes = (".csv", ".tsv", ".txt")
+    holds = "poses or readings: CSV and its relatives with a header line, exports of NDI's trackers"
+    suffixes = DELIMITED
 
-    def read(self, path: Path) -> Table:
+    def read(self, path: Path, stream: str | None = None) -> Table:
         """Raises NeecoError when absent, empty, binary or without a header line."""
+        if stream is not None:
+            raise NeecoError(f"{path}: stream: a table is one; leave it out")
         lines = [(number, line) for number, line in enumerate(_read_text(path).splitlines(), 1) if _holds_data(line)]
         if not lines:
             raise NeecoError(f"{path}: holds only comments; expected {EXPECTED}")
