@@ -48,7 +48,9 @@ def groups() -> dict[str, Group]:
         "build": Group("what neeco is built with", None, build, ()),
         **{extra: Group(f"the extra {extra}", (extra,)) for extra in extras},
         "dev": Group(
-            "the extra dev", ("dev",), includes=("neeco", "build", "docs", "downstream", "ingest", "urdf", "view")
+            "the extra dev",
+            ("dev",),
+            includes=("neeco", "build", "docs", "downstream", "ingest", "lerobot", "ros", "urdf", "view"),
         ),
         "nvidia": Group("PyTorch's CUDA build, which PyPI has for Linux", ("triton",), includes=("triton",)),
         "wasm": Group("make viewer", None, ("ziglang",), ()),

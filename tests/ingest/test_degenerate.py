@@ -15,7 +15,7 @@ import yaml
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import IngestResult, ingest
-from neeco.ingest.recording import read_recording
+from neeco.ingest.recordingfile import read_recording
 
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")

@@ -10,7 +10,7 @@ from neeco.ingest.columns import JointColumns, PoseColumns
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.lens import read_lens
 from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recording import read_recording
+from neeco.ingest.recordingfile import read_recording
 from neeco.ingest.template import write_template
 from neeco.ingest.video import open_video
 

@@ -18,7 +18,7 @@ from neeco.capture.check import errors_only
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.ingest.pipeline import ingest
-from neeco.ingest.recording import read_recording
+from neeco.ingest.recordingfile import read_recording
 from neeco.ingest.synchronized import SynchronizedRecording
 
 pytest.importorskip("pycolmap")

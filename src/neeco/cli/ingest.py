@@ -122,7 +122,7 @@ def _convert(folder: Path, output: Path) -> int:
 
 def _recording(args: Ingest) -> Recording:
     from neeco.errors import NeecoError
-    from neeco.ingest.recording import check_frames, read_recording, recording_from_flags
+    from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
 
     if args.source is not None:
         _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "json"))
