@@ -29,6 +29,7 @@ ALLOWED = re.compile(
 FOUND = {
     "cuda-toolkit": "NVIDIA's, an empty package that names others",  # its description on PyPI
     "gsplat": "Apache-2.0",  # LICENSE in its wheel
+    "apsw": "MIT",  # LICENSE: any licence that the OSI approves
 }
 # what a package's own licence does not tell
 REMARKS = {
