@@ -12,6 +12,7 @@ from neeco.errors import NeecoError
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
 VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same file
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
+CAMERA, BASE = "camera", "base"  # frames that poses may be stated in
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
 FORMS = {
     QUATERNION_WXYZ: (4,),
@@ -53,7 +54,8 @@ class PoseColumns:
     time: one column, or two (whole seconds, nanoseconds); position: x, y, z (not with a 4x4 matrix); rotation: as
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
     column of which only the values `good` mark measured rows; rate_hz: where time counts frames; tool: which, by port,
-    name or serial number, in an NDI export of several; stream: which, of a file that holds several.
+    name or serial number, in an NDI export of several; stream: which, of a file that holds several; frame: what the
+    poses are stated in, CAMERA or BASE (a robot's base, a tracker's frame); None: the format says so, else BASE.
     """
 
     path: Path
@@ -69,6 +71,7 @@ class PoseColumns:
     rate_hz: float | None = None
     tool: str | None = None
     stream: str | None = None
+    frame: str | None = None
 
 
 @dataclass(frozen=True)

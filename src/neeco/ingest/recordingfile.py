@@ -300,7 +300,7 @@ def _joints_of(section: Section) -> dict[str, Any]:
 
 def _pose_columns(parent: Section, key: str, value: Any, video: Path | None) -> PoseColumns:
     """A log of poses: a file's name, or a mapping. In the file of the images it shares their clock."""
-    section, file = _log(parent, key, value, ("tool",))
+    section, file = _log(parent, key, value, ("tool", "frame"))
     keys = ("time", "position", "quaternion", *FORMS, "euler_convention", "state", "good")
     columns = section.section("columns", keys)
     forms = [form for form in ("quaternion", *FORMS) if columns.value.get(form) is not None]
@@ -321,13 +321,16 @@ def _pose_columns(parent: Section, key: str, value: Any, video: Path | None) -> 
         raise columns.error("euler_convention", problem)
     if form == named.EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
+    frame = section.text("frame")
+    if frame not in (None, named.CAMERA, named.BASE):
+        raise section.error("frame", f"{printable(frame)} is no frame of poses; write {named.CAMERA} or {named.BASE}")
     good = columns.value.get("good")
     goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
     clock = section.text("clock") or (VIDEO_CLOCK if file == video else TRACKER_CLOCK)
     return PoseColumns(
         file, clock, columns.names("time", (1, 2)), columns.names("position", (3,)),
         rotation, form, convention, columns.text("state"), goods, _units(section), section.number("rate_hz", above=0.0),
-        section.text("tool"), section.text("stream"),
+        section.text("tool"), section.text("stream"), frame,
     )  # fmt: skip
 
 
