@@ -7,12 +7,13 @@ import io
 from rich.console import Console
 
 from neeco.cli.evaluate import COLUMNS, _table
-from neeco.evaluation.mask_metrics import PART_SCORES
+from neeco.evaluation.mask_folders import USUAL_NAMES
+from neeco.evaluation.mask_metrics import part_scores
 
 
 def test_no_number_is_cut_at_eighty_columns() -> None:
     numbers = {key: 0.125 for _, key, _ in COLUMNS} | {"num_gaussians": 123456, "frames": 45, "psnr": 31.42}
-    numbers["part_iou"] = dict.fromkeys(PART_SCORES)
+    numbers["part_iou"] = dict.fromkeys(part_scores(USUAL_NAMES))
     evaluation = {kind: {"test": numbers, "unseen": numbers} for kind in ("given", "aligned")}
     out = io.StringIO()
     Console(file=out, width=80).print(_table(evaluation))

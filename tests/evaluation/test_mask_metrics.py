@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import truth_file
-from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, to_truth_ids
+from neeco.evaluation.mask_folders import USUAL_NAMES, truth_file
+from neeco.evaluation.mask_metrics import PartTally, dice, iou, mean_of, pairs_of, to_truth_ids
 from neeco.labels.labellers import composited_parts
 from neeco.raster.types import Rendering
 
@@ -25,31 +25,42 @@ def test_iou_and_dice_of_two_overlapping_strips():
 
 
 def test_jaws_are_matched_once_for_the_whole_split_not_per_frame():
-    tally = PartTally()
+    tally = PartTally(USUAL_NAMES)
     truth = torch.tensor([[1, 2, 3, 3, 3, 4, 4]], dtype=torch.uint8)
     named = truth.clone()
     swapped = torch.tensor([[1, 2, 4, 4, 4, 3, 3]], dtype=torch.uint8)
     for parts in (swapped, swapped, named):
         tally.add(parts, truth)
     scores, assignment = tally.result()
-    assert assignment == "swapped"
+    assert assignment == {"jaws": "swapped"}
     assert scores["jaw_left"] == pytest.approx(2 / 3)
     assert scores["jaws"] == 1.0
     assert scores["shaft"] == 1.0
 
 
+def test_parts_of_any_name_are_scored_and_pairs_are_those_that_differ_by_left_and_right():
+    assert pairs_of(["cone", "left_blade", "hook", "right_blade", "lid_left"]) == {
+        "blades": ("left_blade", "right_blade")
+    }
+    tally = PartTally({1: "cone", 5: "left_blade", 7: "right_blade"})
+    tally.add(torch.tensor([[1, 1, 7, 5]]), torch.tensor([[1, 0, 5, 7]]))
+    scores, assignment = tally.result()
+    assert scores == {"cone": 0.5, "left_blade": 1.0, "right_blade": 1.0, "blades": 1.0}
+    assert assignment == {"blades": "swapped"}
+
+
 def test_frames_without_a_part_do_not_count_for_it():
-    tally = PartTally()
+    tally = PartTally(USUAL_NAMES)
     tally.add(torch.tensor([[1, 0]]), torch.tensor([[1, 1]]))
     scores, assignment = tally.result()
     assert scores["shaft"] == 0.5
     assert math.isnan(scores["wrist"])
-    assert assignment == "as named"
+    assert assignment == {"jaws": "as named"}
 
 
 def test_part_ids_become_the_truths_numbers_and_unknown_parts_tissue():
     names = (("a", "jaw_right"), ("a", "shaft"), ("b", "hook"))
-    assert to_truth_ids(torch.tensor([[0, 1, 2, 3]]), names).tolist() == [[0, 4, 1, 0]]
+    assert to_truth_ids(torch.tensor([[0, 1, 2, 3]]), names, USUAL_NAMES).tolist() == [[0, 4, 1, 0]]
 
 
 def rendering(channels):

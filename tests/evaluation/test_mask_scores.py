@@ -181,7 +181,7 @@ def test_jaws_are_named_once_for_the_whole_folder(tmp_path):
     truth = folder(tmp_path / "truth", a=strip(1, 3, 3, 4), b=strip(1, 3, 3, 4))
     predicted = folder(tmp_path / "predicted", a=strip(1, 4, 4, 3), b=strip(1, 4, 4, 3))
     scores = score_masks(predicted, truth)
-    assert scores["jaw_assignment"] == "swapped"
+    assert scores["pair_assignment"] == {"jaws": "swapped"}
     assert scores["classes"]["challenge_iou"] == scores["parts"]["jaw_left"]["box_ap"] == 1.0
     save(tmp_path / "predicted/b.png", strip(1, 3, 3, 4))
     assert score_masks(predicted, truth)["parts"]["jaw_left"]["iou"] == pytest.approx(0.5)  # never the better per image
@@ -221,7 +221,8 @@ def test_a_mask_without_parts_gives_only_the_instruments_scores_and_says_why(tmp
     predicted = folder(tmp_path / "predicted", a=strip(255, 255, 255, 0))
     scores = score_masks(predicted, truth)
     assert scores["instrument"]["iou"] == 1.0
-    assert scores["parts"] is scores["classes"] is scores["jaw_assignment"] is None
+    assert scores["parts"] is scores["classes"] is None
+    assert scores["pair_assignment"] == {}
     assert any(note.startswith("parts: null") and "predicted" in note for note in scores["notes"])
 
 
@@ -243,7 +244,7 @@ def test_classes_rename_ids_and_jaws_known_as_one_are_compared_as_one(tmp_path):
     scores = score_masks(predicted, truth, classes={10: "shaft", 20: "wrist", 30: "jaws"})
     assert list(scores["parts"]) == ["shaft", "wrist", "jaws"]
     assert scores["classes"]["challenge_iou"] == 1.0
-    assert scores["jaw_assignment"] is None
+    assert scores["pair_assignment"] == {}
     partly = score_masks(predicted, truth, classes={10: "shaft", 20: "shaft", 30: "tip"})
     assert partly["parts"]["wrist"]["iou"] is None
     assert partly["instrument"]["iou"] == 1.0

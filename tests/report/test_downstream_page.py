@@ -15,7 +15,7 @@ from html_page import HOSTILE, Page, check_hostile_names
 from neeco.capture.images import write_labels
 from neeco.experiments.downstream.job import job_folder
 from neeco.experiments.downstream.results import comparisons, findings, summarise_folds, verdict
-from neeco.experiments.downstream.samples import CLASSES, recorded_samples
+from neeco.experiments.downstream.samples import class_names, recorded_samples
 from neeco.report.charts import Level, Series, line_chart
 from neeco.report.downstream_examples import draw_boxes, example_sections
 from neeco.report.downstream_page import (
@@ -83,7 +83,7 @@ def experiment_of(capture, jobs, *, folds=2, sets=("kinematic",), classes="instr
         "teaching": {"sets": [{"name": name, "path": f"/sets/{name}", "count": None} for name in sets],
                      "classes": classes, "labels": None, "pick": "spread", "steps": 60, "side": None, "batch": None,
                      "transforms": "transforms.json", "device": "auto"},
-        "classes": list(CLASSES[classes]), "splits": list(SPLITS), "folds": folds, "labelled": labelled,
+        "classes": list(class_names(capture, classes)), "splits": list(SPLITS), "folds": folds, "labelled": labelled,
         "held_back_every": 5,
         "sets": [{"name": name, "path": f"/sets/{name}", "images": 1000,
                   "made_by": {"settings": {"states": "inside", "seed": 0}, "scene": "runs/k"}, "sha256": "ab" * 32}

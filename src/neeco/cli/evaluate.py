@@ -75,14 +75,12 @@ def run(args: Evaluate) -> int:
 
 def _table(evaluation: dict[str, Any]) -> Table:
     """One column per split and kind of pose, so that it fits a narrow terminal."""
-    from neeco.evaluation.mask_metrics import PART_SCORES
-
     scored = [(kind, split) for kind in ("given", "aligned") for split in evaluation.get(kind, {})]
     table = Table("poses", *(Column(f"{kind}\n{split}", justify="right") for kind, split in scored))
     for title, key, form in COLUMNS:
         values = [evaluation[kind][split][key] for kind, split in scored]
         table.add_row(title, *("-" if value is None else form.format(value) for value in values))
-    for part in PART_SCORES:
+    for part in dict.fromkeys(part for kind, split in scored for part in evaluation[kind][split]["part_iou"]):
         values = [evaluation[kind][split]["part_iou"][part] for kind, split in scored]
         if any(value is not None for value in values):
             table.add_row(f"{part} IoU", *("-" if value is None else f"{value:.3f}" for value in values))

@@ -90,6 +90,7 @@ def _lines(scores: dict[str, Any]) -> list[str]:
         classes = scores["classes"]
         lines[0] += f", of its parts {shown(classes['challenge_iou'])}"
         lines.append(f"parts: IoU {shown(classes['isinet_iou'])}, mean class IoU {shown(classes['mean_class_iou'])}")
-    if scores["jaw_assignment"] == "swapped":
-        lines.append("left and right jaw are taken the other way round, which fits this folder better")
+    for pair, way in scores["pair_assignment"].items():
+        if way == "swapped":
+            lines.append(f"{pair}: left and right are taken the other way round, which fits this folder better")
     return lines

@@ -18,8 +18,8 @@ from neeco.errors import NeecoError
 from neeco.evaluation.align import fit_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
-from neeco.evaluation.mask_folders import Reference, load_reference
-from neeco.evaluation.mask_metrics import PART_SCORES, TRUTH_PARTS, PartTally, dice, finite, iou, mean_of, to_truth_ids
+from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
+from neeco.evaluation.mask_metrics import PartTally, dice, finite, iou, mean_of, pairs_of, part_scores, to_truth_ids
 from neeco.files import write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
@@ -41,9 +41,9 @@ Progress = Callable[[str, int, int], None]  # what, how many done, of how many
 class _Tally:
     """Scores of the frames of one split, drawn at one kind of pose."""
 
+    parts: PartTally
     rows: list[dict[str, Any]] = field(default_factory=list)  # of every frame: its name, fit and scores
     scores: list[dict[str, float | None]] = field(default_factory=list)
-    parts: PartTally = field(default_factory=PartTally)
 
 
 @dataclass(frozen=True)
@@ -94,25 +94,29 @@ def evaluate_run(
     context = _Context(scene, capture, networks, observed_depths(scene, capture.split("train")))
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
-    notes = _scene_notes(scene, networks)
+    names = truth_names(capture.root)
+    notes = _scene_notes(scene, networks, names)
     result: dict[str, Any] = {kind: {} for kind in kinds}
-    jaw_assignment: dict[str, Any] = {kind: {} for kind in kinds}
+    pair_assignment: dict[str, Any] = {kind: {} for kind in kinds}
     per_frame: dict[str, Any] = {kind: {} for kind in kinds}
     for split in splits:
         frames = capture.split(split)
-        tallies = {kind: _Tally() for kind in kinds}
+        tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
         for index, frame in enumerate(frames):
             report(split, index, len(frames))
             _score_frame(context, frame, tallies)
         report(split, len(frames), len(frames))
         fps, count = _speed(scene, frames)
         for kind, tally in tallies.items():
-            numbers, jaw_assignment[kind][split] = _summary(scene, tally)
+            numbers, pair_assignment[kind][split] = _summary(scene, tally)
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
         notes += _split_notes(split, result["given"][split])
-    names = [list(name) for name in scene.label_names]
-    labels = {"threshold": threshold_of(scene), "names": names, "jaw_assignment": jaw_assignment}
+    labels = {
+        "threshold": threshold_of(scene),
+        "names": [list(name) for name in scene.label_names],
+        "pair_assignment": pair_assignment,
+    }
     evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
@@ -156,7 +160,8 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
         tally.scores.append(_scores(drawing, recorded, networks))
         tally.rows.append(row | tally.scores[-1])
         if drawing.parts is not None and reference is not None and reference.parts is not None:
-            tally.parts.add(to_truth_ids(drawing.parts, scene.label_names), reference.parts, mask)
+            ours = to_truth_ids(drawing.parts, scene.label_names, tally.parts.names)
+            tally.parts.add(ours, reference.parts, mask)
 
 
 def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]) -> dict[str, float | None]:
@@ -183,19 +188,19 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
     }
 
 
-def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], str | None]:
-    """Means over the frames that have the number, and which way the jaws were matched."""
+def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], dict[str, str]]:
+    """Means over the frames that have the number, and which way the scene's pairs of parts were matched."""
     numbers: dict[str, Any] = {key: mean_of([row[key] for row in tally.scores]) for key in tally.scores[0]}
     numbers["mask_frames"] = sum(row["psnr_instrument"] is not None for row in tally.scores)
     known = {part for _, part in scene.label_names}
-    known |= {"jaws"} & {"jaws" for part in known if part in ("jaw_left", "jaw_right")}
-    parts: dict[str, float | None] = dict.fromkeys(PART_SCORES)
-    assignment = None
-    if tally.parts:
+    known |= {pair for pair, both in pairs_of(tally.parts.names.values()).items() if known & set(both)}
+    parts: dict[str, float | None] = dict.fromkeys(part_scores(tally.parts.names))
+    assignment: dict[str, str] = {}
+    if tally.parts.rows:
         means, assignment = tally.parts.result()
         parts |= {part: value for part, value in means.items() if part in known}
     numbers["part_iou"] = parts
-    return numbers, assignment if "jaws" in known else None
+    return numbers, {pair: way for pair, way in assignment.items() if pair in known}
 
 
 @torch.no_grad()
@@ -213,7 +218,7 @@ def _speed(scene: Drawable, frames: Sequence[Frame]) -> tuple[float, int | None]
     return 1.0 / statistics.median(seconds[2:] or seconds[1:]), scene.num_gaussians
 
 
-def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips]) -> list[str]:
+def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips], names: Mapping[int, str]) -> list[str]:
     notes = []
     missing = [key for name, key in LPIPS_KEYS.items() if name not in networks]
     if missing:
@@ -221,8 +226,9 @@ def _scene_notes(scene: Drawable, networks: Mapping[str, Lpips]) -> list[str]:
     if not scene.label_names:
         notes.append("mask_iou, part_iou: null, the scene carries no labels")
         return notes
-    unnamed = sorted({part for _, part in scene.label_names} - set(TRUTH_PARTS))
-    absent = [part for part in TRUTH_PARTS if part not in {part for _, part in scene.label_names}]
+    parts = {part for _, part in scene.label_names}
+    unnamed = sorted(parts - set(names.values()))
+    absent = [part for part in names.values() if part not in parts]
     if absent:
         notes.append(f"part_iou: null for {', '.join(absent)}: the scene has no such part")
     if unnamed:

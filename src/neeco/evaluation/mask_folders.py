@@ -17,12 +17,11 @@ from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_metrics import TRUTH_PARTS
 from neeco.files import read_json, require_inside
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
-PARTS_FILE = "parts.json"  # what the ids of a folder that `neeco render` wrote mean
-TRUTH_NAMES = {number: part for part, number in TRUTH_PARTS.items()}
+PARTS_FILE = "parts.json"  # what the ids of masks in a folder mean
+USUAL_NAMES: Mapping[int, str] = {1: "shaft", 2: "wrist", 3: "jaw_left", 4: "jaw_right"}  # in folders without one
 REFERENCE_FOLDER = "reference_masks"
 MASK_FOLDERS = ("truth/masks", REFERENCE_FOLDER)  # in which a frame's is looked for, in this order
 
@@ -42,6 +41,12 @@ def truth_file(root: Path, name: str) -> Path | None:
     return None if file is None else require_inside(file, root)
 
 
+def truth_names(root: Path) -> Mapping[int, str]:
+    """Part by id in the truth of the capture in `root`: as `truth/masks/parts.json` says, else the usual ones. Raises
+    NeecoError."""
+    return _stated_names(root / MASK_FOLDERS[0]) or USUAL_NAMES
+
+
 def load_reference(capture: Capture, frame: Frame) -> Reference | None:
     """The mask to score a frame against: `truth/masks/<stem>.png` (parts), else `reference_masks/<stem>.png` (0/255).
 
@@ -52,7 +57,7 @@ def load_reference(capture: Capture, frame: Frame) -> Reference | None:
 
 
 def _read_reference(file: Path, frame: Frame) -> Reference:
-    """What `truth_file` found of a frame: part ids (0 tissue, 1 shaft, 2 wrist, 3 jaw_left, 4 jaw_right), or a mask."""
+    """What `truth_file` found of a frame: part ids (0 tissue; `truth_names`), or a mask."""
     size = frame.camera.width, frame.camera.height
     if file.parent.name == REFERENCE_FOLDER:
         return Reference(read_mask(file, size), None)
@@ -185,7 +190,7 @@ def open_truth(
     if classes is not None and not parts:
         what = f"{path / REFERENCE_FOLDER} tell the instrument, no parts"
         raise NeecoError(f"--truth-classes: {what}; leave --truth-classes out")
-    return Masks(path, files, (classes or TRUTH_NAMES) if parts else None, frames=masked)
+    return Masks(path, files, (classes or truth_names(path)) if parts else None, frames=masked)
 
 
 def _palette_ids(image: Image.Image, ids: np.ndarray) -> np.ndarray:
@@ -230,8 +235,8 @@ def _guessed(path: Path, files: Mapping[str, Path], plain: bool, option: str) ->
     if plain and ids == {1}:
         note = f"{path}: its ids are 0 and 1: read as a mask of the instrument; name parts with {option}"
         return Masks(path, files, None, (note,))
-    if strange := sorted(ids - set(TRUTH_NAMES)):
+    if strange := sorted(ids - set(USUAL_NAMES)):
         name = next(name for name, values in found.items() if strange[0] in values)
         what = f"id {strange[0]} is neither a mask's 255 nor a part's 1 to 4"
         raise NeecoError(f"{files[name]}: {what}; say what ids mean, {option} PART={strange[0]} …")
-    return Masks(path, files, TRUTH_NAMES)
+    return Masks(path, files, USUAL_NAMES)

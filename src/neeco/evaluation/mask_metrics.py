@@ -6,7 +6,8 @@ Boundary F is computed on the contours of DAVIS, to the pixel; box AP is that of
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -16,8 +17,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from torch import Tensor
 
-TRUTH_PARTS: Mapping[str, int] = {"shaft": 1, "wrist": 2, "jaw_left": 3, "jaw_right": 4}
-PART_SCORES = ("shaft", "wrist", "jaw_left", "jaw_right", "jaws")
+_LEFT = re.compile(r"(?:^|_)left(?=_|$)")
 BOUNDARY_TOLERANCE = 0.008  # of the image's diagonal, as DAVIS
 COCO_THRESHOLDS = tuple(np.linspace(0.5, 0.95, 10).round(2))
 RECALLS = np.linspace(0, 1, 101)
@@ -44,50 +44,74 @@ def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, 
     return int((mask & truth).sum()), int((mask | truth).sum())
 
 
-def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]]) -> Tensor:
-    """Renumber part ids [H, W] (column index + 1) to the truth's numbers; parts the truth does not name become 0."""
+def to_truth_ids(parts: Tensor, label_names: Sequence[tuple[str, str]], names: Mapping[int, str]) -> Tensor:
+    """Renumber part ids [H, W] (column index + 1) to the truth's, part by id in `names`; parts that the truth does not
+    name become 0."""
+    numbers = {part: number for number, part in names.items()}
     table = torch.zeros(len(label_names) + 1, dtype=torch.uint8, device=parts.device)
     for index, (_, part) in enumerate(label_names):
-        table[index + 1] = TRUTH_PARTS.get(part, 0)
+        table[index + 1] = numbers.get(part, 0)
     return table[parts.long()]
+
+
+def pairs_of(parts: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Parts whose names differ by left and right, by what both are called as one: {"jaws": ("jaw_left", "jaw_right")}.
+    Images alone do not tell which of them is called left."""
+    names = tuple(parts)
+    pairs = {}
+    for left in names:
+        right, count = _LEFT.subn(lambda found: found[0].replace("left", "right"), left)
+        if count and right in names:
+            pairs[_LEFT.sub("", left).strip("_") + "s"] = left, right
+    return pairs
+
+
+def part_scores(names: Mapping[int, str]) -> tuple[str, ...]:
+    """The parts that are scored where `names` are those of the truth by id, and each pair as one."""
+    return *names.values(), *pairs_of(names.values())
 
 
 @dataclass
 class PartTally:
-    """Gathers per-part IoU over the frames of a split.
+    """Gathers per-part IoU over the frames of a split. names: part by id in the truth.
 
-    A scene learned from images cannot know which jaw is called left: both assignments of the two jaws are counted, and
+    A scene learned from images cannot know which of a pair is called left: both assignments are counted, and
     the better one over the whole split is reported (never the better one per frame).
     """
 
-    frames: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"as named": [], "swapped": []})
-
-    def __bool__(self) -> bool:
-        """Whether it has counted any frame."""
-        return any(self.frames.values())
+    names: Mapping[int, str]
+    rows: list[dict[tuple[str, str], float]] = field(default_factory=list)  # of frames, by (part, part of the truth)
 
     def add(self, parts: Tensor, truth: Tensor, counted: Tensor | None = None) -> None:
         """Count one frame: `parts` and `truth` [H, W] uint8, both in the truth's numbers."""
-        for assignment, rows in self.frames.items():
-            names = dict(TRUTH_PARTS)
-            if assignment == "swapped":
-                names["jaw_left"], names["jaw_right"] = names["jaw_right"], names["jaw_left"]
-            row = {part: iou(parts == names[part], truth == TRUTH_PARTS[part], counted) for part in TRUTH_PARTS}
-            row["jaws"] = iou(parts >= TRUTH_PARTS["jaw_left"], truth >= TRUTH_PARTS["jaw_left"], counted)
-            rows.append(row)
+        ours, theirs = ({part: ids == number for number, part in self.names.items()} for ids in (parts, truth))
+        compared = [(part, part) for part in part_scores(self.names)]
+        for pair, (left, right) in pairs_of(self.names.values()).items():
+            for masks in (ours, theirs):
+                masks[pair] = masks[left] | masks[right]
+            compared += [(left, right), (right, left)]
+        self.rows.append({(a, b): iou(ours[a], theirs[b], counted) for a, b in compared})
 
-    def result(self) -> tuple[dict[str, float], str]:
-        """Mean IoU per part over the frames that show it (NaN when none does), and the assignment used."""
-        means = {
-            name: {part: mean_of([row[part] for row in rows]) for part in PART_SCORES}
-            for name, rows in self.frames.items()
-        }
-        scores = {
-            name: sum(value for part in ("jaw_left", "jaw_right") if not math.isnan(value := parts[part]))
-            for name, parts in means.items()
-        }
-        best = max(scores, key=lambda name: scores[name])  # a tie keeps the first, "as named"
-        return means[best], best
+    def result(self) -> tuple[dict[str, float], dict[str, str]]:
+        """Mean IoU per part over the frames that show it (NaN when none does), and of each pair the assignment used,
+        "as named" or "swapped"."""
+
+        def mean(ours: str, theirs: str) -> float:
+            return mean_of([row[ours, theirs] for row in self.rows])
+
+        means = {part: mean(part, part) for part in part_scores(self.names)}
+        assignment = {}
+        for pair, (left, right) in pairs_of(self.names.values()).items():
+            swapped = {left: mean(right, left), right: mean(left, right)}
+            is_better = total(swapped.values()) > total((means[left], means[right]))
+            assignment[pair] = "swapped" if is_better else "as named"
+            means |= swapped if is_better else {}
+        return means, assignment
+
+
+def total(values: Iterable[float]) -> float:
+    """Sum of the values that are numbers."""
+    return sum(value for value in values if not math.isnan(value))
 
 
 def mean_of(values: Sequence[float | None]) -> float:

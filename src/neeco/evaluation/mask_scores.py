@@ -15,7 +15,6 @@ from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.evaluation.mask_folders import Masks, open_masks, open_truth, read_truth
 from neeco.evaluation.mask_metrics import (
-    TRUTH_PARTS,
     average_precision,
     boundary_f,
     boxes_of,
@@ -23,20 +22,20 @@ from neeco.evaluation.mask_metrics import (
     finite,
     iou,
     mean_of,
+    pairs_of,
+    total,
 )
 
 SCHEMA = "neeco-mask-scores/1"
 OVERLAPS = ("iou", "dice", "boundary_f")  # of each image
 SCORES = (*OVERLAPS, "box_ap", "box_ap50")
-LEFT, RIGHT, JAWS = "jaw_left", "jaw_right", "jaws"
 INSTRUMENT = "instrument"
-SWAP = {LEFT: RIGHT, RIGHT: LEFT}
 Tables = Mapping[str, np.ndarray]  # bool [256] by region: which ids belong to it
 
 
 @dataclass(frozen=True)
 class Regions:
-    """What is compared: the instrument, the classes both sides tell apart, and both jaws as one."""
+    """What is compared: the instrument, the classes both sides tell apart, and each pair of left and right as one."""
 
     classes: tuple[str, ...]  # without overlap; Challenge IoU is over these
     missing: tuple[str, ...]  # of `classes`, those that the prediction does not name
@@ -44,8 +43,8 @@ class Regions:
     truth: Tables
 
     @property
-    def has_jaws(self) -> bool:
-        return {LEFT, RIGHT} <= set(self.classes)
+    def pairs(self) -> dict[str, tuple[str, str]]:
+        return pairs_of(self.classes)
 
 
 @dataclass(frozen=True)
@@ -137,15 +136,13 @@ def _predicted_splits(predicted: Masks, truth: Masks) -> list[str]:
 def _shared_regions(predicted: Masks, truth: Masks) -> tuple[Regions, str | None]:
     """The regions two folders can be compared in, and why there are no parts among them, if so.
 
-    Where either side names its jaws `jaws`, the other's two become one.
+    Where either side has one name for a pair (jaws), the other's two become one.
     """
     ours, theirs = dict(predicted.names or {}), dict(truth.names or {})
-    if JAWS in {*ours.values(), *theirs.values()}:
-        ours, theirs = (
-            {number: JAWS if part in SWAP else part for number, part in names.items()} for names in (ours, theirs)
-        )
-    order = [*TRUTH_PARTS, JAWS]
-    classes = sorted(set(theirs.values()), key=lambda part: (order.index(part) if part in order else len(order), part))
+    either = {*ours.values(), *theirs.values()}
+    merged = {part: pair for pair, both in pairs_of(sorted(either)).items() if pair in either for part in both}
+    ours, theirs = ({number: merged.get(part, part) for number, part in names.items()} for names in (ours, theirs))
+    classes = list(dict.fromkeys(theirs[number] for number in sorted(theirs)))
     reason = None
     if sides := [str(masks.path) for masks in (predicted, truth) if masks.names is None]:
         reason = f"parts: null, {' and '.join(sides)} tell instrument from tissue only"
@@ -162,8 +159,8 @@ def _tables(names: Mapping[int, str], classes: Sequence[str]) -> Tables:
     tables = {INSTRUMENT: np.arange(256) > 0}
     for part in classes:
         tables[part] = np.isin(np.arange(256), [number for number, name in names.items() if name == part])
-    if {LEFT, RIGHT} <= set(classes):
-        tables[JAWS] = tables[LEFT] | tables[RIGHT]
+    for pair, (left, right) in pairs_of(classes).items():
+        tables[pair] = tables[left] | tables[right]
     return tables
 
 
@@ -176,7 +173,8 @@ def _score_image(name: str, predicted: Masks, truth: Masks, regions: Regions, co
     guesses = {region: table[guess] for region, table in regions.predicted.items()}
     truths = {region: table[ids] for region, table in regions.truth.items()}
     everywhere = True if counted is None else counted
-    pairs = [(region, region) for region in truths] + (list(SWAP.items()) if regions.has_jaws else [])
+    pairs = [(region, region) for region in truths]
+    pairs += [way for left, right in regions.pairs.values() for way in ((left, right), (right, left))]
     return _Image(
         name,
         {(ours, theirs): _overlap(guesses[ours], truths[theirs], counted) for ours, theirs in pairs},
@@ -193,8 +191,14 @@ def _overlap(mask: np.ndarray, truth: np.ndarray, counted: np.ndarray | None) ->
 
 
 def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
-    """Numbers per region, and the jaws' names that fit the whole folder better (as `mask_metrics.PartTally`)."""
-    swap = SWAP if regions.has_jaws and _jaw_sum(images, SWAP) > _jaw_sum(images, {}) else {}
+    """Numbers per region, and the names of pairs that fit the whole folder better (as `mask_metrics.PartTally`)."""
+    assignment: dict[str, str] = {}
+    swap: dict[str, str] = {}
+    for pair, (left, right) in regions.pairs.items():
+        exchanged = {left: right, right: left}
+        is_better = _pair_sum(images, exchanged, exchanged) > _pair_sum(images, exchanged, {})
+        assignment[pair] = "swapped" if is_better else "as named"
+        swap |= exchanged if is_better else {}
     numbers = {region: _region_numbers(images, region, swap) for region in regions.truth}
     notes = []
     for part in regions.missing:
@@ -212,7 +216,7 @@ def _summary(images: Sequence[_Image], regions: Regions) -> dict[str, Any]:
         INSTRUMENT: instrument,
         "parts": numbers if regions.classes else None,
         "classes": overall,
-        "jaw_assignment": ("swapped" if swap else "as named") if regions.has_jaws else None,
+        "pair_assignment": assignment,
         "per_image": [{"name": image.name} | image.overlaps[INSTRUMENT, INSTRUMENT] for image in images],
         "notes": notes,
     }
@@ -228,9 +232,8 @@ def _region_numbers(images: Sequence[_Image], region: str, swap: Mapping[str, st
     return numbers | {"images": sum(not math.isnan(row["iou"]) for row in rows)}
 
 
-def _jaw_sum(images: Sequence[_Image], swap: Mapping[str, str]) -> float:
-    means = [mean_of([image.iou(jaw, swap) for image in images]) for jaw in (LEFT, RIGHT)]
-    return sum(value for value in means if not math.isnan(value))
+def _pair_sum(images: Sequence[_Image], pair: Iterable[str], swap: Mapping[str, str]) -> float:
+    return total(mean_of([image.iou(part, swap) for image in images]) for part in pair)
 
 
 def _challenge(images: Sequence[_Image], classes: Sequence[str], swap: Mapping[str, str]) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw
 from neeco.capture.model import Capture, Frame, State
 from neeco.evaluation.image_metrics import FULL_SCALE, PART_COLORS, overlay_outline, overlay_parts
 from neeco.evaluation.mask_folders import load_reference
+from neeco.evaluation.mask_metrics import pairs_of
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.report.charts import SMALL, Series, line_chart, short
@@ -54,7 +55,6 @@ KINDS = {
     "aligned": "Aligned: instrument and camera pose fitted to each recorded image first, the scene unchanged",
 }
 KIND_NAMES = {"given": "as given", "aligned": "aligned"}
-PARTS = ("shaft", "wrist", "jaws", "jaw_left", "jaw_right")
 
 
 def write_report(
@@ -94,8 +94,7 @@ def write_report(
         tiles=_tiles(evaluation, kind),
         **_numbers(evaluation),
         notes=evaluation.get("notes", ()),
-        part_head=["split", *(part.replace("_", " ") for part in PARTS), "jaws matched"],
-        parts=_parts(evaluation),
+        **_parts(evaluation),
         figures=frame_figures(evaluation, capture, scene, kind),
         pose_kind=KIND_NAMES[kind],
         full_scale=FULL_SCALE,
@@ -204,17 +203,21 @@ def _numbers(evaluation: dict[str, Any]) -> dict[str, Any]:
     return {"columns": columns, "scores": scores}
 
 
-def _parts(evaluation: dict[str, Any]) -> list[list[str]]:
-    """Rows of per-part IoU, where any is known."""
+def _parts(evaluation: dict[str, Any]) -> dict[str, Any]:
+    """The table of per-part IoU, where any is known, and which parts images do not tell apart by name."""
+    scored = [
+        (kind, split, numbers["part_iou"]) for kind in KINDS for split, numbers in evaluation.get(kind, {}).items()
+    ]
+    names = list(dict.fromkeys(name for _, _, parts in scored for name in parts))
+    pairs = pairs_of(names)
     rows = []
-    for kind in KINDS:
-        for split, numbers in evaluation.get(kind, {}).items():
-            parts = numbers.get("part_iou") or {}
-            if any(value is not None for value in parts.values()):
-                way = evaluation["labels"]["jaw_assignment"].get(kind, {}).get(split) or "-"
-                cells = [_written(parts.get(name), "{:.3f}") for name in PARTS]
-                rows.append([f"{split}, {KIND_NAMES[kind]}", *cells, way])
-    return rows
+    for kind, split, parts in scored:
+        if any(value is not None for value in parts.values()):
+            ways = evaluation["labels"]["pair_assignment"][kind][split]
+            cells = [_written(parts[name], "{:.3f}") for name in names]
+            rows.append([f"{split}, {KIND_NAMES[kind]}", *cells, *(ways.get(pair, "-") for pair in pairs)])
+    head = ["split", *(name.replace("_", " ") for name in names), *(f"{pair} matched" for pair in pairs)]
+    return {"part_head": head, "parts": rows, "pairs": [pair.replace("_", " ") for pair in pairs]}
 
 
 def _tints(scene: Drawable) -> list[tuple[str, str]]:

@@ -14,8 +14,10 @@ from downstream_world import bar_parts, picture_of, read_grey, save_grey, save_r
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.experiments.downstream.samples import (
+    WHOLE,
     DataSet,
     Example,
+    class_names,
     frame_size,
     has_labels,
     recorded_samples,
@@ -25,7 +27,10 @@ from neeco.experiments.downstream.samples import (
 SIZE = (48, 40)
 
 
-def loaded(root: Path, classes="instrument", edges="hard", count=None) -> list[Example]:
+PARTS = ("shaft", "wrist", "jaws")
+
+
+def loaded(root: Path, classes=WHOLE, edges="hard", count=None) -> list[Example]:
     return [sample.load() for sample in synthetic_samples(DataSet("set", root, count), classes, edges, SIZE)]
 
 
@@ -48,14 +53,27 @@ def test_one_class_is_every_part(drawn: Path) -> None:
 
 
 def test_of_parts_both_jaws_are_one_class(drawn: Path) -> None:
-    example = loaded(drawn, "parts")[2]
+    example = loaded(drawn, PARTS)[2]
     assert np.array_equal(example.classes, np.minimum(bar_parts(2), 3))
     assert set(np.unique(example.instruments)) == {0, 1}
 
 
+def test_parts_of_any_name_are_classes_as_the_truth_names_them(capture: Path, drawn: Path) -> None:
+    names = [
+        {"id": number, "part": part} for number, part in enumerate(("rod", "cone", "blade_left", "blade_right"), 1)
+    ]
+    (capture / "truth" / "masks" / "parts.json").write_text(json.dumps({"ids": names}))
+    assert class_names(read_capture(capture), "parts") == ("rod", "cone", "blades")
+    sample = recorded_samples(read_capture(capture), "test", "parts")[0]
+    assert {1, 3} <= set(np.unique(sample.load().classes)) <= {0, 1, 2, 3}
+    assert set(sample.pairs()) == {"blades"}
+    with refused("--sets set", "none of the parts rod, cone, blades"):
+        loaded(drawn, ("rod", "cone", "blades"))
+
+
 def test_ids_mean_what_dataset_json_says(drawn: Path) -> None:
     write_ids(drawn, (("bar", "jaw_right"), ("bar", "shaft"), ("bar", "jaw_left"), ("bar", "wrist")))
-    parts, classes = bar_parts(0), loaded(drawn, "parts")[0].classes
+    parts, classes = bar_parts(0), loaded(drawn, PARTS)[0].classes
     assert [set(np.unique(classes[parts == number])) for number in (1, 2, 3, 4)] == [{3}, {1}, {3}, {2}]
 
 
@@ -65,7 +83,7 @@ def test_two_instruments_have_boxes_apart(drawn: Path) -> None:
     boxes, classes = loaded(drawn)[0].boxes()
     assert boxes.tolist() == [[left, top, left + 10, top + 8], [left + 10, top, left + 20, top + 8]]
     assert classes.tolist() == [1, 1]
-    boxes, classes = loaded(drawn, "parts")[0].boxes()
+    boxes, classes = loaded(drawn, PARTS)[0].boxes()
     assert classes.tolist() == [1, 3, 1, 3]
     assert boxes[:, 0].tolist() == [left, left + 5, left + 10, left + 15]
 
@@ -98,9 +116,9 @@ def test_edges_are_read_where_they_are_asked_for(drawn: Path) -> None:
 
 
 def test_a_count_takes_the_first_images(drawn: Path) -> None:
-    samples = synthetic_samples(DataSet("set", drawn, 4), "instrument", "hard", SIZE)
+    samples = synthetic_samples(DataSet("set", drawn, 4), WHOLE, "hard", SIZE)
     assert [sample.name for sample in samples] == ["000000", "000001", "000002", "000003"]
-    assert len(synthetic_samples(DataSet("set", drawn), "instrument", "hard", SIZE)) == 6
+    assert len(synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)) == 6
 
 
 def annotated(drawn: Path, splits: list[str]) -> Path:
@@ -114,7 +132,7 @@ def annotated(drawn: Path, splits: list[str]) -> Path:
 
 def test_of_annotated_frames_only_those_trained_on_are_learned_from(drawn: Path) -> None:
     splits = ["test", "train", "train", "unseen", "train", "test"]
-    samples = synthetic_samples(DataSet("set", annotated(drawn, splits)), "instrument", "hard", SIZE)
+    samples = synthetic_samples(DataSet("set", annotated(drawn, splits)), WHOLE, "hard", SIZE)
     assert [sample.name for sample in samples] == ["000001", "000002", "000004"]
 
 
@@ -143,7 +161,7 @@ def test_of_a_set_of_others_masks_are_enough(value: int, tmp_path: Path) -> None
     assert len(examples) == 6
     assert np.array_equal(examples[3].classes, bar_parts(3) > 0)
     with refused("--sets set", "dataset.json", "use --classes instrument"):
-        loaded(root, "parts")
+        loaded(root, PARTS)
 
 
 def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> None:
@@ -155,7 +173,7 @@ def test_sets_that_cannot_be_read_are_refused(drawn: Path, tmp_path: Path) -> No
     with refused("--sets set", "has 6 images, not 7; synthesize more"):
         loaded(drawn, count=7)
     with refused("--sets set", "is 48x40, the capture's frames are 60x50"):
-        synthetic_samples(DataSet("set", drawn), "instrument", "hard", (60, 50))
+        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", (60, 50))
     (drawn / "parts" / "000005.png").unlink()
     assert len(loaded(drawn, count=5)) == 5
     with refused("--sets set", "000005.png", "every image needs its labels"):
@@ -193,7 +211,7 @@ def test_ids_that_mean_nothing_are_refused(drawn: Path) -> None:
     parts[0, 0] = 9
     save_grey(drawn / "parts" / "000000.png", parts)
     with refused("000000.png: id 9 has no class", "dataset.json"):
-        synthetic_samples(DataSet("set", drawn), "instrument", "hard", SIZE)  # known before the work
+        synthetic_samples(DataSet("set", drawn), WHOLE, "hard", SIZE)  # known before the work
 
 
 def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> None:
@@ -207,8 +225,8 @@ def test_a_description_with_numbers_that_are_none_is_refused(drawn: Path) -> Non
 def test_parts_are_refused_where_labels_tell_none(drawn: Path) -> None:
     write_ids(drawn, tuple((name, "instrument") for name in "abcd"))
     assert loaded(drawn)[0].instruments.max() == 4
-    with refused("--sets set", "have no parts; use --classes instrument"):
-        loaded(drawn, "parts")
+    with refused("--sets set", "none of the parts", "use --classes instrument"):
+        loaded(drawn, PARTS)
 
 
 @pytest.mark.parametrize(

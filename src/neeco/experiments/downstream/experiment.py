@@ -26,8 +26,8 @@ from neeco.experiments.downstream.job import (
 from neeco.experiments.downstream.model import model_class
 from neeco.experiments.downstream.results import comparisons, failed_jobs, findings, summarise_folds
 from neeco.experiments.downstream.samples import (
-    CLASSES,
     DataSet,
+    class_names,
     frame_size,
     has_labels,
     recorded_samples,
@@ -71,7 +71,7 @@ def plan_downstream(settings: DownstreamSettings) -> DownstreamPlan:
     for data in settings.sets:
         edges = {condition.edges for condition in conditions if data.name in condition.sets}
         for edge in sorted(edges) or [DEFAULT_EDGES]:
-            images[data.name] = len(synthetic_samples(data, settings.classes, edge, size))
+            images[data.name] = len(synthetic_samples(data, class_names(capture, settings.classes), edge, size))
     counts, labelled = _counts(settings, capture, conditions)
     _check_inputs(settings, capture, size)
     entries = settings.output.iterdir() if settings.output.is_dir() else ()
@@ -244,7 +244,7 @@ def document(plan: DownstreamPlan, results: Sequence[Mapping[str, Any]]) -> dict
             "batch": settings.batch,
             "device": settings.device,
         },
-        "classes": list(CLASSES[settings.classes]),
+        "classes": list(class_names(plan.capture, settings.classes)),
         "splits": list(settings.splits),
         "folds": settings.folds,
         "labelled": plan.labelled,

@@ -19,14 +19,13 @@ from neeco.errors import NeecoError
 from neeco.evaluation.mask_metrics import iou
 from neeco.experiments.downstream.model import Model, TrainedModel, TrainingTask, input_size, model_class
 from neeco.experiments.downstream.samples import (
-    CLASSES,
-    JAWS,
     BatchSampler,
     ClassNames,
     DataSet,
     Edges,
     Sample,
     augment,
+    class_names,
     frame_size,
     recorded_samples,
     synthetic_samples,
@@ -43,7 +42,7 @@ EDGES: tuple[Edges, ...] = ("hard", "soft", "ignore")
 DEFAULT_EDGES: Edges = "hard"
 RESERVED = (REAL, AUGMENT, *EDGES)
 PARTS_STEPS = 2.5  # times as many steps to learn parts as one class: more of them do not help
-JAW_DISTANCE = 4.0  # px about the true jaws in which `iou_jaws` is taken: they are thin, and small beside the shaft
+PAIR_DISTANCE = 4.0  # px about a pair (jaws) in which `iou_jaws` is taken: they are thin, and small beside the shaft
 HELD_OUT = ("validation_every", "min_validated")  # settings that job.json has only where they are not the default
 PYTHON_ONLY = ("finetune_share", "finetune_epochs", *HELD_OUT)
 MIN_STORED_SCORE = 0.05  # boxes of a lower confidence are not stored
@@ -302,7 +301,8 @@ class DownstreamJob:
         chosen = labelled_frames(len(recorded), self.real, self.fold, settings.frame_selection)
         size = frame_size(recorded or recorded_samples(capture, settings.splits[0], settings.classes))
         sources: list[Sequence[Sample]] = [[recorded[index] for index in chosen]]
-        sources += [synthetic_samples(data, settings.classes, self.condition.edges, size) for data in self.sets]
+        names = class_names(capture, settings.classes)
+        sources += [synthetic_samples(data, names, self.condition.edges, size) for data in self.sets]
         parts = [settings.hold_out(source, self.fold) for source in sources if source]
         learned = [samples for samples, _ in parts]
         validation: Sequence[Sample] = next((held_out for _, held_out in parts if held_out), [])
@@ -312,7 +312,7 @@ class DownstreamJob:
             most = settings.finetune_epochs * len(learned[0]) // batch
             mixed = (steps - min(round(settings.finetune_share * steps), most)) * batch
         return TrainingTask(
-            classes=CLASSES[settings.classes],
+            classes=names,
             batches=BatchSampler(learned, self.fold, augment if self.condition.augment else None, mixed),
             validation=tuple(validation),
             size=settings.input_of(kind, size),
@@ -329,7 +329,7 @@ class DownstreamJob:
         samples = recorded_samples(capture, split, self.settings.classes)
         truth = [sample.load() for sample in samples]
         predictions = trained.predict([example.image for example in truth])
-        names, folder = CLASSES[self.settings.classes], predictions_folder(self.folder, split)
+        names, folder = class_names(capture, self.settings.classes), predictions_folder(self.folder, split)
         boxes = {
             sample.name: found
             for sample, found in zip(samples, predictions, strict=True)
@@ -343,10 +343,10 @@ class DownstreamJob:
             assert isinstance(mask, np.ndarray)
             write_labels(folder / f"{sample.name}.png", torch.from_numpy(mask))
             scores = mask_scores(mask, example, names)
-            if (jaws := sample.part_pixels(JAWS)) is not None:
-                close = near(jaws, JAW_DISTANCE)
+            for pair, pixels in sample.pairs().items():
+                close = near(pixels, PAIR_DISTANCE)
                 region = close if example.valid is None else close & example.valid
-                scores |= {"iou_jaws": iou(mask > 0, example.classes > 0, region)}
+                scores |= {f"iou_{pair}": iou(mask > 0, example.classes > 0, region)}
             frames.append(scores)
         rows = [
             {"frame": sample.name}

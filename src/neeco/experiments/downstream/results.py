@@ -40,13 +40,13 @@ TITLES = {
     "precision": "precision",
     "recall": "recall",
     "boundary_f": "boundary F",
-    "iou_jaws": "IoU near the jaws",
     "ap": "AP50-95",
     "ap50": "AP50",
     "ap75": "AP75",
     "box_precision": "precision",
     "box_recall": "recall",
 }
+NEAR = "iou_"  # begins the score near a pair of parts: iou_jaws
 CONFIDENCE = 0.95  # of intervals
 HELPS, HURTS, NONE_SHOWN = "helps", "hurts", "no difference shown"
 VERDICTS = (HELPS, HURTS, NONE_SHOWN)
@@ -93,10 +93,11 @@ def failed_jobs(experiment: Document) -> list[str]:
 
 def metrics_of(jobs: Sequence[Document], predicts: str) -> list[str]:
     """The scores that these jobs have, the usual ones first, then those of classes."""
-    usual = [*MASK_SCORES, "iou_jaws"] if predicts == "masks" else list(BOX_SCORES)
+    usual = list(MASK_SCORES if predicts == "masks" else BOX_SCORES)
     scores = [split for job in jobs for split in job["splits"].values()]
     found = dict.fromkeys(key for split in scores for key, value in split.items() if isinstance(value, float))
-    return [key for key in usual if key in found] + [key for key in found if "." in key]
+    of_pairs = [key for key in found if predicts == "masks" and key.startswith(NEAR)]
+    return [*(key for key in usual if key in found), *of_pairs, *(key for key in found if "." in key)]
 
 
 def summarise_folds(jobs: Sequence[Document], models: Mapping[str, str], splits: Sequence[str]) -> list[dict[str, Any]]:
@@ -331,7 +332,9 @@ def _keys(row: Document) -> tuple[str, str]:
 
 
 def _metric_title(metric: str) -> str:
-    """A score's title; of a class `jaws IoU`."""
+    """A score's title; of a class `jaws IoU`, near a pair of parts `IoU near the jaws`."""
+    if metric.startswith(NEAR):
+        return f"IoU near the {metric.removeprefix(NEAR).replace('_', ' ')}"
     name, _, score = metric.rpartition(".")
     return f"{name} {TITLES[score]}".strip()
 

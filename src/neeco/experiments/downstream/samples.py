@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,14 +15,13 @@ import numpy as np
 from neeco.capture.images import EXTENSIONS, image_size, open_image, read_image_bytes, read_labels
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
-from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file
-from neeco.evaluation.mask_metrics import TRUTH_PARTS
+from neeco.evaluation.mask_folders import PARTS_FILE, Masks, open_masks, open_truth, truth_file, truth_names
+from neeco.evaluation.mask_metrics import pairs_of
 from neeco.files import read_json, read_text, require_inside
 
 ClassNames = Literal["instrument", "parts"]
 Edges = Literal["hard", "soft", "ignore"]
-CLASSES: Mapping[str, tuple[str, ...]] = {"instrument": ("instrument",), "parts": ("shaft", "wrist", "jaws")}
-JAWS = ("jaw_left", "jaw_right")  # one class: an image does not show which jaw is called left
+WHOLE = ("instrument",)  # the classes where an instrument is one
 DATASET_FILE, STATES_FILE, IMAGE_FOLDER = "dataset.json", "states.jsonl", "images"
 
 
@@ -54,14 +53,29 @@ class Example:
         return np.concatenate([centres, sizes], 1) / np.array([width, height, width, height], np.float64), classes
 
 
-class LabelMap:
-    """Class and instrument of every id in label images, uint8 [256] each, from {id: (instrument, from 1; part)}."""
+def class_names(capture: Capture, classes: ClassNames) -> tuple[str, ...]:
+    """What a model tells apart: the instrument, or the parts of the capture's truth. Raises NeecoError."""
+    if classes == "instrument":
+        return WHOLE
+    return tuple(dict.fromkeys(_paired(truth_names(capture.root)).values()))
 
-    def __init__(self, parts: Mapping[int, tuple[int, str]], classes: ClassNames) -> None:
+
+def _paired(names: Mapping[int, str]) -> dict[int, str]:
+    """Part by id, with one name for both of a pair: an image does not show which jaw is called left."""
+    pairs = {part: pair for pair, both in pairs_of(names.values()).items() for part in both}
+    return {number: pairs.get(part, part) for number, part in names.items()}
+
+
+class LabelMap:
+    """Class and instrument of every id in label images, uint8 [256] each, from {id: (instrument, from 1; part)};
+    classes: as `class_names` gives them."""
+
+    def __init__(self, parts: Mapping[int, tuple[int, str]], classes: Sequence[str]) -> None:
         self.classes, self.instruments = np.zeros((2, 256), np.uint8)
-        for number, (instrument, part) in parts.items():
-            name = "instrument" if classes == "instrument" else "jaws" if part in JAWS else part
-            self.classes[number] = CLASSES[classes].index(name) + 1 if name in CLASSES[classes] else 0
+        paired = _paired({number: part for number, (_, part) in parts.items()})
+        for number, (instrument, _) in parts.items():
+            name = WHOLE[0] if classes == WHOLE else paired[number]
+            self.classes[number] = classes.index(name) + 1 if name in classes else 0
             self.instruments[number] = instrument
 
     def check(self, ids: np.ndarray, file: Path, remedy: str) -> None:
@@ -97,12 +111,14 @@ class RecordedSample:
         labels = self.label_map.classes[ids], self.label_map.instruments[ids]
         return Example(pixels, *labels, None if valid is None else valid.numpy())
 
-    def part_pixels(self, parts: Collection[str]) -> np.ndarray | None:
-        """bool [H, W]: the pixels of these parts; None where the labels have no parts. Raises NeecoError."""
-        names = self.masks.names
-        if names is None:
-            return None
-        return np.isin(self.masks.load(self.name), [number for number, part in names.items() if part in parts])
+    def pairs(self) -> dict[str, np.ndarray]:
+        """bool [H, W] by pair: the pixels of its parts; none where the labels have no parts. Raises NeecoError."""
+        names = self.masks.names or {}
+        ids = self.masks.load(self.name)
+        return {
+            pair: np.isin(ids, [number for number, part in names.items() if part in both])
+            for pair, both in pairs_of(names.values()).items()
+        }
 
 
 @dataclass(frozen=True)
@@ -187,11 +203,12 @@ def recorded_samples(
     if masks is None or not frames:
         where = f"{capture.root}: split {split}" if labels is None else f"--labels {labels}"
         raise NeecoError(f"{where}: no frame has a label; give --labels FOLDER with masks named as the frames")
-    if classes == "parts" and not set((masks.names or {}).values()) & set(TRUTH_PARTS):
+    wanted = class_names(capture, classes)
+    if classes == "parts" and not set(_paired(masks.names or {}).values()) & set(wanted):
         raise NeecoError(f"--classes parts: the labels in {masks.path} have no parts; use --classes instrument")
     # where only some frames' truth has parts, every id is a piece of the instrument
     names = dict.fromkeys(range(1, 256), "instrument") if masks.names is None else masks.names
-    label_map = LabelMap({number: (1, part) for number, part in names.items()}, classes)
+    label_map = LabelMap({number: (1, part) for number, part in names.items()}, wanted)
     return tuple(RecordedSample(frame, masks, label_map) for frame in frames)
 
 
@@ -212,7 +229,7 @@ def frame_size(samples: Sequence[RecordedSample]) -> tuple[int, int]:
 
 
 def synthetic_samples(
-    data: DataSet, classes: ClassNames, edges: Edges, size: tuple[int, int]
+    data: DataSet, classes: Sequence[str], edges: Edges, size: tuple[int, int]
 ) -> tuple[SyntheticSample, ...]:
     """The images of a data set in their order, each with its labels; the first `count` of them.
 
@@ -268,11 +285,11 @@ def _training_images(data: DataSet, images: list[Path]) -> list[Path]:
     return chosen
 
 
-def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, LabelMap]:
+def _labels_of(data: DataSet, classes: Sequence[str]) -> tuple[str, LabelMap]:
     """The folder of a data set that holds its labels, and what they mean."""
     file, info = data.file(DATASET_FILE), data.info()
     if info is None:
-        if classes == "parts":
+        if classes != WHOLE:
             raise data.error(f"{file}: no such file, so no parts are known; use --classes instrument")
         return "masks", LabelMap(dict.fromkeys((1, 255), (1, "instrument")), classes)  # 255: black and white masks
     try:
@@ -282,10 +299,13 @@ def _labels_of(data: DataSet, classes: ClassNames) -> tuple[str, LabelMap]:
     except (KeyError, TypeError, ValueError, IndexError):
         raise data.error(f"{file}: ids: not as `neeco synthesize` writes them") from None
     instruments = list(dict.fromkeys(instrument for _, instrument, _ in entries))
-    if classes == "parts" and not {part for _, _, part in entries} & set(TRUTH_PARTS):
-        raise data.error(f"{data.path}: its labels have no parts; use --classes instrument")
     parts = {number: (instruments.index(instrument) + 1, part) for number, instrument, part in entries}
-    return "parts", LabelMap(parts, classes)
+    label_map = LabelMap(parts, classes)
+    if not label_map.classes.any():
+        raise data.error(
+            f"{data.path}: its labels have none of the parts {', '.join(classes)}; use --classes instrument"
+        )
+    return "parts", label_map
 
 
 def _read_grey(file: Path, size: tuple[int, int]) -> np.ndarray:
