@@ -19,7 +19,17 @@ from neeco.evaluation.align import fit_frame, pose_changes
 from neeco.evaluation.coverage import Coverage, observed_depths, unobserved_tissue
 from neeco.evaluation.image_metrics import MIN_SIZE, WEIGHTS_VARIABLE, Lpips, psnr, ssim
 from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
-from neeco.evaluation.mask_metrics import PartTally, dice, finite, iou, mean_of, pairs_of, part_scores, to_truth_ids
+from neeco.evaluation.mask_metrics import (
+    PartTally,
+    dice,
+    finite,
+    iou,
+    mean_of,
+    pairs_of,
+    part_scores,
+    precision,
+    to_truth_ids,
+)
 from neeco.files import write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
@@ -169,7 +179,7 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
     image, target, mask, reference = drawing.image, recorded.image, recorded.mask, recorded.reference
     counted = torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
     tissue = int((recorded.tissue & counted).sum())
-    predicted = None if drawing.parts is None or reference is None else drawing.parts > 0
+    labelled = None if drawing.parts is None or reference is None else (drawing.parts > 0, reference.mask)
     shown = image if mask is None else torch.where(mask[..., None], image, target)
     lpips = {
         name: network.between(network.features(shown), recorded.features[name], mask)
@@ -180,8 +190,10 @@ def _scores(drawing: Drawing, recorded: _Recorded, networks: Mapping[str, Lpips]
         "ssim": ssim(image, target, mask),
         **{key: lpips.get(name) for name, key in LPIPS_KEYS.items()},
         "psnr_instrument": None if reference is None else psnr(image, target, counted & reference.mask),
-        "mask_iou": None if reference is None or predicted is None else iou(predicted, reference.mask, counted),
-        "mask_dice": None if reference is None or predicted is None else dice(predicted, reference.mask, counted),
+        "mask_iou": None if labelled is None else iou(*labelled, counted),
+        "mask_dice": None if labelled is None else dice(*labelled, counted),
+        "mask_precision": None if labelled is None else precision(*labelled, counted),
+        "mask_recall": None if labelled is None else precision(*labelled[::-1], counted),
         "psnr_covered": psnr(image, target, counted & ~recorded.unobserved),
         "psnr_uncovered": psnr(image, target, counted & recorded.unobserved),
         "covered_fraction": 1.0 - int((recorded.unobserved & counted).sum()) / tissue if tissue else None,

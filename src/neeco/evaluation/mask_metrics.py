@@ -38,6 +38,14 @@ def dice(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
     return 2 * both / (both + either) if either else math.nan
 
 
+def precision(mask: Pixels, truth: Pixels, counted: Pixels | None = None) -> float:
+    """Share of a bool mask [H, W] that is true; recall, the other way round. NaN when `mask` is empty."""
+    if counted is not None:
+        mask = mask & counted
+    marked = int(mask.sum())
+    return int((mask & truth).sum()) / marked if marked else math.nan
+
+
 def _overlap(mask: Pixels, truth: Pixels, counted: Pixels | None) -> tuple[int, int]:
     if counted is not None:
         mask, truth = mask & counted, truth & counted
