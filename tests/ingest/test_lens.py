@@ -27,6 +27,10 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ -0.3, 0.1, 0.001, -0.002, 0. ]
 """
+FISHEYE = {
+    "camera_model": "OPENCV_FISHEYE", "w": 640, "h": 480, "fl_x": 330, "fl_y": 335, "cx": 322, "cy": 241,
+    "k1": -0.02, "k2": 0.01, "k3": -0.004, "k4": 0.0007,
+}  # fmt: skip
 ROS = """image_width: 320
 image_height: 240
 distortion_model: plumb_bob
@@ -68,10 +72,11 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", OPENCV.replace("300.5", "[{}]"), "camera_matrix: "),
         ("a.yaml", OPENCV.replace("300.5", "wide"), "'wide' is not a usable number"),
         ("a.yaml", OPENCV.replace("300.5", "1" + "0" * 400), "is not a usable number"),
-        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant lenses are not supported"),
+        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "a fisheye lens has 4 coefficients, not 5"),
         ("a.json", "{}", "fl_x: missing"),
         ("a.json", '{"fl_x": "x", "cx": 1, "cy": 1}', "'x' is not a usable number"),
-        ("a.json", '{"camera_model": "OPENCV_FISHEYE", "fl_x": 1}', "opencv_fisheye lenses are not supported"),
+        ("a.json", json.dumps(FISHEYE | {"fl_x": 90, "fl_y": 90}), "sees farther than 80 degrees off its axis"),
+        ("a.json", json.dumps(FISHEYE | {"k1": -0.9}), "or folds the image over"),
         ("a.yaml", "!!python/object/apply:os.system [ls]", "not valid YAML"),
     ],
 )
@@ -82,6 +87,17 @@ def test_calibrations_that_are_none(world, name, text, message):
     with pytest.raises(NeecoError, match=rf"{name}: .*{message}") as caught:
         read_lens(world.text(text, name))
     assert "\n" not in str(caught.value)
+
+
+def test_a_fisheye_lens_bends_as_opencv_says(world):
+    lens = read_lens(world.text(json.dumps(FISHEYE), "fisheye.json"))
+    rays = np.random.default_rng(0).uniform((-1.4, -0.9), (1.4, 0.9), (200, 2))  # to 59 degrees off the axis
+    coefficients = np.array([FISHEYE[key] for key in ("k1", "k2", "k3", "k4")])
+    true = cv2.fisheye.distortPoints(rays[:, None], lens._matrix(), coefficients)[:, 0]
+    points = np.column_stack([rays, np.ones(200)])
+    bent, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens._matrix(), np.array(lens.distortion))
+    assert np.abs(bent[:, 0] - true).max() < 0.01  # px
+    lens.pinhole((640, 480))  # and nothing folds
 
 
 def test_a_lens_of_another_video_is_refused():

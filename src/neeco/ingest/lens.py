@@ -20,8 +20,11 @@ from neeco.files import parse_yaml, read_json, read_text, require_file
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
+FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 LARGEST = 1e9  # of any of a lens's numbers
+WIDEST_ANGLE = math.radians(80)  # off the axis, that a fisheye lens may see
+MISFIT_PX = 0.1  # of a fisheye lens written as another model
 
 # The dark border around a round field of view.
 BORDER_SAMPLES = 48  # frames looked at
@@ -36,7 +39,8 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     """A lens from an OpenCV or ROS calibration (YAML), the fields of a nerfstudio JSON, or (fl_x, fl_y, cx, cy) px.
 
     None: to be estimated. OpenCV's principal point counts from the first pixel's centre, ours from its corner: half a
-    pixel is added. Raises NeecoError naming file, field and remedy.
+    pixel is added. A fisheye lens becomes one of OpenCV's rational model. Raises NeecoError naming file, field and
+    remedy.
     """
     if source is None:
         return None
@@ -51,7 +55,6 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
 def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
-    _refuse_fisheye(path, document, "camera_model")
     size = _size(path, document.get("w"), document.get("h"))
     if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
         angle = float(document["camera_angle_x"])
@@ -61,7 +64,9 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     if missing:
         raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
-    return _checked(path, values, [document.get(key, 0.0) for key in NERFSTUDIO_DISTORTION], size)
+    names = FISHEYE_DISTORTION if _is_fisheye(document, "camera_model") else NERFSTUDIO_DISTORTION
+    distortion = [document.get(key, 0.0) for key in names]
+    return _checked(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
 
 
 def _opencv(path: Path, document: Any) -> Lens:
@@ -72,14 +77,21 @@ def _opencv(path: Path, document: Any) -> Lens:
     matrix = _numbers(path, _first(document, MATRIX_NAMES), "camera_matrix")
     if len(matrix) != 9:
         raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
-    _refuse_fisheye(path, document, "distortion_model")
     found = _first(document, DISTORTION_NAMES)
     size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
-    return _checked(path, values, _numbers(path, [] if found is None else found, "distortion_coefficients"), size)
+    distortion = _numbers(path, [] if found is None else found, "distortion_coefficients")
+    return _checked(path, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
 
 
-def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], size: tuple[int, int] | None) -> Lens:
+def _checked(
+    source: object,
+    values: Sequence[Any],
+    distortion: Sequence[Any],
+    size: tuple[int, int] | None,
+    *,
+    fisheye: bool = False,
+) -> Lens:
     for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
         for value in given:
             number = as_float(value)
@@ -88,6 +100,8 @@ def _checked(source: object, values: Sequence[Any], distortion: Sequence[Any], s
     if len(values) != 4 or min(values[:2]) <= 0:
         raise NeecoError(f"{source}: fl_x, fl_y: must be two positive focal lengths in pixels; correct them")
     coefficients = tuple(float(value) for value in distortion)
+    if fisheye:
+        coefficients = _rational(source, [float(value) for value in values], coefficients, size)
     if len(coefficients) not in COEFFICIENTS:
         raise NeecoError(f"{source}: distortion: has {len(coefficients)} coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if not any(coefficients):
@@ -104,11 +118,42 @@ def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _refuse_fisheye(path: Path, document: dict[Any, Any], field: str) -> None:
-    model = str(document.get(field, "")).lower()
-    if model in FISHEYE:
-        remedy = "calibrate with OpenCV's standard model (calibrateCamera)"
-        raise NeecoError(f"{path}: {field}: {model} lenses are not supported; {remedy}")
+def _is_fisheye(document: dict[Any, Any], field: str) -> bool:
+    return str(document.get(field, "")).lower() in FISHEYE
+
+
+def _rational(
+    source: object, values: Sequence[float], fisheye: Sequence[float], size: tuple[int, int] | None
+) -> tuple[float, ...]:
+    """OpenCV's eight coefficients of the rational model that bend the image as four of a fisheye (Kannala & Brandt
+    2006) do, to MISFIT_PX or better: least squares, reweighted by the denominator. Raises NeecoError."""
+    if len(fisheye) != 4:
+        raise NeecoError(
+            f"{source}: distortion: a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
+        )
+    fl_x, fl_y, cx, cy = values
+    width, height = size or (2 * cx, 2 * cy)
+    theta = np.linspace(1e-3, WIDEST_ANGLE, 2000)
+    bent = theta * np.polynomial.polynomial.polyval(theta**2, (1.0, *fisheye))
+    farthest = math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
+    used = bent <= farthest
+    if used.all() or (np.diff(bent[used]) <= 0).any():
+        what = f"sees farther than {math.degrees(WIDEST_ANGLE):.0f} degrees off its axis, or folds the image over"
+        raise NeecoError(f"{source}: distortion: this fisheye lens {what}; crop the images, or calibrate again")
+    radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
+    powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
+    weight = radius
+    for _ in range(8):
+        rows = np.hstack([powers, -share[:, None] * powers]) * weight[:, None]
+        found = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
+        weight = radius / np.maximum(1 + powers @ found[3:], 1e-6)
+    error = np.abs((1 + powers @ found[:3]) / (1 + powers @ found[3:]) - share) * radius * max(fl_x, fl_y)
+    if not error.max() < MISFIT_PX:
+        raise NeecoError(
+            f"{source}: distortion: this fisheye lens bends too much for OpenCV's rational model ({error.max():.2f} px "
+            "off); crop the images, or calibrate again"
+        )
+    return (*found[:2].tolist(), 0.0, 0.0, *found[2:].tolist())
 
 
 class _Loader(yaml.SafeLoader):
