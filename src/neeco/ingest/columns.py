@@ -121,9 +121,9 @@ def split_unit(name: str, kind: str) -> tuple[str, str | None]:
 
 
 def scale_of(
-    path: Path, names: tuple[str, ...], kind: str, stated: str | None, implied: str | None, hint: str
+    where: Path | str, names: tuple[str, ...], kind: str, stated: str | None, implied: str | None, hint: str
 ) -> float:
-    """The factor to mm, rad or s of some columns of a file.
+    """The factor to mm, rad or s of some columns; `where` begins messages.
 
     The unit is in their names, else `stated` by the recording, else `implied` by the file's format. hint: added to
     the question when there is none. Raises NeecoError when nothing gives the unit or two sources disagree.
@@ -131,14 +131,14 @@ def scale_of(
     found = {unit for name in names if (unit := split_unit(name, kind)[1])}
     listed = ", ".join(names)
     if len(found) > 1:
-        raise NeecoError(f"{path}: columns {listed}: named in different units; write them in one {kind} unit")
+        raise NeecoError(f"{where}: columns {listed}: named in different units; write them in one {kind} unit")
     unit = next(iter(found), None)
     if unit and stated and unit != stated:
-        raise NeecoError(f"{path}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct one")
+        raise NeecoError(f"{where}: columns {listed}: named in {unit}, but units.{kind} says {stated}; correct one")
     unit = unit or stated or implied
     if unit is None:
         raise NeecoError(
-            f"{path}: columns {listed}: in which {kind} unit?{hint} Say it in the header (for example "
+            f"{where}: columns {listed}: in which {kind} unit?{hint} Say it in the header (for example "
             f"{names[0]}_{next(iter(UNITS[kind]))}) or in the recording's units.{kind} ({', '.join(UNITS[kind])})"
         )
     return UNITS[kind][unit]

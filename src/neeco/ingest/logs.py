@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest import columns as named
 from neeco.ingest.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
-from neeco.ingest.formats import Table, column_index, count_rows, list_lines, numbers, read_table
+from neeco.ingest.formats import Table, column_index, count_rows, numbers, read_table
 from neeco.ingest.ndi import tool_columns
 from neeco.raster.rotations import rotation_error
 
@@ -36,7 +36,8 @@ class PoseLog:
     """Poses tracker_from_sensor over time, on the log's own clock: t_log = t_video + offset.
 
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
-    first time after) where samples are missing; notes: what was dropped or repaired, in words.
+    first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
+    are stated in, CAMERA or BASE.
     """
 
     path: Path
@@ -46,6 +47,7 @@ class PoseLog:
     quats: np.ndarray
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
+    frame: str = named.BASE
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -80,17 +82,18 @@ class Rows:
         """Leave out a few rows that are wrong (bool [R]). Raises NeecoError when they are more than a few."""
         lines, count = self.table.lines[wrong & self.keep], int(self.keep.sum())
         if len(lines) > max(1, WRONG_ROWS * count):
-            raise NeecoError(f"{self.table.path}: {list_lines(lines)} ({len(lines)} of {count_rows(count)}): {reason}")
+            share = f"{self.table.list_rows(lines)} ({len(lines)} of {count_rows(count)})"
+            raise NeecoError(f"{self.table.where}: {share}: {reason}")
         self.drop(wrong, reason.split(";")[0])
 
     def notes(self) -> tuple[str, ...]:
         """What was done to the rows, one sentence each."""
-        name = self.table.path.name
+        name = self.table.title
         dropped = (
-            f"{name}: {count_rows(len(lines))} dropped: {reason} ({list_lines(lines)})"
+            f"{name}: {count_rows(len(lines))} dropped: {reason} ({self.table.list_rows(lines)})"
             for reason, lines in self.reasons.items()
         )
-        return (*dropped, *(f"{name}: {repair}" for repair in self.repairs))
+        return (*self.table.notes, *dropped, *(f"{name}: {repair}" for repair in self.repairs))
 
 
 def read_pose_log(source: PoseColumns) -> PoseLog:
@@ -106,7 +109,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
     gaps, gap_notes = _gaps(table, times)
-    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, (*rows.notes(), *gap_notes))
+    notes, frame = (*rows.notes(), *gap_notes), source.frame or table.frame or named.BASE
+    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame)
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -125,7 +129,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         values, clamped = _calibrated(rows, value, values, source, source.calibration)
     else:
         hint = " Counts need a calibration table, `calibration`."
-        values = values * named.scale_of(table.path, (value,), "angle", source.units.angle, None, hint)
+        values = values * named.scale_of(table.where, (value,), "angle", source.units.angle, None, hint)
         impossible = np.abs(np.where(rows.keep, values, 0)) > TWO_TURNS
         reason = f"{value} is more than two turns; give the right unit, or a calibration table if these are counts"
         rows.drop_wrong(impossible, reason)
@@ -146,10 +150,10 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     else:
         read = (*position, *rotation)
     implied = found.length_unit if position == found.position else None
-    scale = named.scale_of(table.path, position, "length", source.units.length, implied, "")
+    scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
-        angle = named.scale_of(table.path, rotation, "angle", source.units.angle, None, "")
+        angle = named.scale_of(table.where, rotation, "angle", source.units.angle, None, "")
     positions, turns = _parts(table, form, _cells(rows, read))
     positions = positions * scale
     if form not in (EULER, ROTATION_VECTOR):  # trackers write zeros where they have no rotation
@@ -160,8 +164,8 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
     distance = np.median(np.linalg.norm(positions[rows.keep], axis=1)) if rows.keep.any() else 0.0
     if distance > FARTHEST_MM:
         raise NeecoError(
-            f"{table.path}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker; "
-            "correct the unit in the header or in units.length"
+            f"{table.where}: {', '.join(position)}: half the samples are over {distance / 1000:.3g} m from the tracker"
+            "; correct the unit in the header or in units.length"
         )
     return positions, quats
 
@@ -224,8 +228,8 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
         rows.keep[members] = False
     if not rows.keep.any():
         raise NeecoError(
-            f"{table.path}: {name}: no row is {' or '.join(source.good)} (line {table.lines[0]} has {states[0][:20]!r})"
-            "; list the values that mark measured rows in the recording: columns.good"
+            f"{table.where}: {name}: no row is {' or '.join(source.good)} ({table.list_rows(table.lines[:1])} has "
+            f"{states[0][:20]!r}); list the values that mark measured rows in the recording: columns.good"
         )
 
 
@@ -233,7 +237,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
     """Times [R] in s; rows without one are dropped."""
     table, names = rows.table, source.time or found.time
     if names is None:
-        raise NeecoError(f"{table.path}: header: no column of times found; name it as columns.time (or add t_s)")
+        raise NeecoError(f"{table.where}: header: no column of times found; name it as columns.time (or add t_s)")
     cells = _cells(rows, names)
     known = named.recognise_time(names)
     if len(names) == 2:
@@ -242,7 +246,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
         return cells[:, 0] / source.rate_hz
     if known.counts_frames:
         raise NeecoError(
-            f"{table.path}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
+            f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "
             "recording (40 for NDI Aurora, 60 for NDI Polaris) or name a column of times"
         )
     steps = np.diff(cells[rows.keep, 0])
@@ -252,7 +256,7 @@ def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColu
         rates = {unit: 1 / (np.median(steps) * scale) for unit, scale in (("s", 1), ("ms", 1e-3), ("ns", 1e-9))}
         likely = [f"{unit} would be {rate:.3g} Hz" for unit, rate in rates.items() if 1 <= rate <= 5000]
         hint = f" Its steps in {', '.join(likely)}." if likely else ""
-    return cells[:, 0] * named.scale_of(table.path, names, "time", source.units.time, known.time_unit, hint)
+    return cells[:, 0] * named.scale_of(table.where, names, "time", source.units.time, known.time_unit, hint)
 
 
 def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
@@ -264,13 +268,14 @@ def _cells(rows: Rows, names: tuple[str, ...]) -> np.ndarray:
     if len(bad) > max(3, 0.5 * rows.keep.sum()):
         alike = f"{len(bad)} of {count_rows(len(table.rows))} like it"
         raise NeecoError(
-            f"{table.path}: line {table.lines[bad[0][0]]}: {bad[0][1]} ({alike}); name other columns or repair the file"
+            f"{table.where}: {table.record} {table.lines[bad[0][0]]}: {bad[0][1]} ({alike}); name other columns or "
+            "repair the file"
         )
     if bad:
         rows.drop([row for row, _ in bad], f"not readable, first: {bad[0][1]}")
     if not rows.keep.any():
         raise NeecoError(
-            f"{table.path}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
+            f"{table.where}: {', '.join(names)}: no row has values; name other columns or another file in the recording"
         )
     return values
 
@@ -282,9 +287,10 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
         raise _unclear(table, found, "rotation", "qw, qx, qy, qz columns")
     if len(rotation) not in named.FORMS[form]:
         wanted = " or ".join(map(str, named.FORMS[form]))
-        raise NeecoError(f"{table.path}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
+        raise NeecoError(f"{table.where}: {form}: takes {wanted} columns, not {len(rotation)}; list them all")
     if form == EULER and not source.euler_convention:
-        raise NeecoError(f"{table.path}: {', '.join(rotation)}: say their euler_convention in the recording (like XYZ)")
+        listed = ", ".join(rotation)
+        raise NeecoError(f"{table.where}: {listed}: say their euler_convention in the recording (like XYZ)")
     return form, rotation
 
 
@@ -293,7 +299,7 @@ def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -
     problem = (
         f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns"
     )
-    return NeecoError(f"{table.path}: header: {f'{what}: {reason}' if reason else problem}")
+    return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
 
 
 def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -304,7 +310,7 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     if cells.shape[1] == 16:
         last, column = cells[:, 12:], cells.reshape(-1, 4, 4)[:, :3, 3]
         if np.nanmedian(np.abs(last[:, :3])) > 1e-6 and np.nanmax(np.abs(column)) < 1e-9:
-            raise NeecoError(f"{table.path}: matrix: is written by columns; list them in the recording row by row")
+            raise NeecoError(f"{table.where}: matrix: is written by columns; list them in the recording row by row")
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
@@ -319,11 +325,12 @@ def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(order) < MIN_SAMPLES:
         why = "; ".join(note.partition(": ")[2] for note in rows.notes()[:2])
         raise NeecoError(
-            f"{table.path}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
+            f"{table.where}: {count_rows(len(order))} of {len(table.rows)} can be used{f' ({why})' if why else ''}; "
             "record again or name the right columns"
         )
     if len(late):
-        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({list_lines(table.lines[late])})")
+        listed = table.list_rows(table.lines[late])
+        rows.repairs.append(f"{count_rows(len(late))} out of order in time; sorted ({listed})")
     return times[order], order
 
 
@@ -337,7 +344,7 @@ def _gaps(table: Table, times: np.ndarray) -> tuple[tuple[tuple[float, float], .
     total = sum(end - start for start, end in gaps)
     first = ", ".join(f"{start:.2f}-{end:.2f} s" for start, end in gaps[:3])
     count = f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''}"
-    return gaps, (f"{table.path.name}: {count}, {total:.2f} s in all ({first}); not bridged",)
+    return gaps, (f"{table.title}: {count}, {total:.2f} s in all ({first}); not bridged",)
 
 
 def read_calibration(path: Path, angle_unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -399,9 +406,9 @@ def _calibrated(
     note = ""
     if clamped.any():
         note = (
-            f"{table.path.name}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
+            f"{table.title}: {count_rows(int(clamped.sum()))} with {name} just outside the table "
             f"{path.name} ({low:g} to {high:g}, by at most {excess[clamped].max():g}): "
-            f"read as its end ({list_lines(table.lines[clamped])})"
+            f"read as its end ({table.list_rows(table.lines[clamped])})"
         )
     reason = f"{name} lies far outside the calibration table {path.name}"
     rows.drop_wrong(outside, reason + "; extend the table, or name the right column")

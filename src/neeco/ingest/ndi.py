@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
+
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.ingest.columns import PoseColumns
@@ -32,7 +34,7 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     Raises NeecoError where there are several tools and none is named, or columns are named that are not all one tool's:
     the second `Tx` is the first tool's first marker.
     """
-    tools = _tools(table)
+    tools = [] if isinstance(table.rows, np.ndarray) else _tools(table)
     if not tools:
         if source.tool is not None:
             raise NeecoError(

@@ -33,13 +33,35 @@ DELIMITED = (".csv", ".tsv", ".txt")
 
 @dataclass(frozen=True)
 class Table:
-    """What a log file holds. header: column names, all different."""
+    """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
+    a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
+    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
+    stated in, CAMERA or BASE, where the file says it; notes: what reading it changed or left out, in words."""
 
     path: Path
     header: tuple[str, ...]
-    rows: list[list[str]]  # cells, stripped; a row may have more or fewer than the header
-    lines: np.ndarray  # int64 [R] the file's line (or record) of each row, from 1
+    rows: list[list[str]] | np.ndarray
+    lines: np.ndarray
     decimal_comma: bool = False
+    stream: str | None = None
+    record: str = "line"
+    frame: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def where(self) -> str:
+        """Begins a message: the file, and the stream."""
+        return str(self.path) if self.stream is None else f"{self.path}: {self.stream}"
+
+    @property
+    def title(self) -> str:
+        """Begins a note: the same without folders."""
+        return self.path.name if self.stream is None else f"{self.path.name}: {self.stream}"
+
+    def list_rows(self, lines: Sequence[int] | np.ndarray) -> str:
+        """`lines 3, 7, 9, ...`, the first few."""
+        names = ", ".join(str(int(line)) for line in lines[:MAX_LISTED])
+        return f"{self.record}{'' if len(lines) == 1 else 's'} {names}{', ...' if len(lines) > MAX_LISTED else ''}"
 
 
 @dataclass(frozen=True)
@@ -157,6 +179,10 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     Missing or unreadable cells are NaN. Raises NeecoError when a column does not exist.
     """
     indices = [column_index(table, name) for name in columns]
+    if isinstance(table.rows, np.ndarray):
+        chosen = table.rows[:, indices]
+        missing = ~(np.abs(chosen) < HUGE)  # NaN compares false
+        return np.where(missing, np.nan, chosen), np.any(missing, axis=1), []
     values = np.full((len(table.rows), len(columns)), np.nan)
     bad: list[tuple[int, str]] = []
     for row, cells in enumerate(table.rows):
@@ -169,7 +195,7 @@ def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
                 bad.append((row, f"{columns[slot]} is {printable(cells[index], 24)}, not a number"))
                 break
             values[row, slot] = value
-    missing = np.isnan(values).any(axis=1)
+    missing = np.any(np.isnan(values), axis=1)
     missing[[row for row, _ in bad]] = False
     return values, missing, bad
 
@@ -181,7 +207,7 @@ def column_index(table: Table, name: str) -> int:
     matches = [index for index, other in enumerate(table.header) if other.lower() == name.lower()]
     if len(matches) != 1:
         names = ", ".join(table.header[:16]) + (", ..." if len(table.header) > 16 else "")
-        raise NeecoError(f"{table.path}: has no column {printable(name)}; its columns are {printable(names, 200)}")
+        raise NeecoError(f"{table.where}: has no column {printable(name)}; its columns are {printable(names, 200)}")
     return matches[0]
 
 
@@ -201,9 +227,3 @@ def parse_number(text: str) -> float | None:
 def count_rows(count: int) -> str:
     """`1 row`, `12 rows`."""
     return f"{count} row{'' if count == 1 else 's'}"
-
-
-def list_lines(lines: Sequence[int] | np.ndarray) -> str:
-    """`lines 3, 7, 9, ...`, the first few."""
-    names = ", ".join(str(int(line)) for line in lines[:MAX_LISTED])
-    return f"line{'' if len(lines) == 1 else 's'} {names}{', ...' if len(lines) > MAX_LISTED else ''}"
