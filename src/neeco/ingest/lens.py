@@ -18,8 +18,8 @@ from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 
 NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
-DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D")
+MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
+DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D", "d")
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 LARGEST = 1e9  # of any of a lens's numbers
@@ -45,17 +45,17 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     if source is None:
         return None
     if not isinstance(source, Path):
-        return _checked("intrinsics", [*source], (), None)
+        return checked_lens("intrinsics", [*source], (), None)
     require_file(source, "a calibration as YAML or JSON")
     if source.suffix.lower() == ".json":
         return _nerfstudio(source, read_json(source))
-    return _opencv(source, _read_opencv_yaml(source))
+    return opencv_lens(source, read_opencv_yaml(source))
 
 
 def _nerfstudio(path: Path, document: Any) -> Lens:
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: expected an object with fl_x, fl_y, cx, cy")
-    size = _size(path, document.get("w"), document.get("h"))
+    size = image_size(path, document.get("w"), document.get("h"))
     if "fl_x" not in document and size and isinstance(document.get("camera_angle_x"), int | float):
         angle = float(document["camera_angle_x"])
         focal = size[0] / 2 / math.tan(angle / 2) if angle else math.nan
@@ -66,25 +66,26 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
     names = FISHEYE_DISTORTION if _is_fisheye(document, "camera_model") else NERFSTUDIO_DISTORTION
     distortion = [document.get(key, 0.0) for key in names]
-    return _checked(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
+    return checked_lens(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
 
 
-def _opencv(path: Path, document: Any) -> Lens:
+def opencv_lens(path: Path, document: Any) -> Lens:
     """From `camera_matrix`, `distortion_coefficients`, `image_width`, `image_height`, as OpenCV's samples and ROS's
-    camera_calibration write them."""
+    camera_calibration write them, or K, D, width and height of a camera_info. Raises NeecoError."""
     if not isinstance(document, dict):
         raise NeecoError(f"{path}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
-    matrix = _numbers(path, _first(document, MATRIX_NAMES), "camera_matrix")
+    matrix = matrix_numbers(path, first_of(document, MATRIX_NAMES), "camera_matrix")
     if len(matrix) != 9:
         raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
-    found = _first(document, DISTORTION_NAMES)
-    size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
+    found = first_of(document, DISTORTION_NAMES)
+    sides = [(f"image_{side}", f"image_{side.title()}", side) for side in ("width", "height")]
+    size = image_size(path, *(first_of(document, names) for names in sides))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
-    distortion = _numbers(path, [] if found is None else found, "distortion_coefficients")
-    return _checked(path, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
+    distortion = matrix_numbers(path, [] if found is None else found, "distortion_coefficients")
+    return checked_lens(path, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
 
 
-def _checked(
+def checked_lens(
     source: object,
     values: Sequence[Any],
     distortion: Sequence[Any],
@@ -92,6 +93,7 @@ def _checked(
     *,
     fisheye: bool = False,
 ) -> Lens:
+    """A lens of fl_x, fl_y, cx, cy px (pixel centres at +0.5) and OpenCV's coefficients. Raises NeecoError."""
     for field, given in (("fl_x, fl_y, cx, cy", values), ("distortion", distortion)):
         for value in given:
             number = as_float(value)
@@ -110,7 +112,8 @@ def _checked(
     return Lens(fl_x, fl_y, cx, cy, coefficients, size)
 
 
-def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
+def image_size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
+    """(width, height) px; None where one is not given. Raises NeecoError."""
     if width is None or height is None:
         return None
     if not all(isinstance(value, int | float) and 1 <= value < 1e6 for value in (width, height)):
@@ -167,8 +170,9 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
     )
 
 
-def _read_opencv_yaml(path: Path) -> Any:
-    """By PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a bad line."""
+def read_opencv_yaml(path: Path) -> Any:
+    """What a calibration holds, by PyYAML, which unlike cv2.FileStorage reads ROS's files and plain lists, and names a
+    bad line."""
     text = read_text(path, "OpenCV's calibration as YAML")
     if text.lstrip().startswith("<"):
         raise NeecoError(f"{path}: is XML; save the calibration as YAML (name it .yaml in OpenCV's FileStorage)")
@@ -177,11 +181,12 @@ def _read_opencv_yaml(path: Path) -> Any:
     return parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
 
 
-def _first(document: dict[Any, Any], names: Sequence[str]) -> Any:
+def first_of(document: dict[Any, Any], names: Sequence[str]) -> Any:
+    """What the first of these names holds; None where there is none."""
     return next((document[name] for name in names if document.get(name) is not None), None)
 
 
-def _numbers(path: Path, value: Any, field: str) -> list[float]:
+def matrix_numbers(path: Path, value: Any, field: str) -> list[float]:
     """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
     if isinstance(value, dict):
         value = value.get("data")
