@@ -49,7 +49,7 @@ def read_lens(source: Path | Sequence[float] | None) -> Lens | None:
     require_file(source, "a calibration as YAML or JSON")
     if source.suffix.lower() == ".json":
         return _nerfstudio(source, read_json(source))
-    return _opencv(source, _read_opencv_yaml(source))
+    return opencv_lens(source, _read_opencv_yaml(source))
 
 
 def _nerfstudio(path: Path, document: Any) -> Lens:
@@ -69,19 +69,19 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     return _checked(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
 
 
-def _opencv(path: Path, document: Any) -> Lens:
+def opencv_lens(where: Path | str, document: Any) -> Lens:
     """From `camera_matrix`, `distortion_coefficients`, `image_width`, `image_height`, as OpenCV's samples and ROS's
-    camera_calibration write them."""
+    camera_calibration write them; `where` begins messages. Raises NeecoError."""
     if not isinstance(document, dict):
-        raise NeecoError(f"{path}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
-    matrix = _numbers(path, _first(document, MATRIX_NAMES), "camera_matrix")
+        raise NeecoError(f"{where}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
+    matrix = _numbers(where, _first(document, MATRIX_NAMES), "camera_matrix")
     if len(matrix) != 9:
-        raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
+        raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
     found = _first(document, DISTORTION_NAMES)
-    size = _size(path, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
+    size = _size(where, *(_first(document, (f"image_{side}", f"image_{side.title()}")) for side in ("width", "height")))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
-    distortion = _numbers(path, [] if found is None else found, "distortion_coefficients")
-    return _checked(path, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
+    distortion = _numbers(where, [] if found is None else found, "distortion_coefficients")
+    return _checked(where, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
 
 
 def _checked(
@@ -110,7 +110,7 @@ def _checked(
     return Lens(fl_x, fl_y, cx, cy, coefficients, size)
 
 
-def _size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
+def _size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | None:
     if width is None or height is None:
         return None
     if not all(isinstance(value, int | float) and 1 <= value < 1e6 for value in (width, height)):
@@ -181,7 +181,7 @@ def _first(document: dict[Any, Any], names: Sequence[str]) -> Any:
     return next((document[name] for name in names if document.get(name) is not None), None)
 
 
-def _numbers(path: Path, value: Any, field: str) -> list[float]:
+def _numbers(path: Path | str, value: Any, field: str) -> list[float]:
     """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
     if isinstance(value, dict):
         value = value.get("data")
