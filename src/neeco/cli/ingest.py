@@ -87,13 +87,14 @@ def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
 
 
 def _list_formats() -> int:
+    from rich.markup import escape
     from rich.table import Table
 
     from neeco.ingest.formats import recording_formats
 
     table = Table("format", "read of it", "needs")
     for known in recording_formats():
-        table.add_row(known.format, known.holds, f"neeco[{known.extra}]" if known.extra else "")
+        table.add_row(known.format, known.holds, escape(f"neeco[{known.extra}]") if known.extra else "")
     Console().print(table)
     return 0
 

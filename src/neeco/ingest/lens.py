@@ -69,20 +69,21 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     return checked_lens(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
 
 
-def opencv_lens(path: Path, document: Any) -> Lens:
+def opencv_lens(where: Path | str, document: Any) -> Lens:
     """From `camera_matrix`, `distortion_coefficients`, `image_width`, `image_height`, as OpenCV's samples and ROS's
-    camera_calibration write them, or K, D, width and height of a camera_info. Raises NeecoError."""
+    camera_calibration write them, or K, D, width and height of a camera_info; `where` begins messages. Raises
+    NeecoError."""
     if not isinstance(document, dict):
-        raise NeecoError(f"{path}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
-    matrix = matrix_numbers(path, first_of(document, MATRIX_NAMES), "camera_matrix")
+        raise NeecoError(f"{where}: expected camera_matrix and distortion_coefficients, as OpenCV writes them")
+    matrix = matrix_numbers(where, first_of(document, MATRIX_NAMES), "camera_matrix")
     if len(matrix) != 9:
-        raise NeecoError(f"{path}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
+        raise NeecoError(f"{where}: camera_matrix: needs 9 numbers, has {len(matrix)}; write it as OpenCV does")
     found = first_of(document, DISTORTION_NAMES)
     sides = [(f"image_{side}", f"image_{side.title()}", side) for side in ("width", "height")]
-    size = image_size(path, *(first_of(document, names) for names in sides))
+    size = image_size(where, *(first_of(document, names) for names in sides))
     values = [matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5]
-    distortion = matrix_numbers(path, [] if found is None else found, "distortion_coefficients")
-    return checked_lens(path, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
+    distortion = matrix_numbers(where, [] if found is None else found, "distortion_coefficients")
+    return checked_lens(where, values, distortion, size, fisheye=_is_fisheye(document, "distortion_model"))
 
 
 def checked_lens(
@@ -112,7 +113,7 @@ def checked_lens(
     return Lens(fl_x, fl_y, cx, cy, coefficients, size)
 
 
-def image_size(path: Path, width: Any, height: Any) -> tuple[int, int] | None:
+def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | None:
     """(width, height) px; None where one is not given. Raises NeecoError."""
     if width is None or height is None:
         return None
@@ -186,7 +187,7 @@ def first_of(document: dict[Any, Any], names: Sequence[str]) -> Any:
     return next((document[name] for name in names if document.get(name) is not None), None)
 
 
-def matrix_numbers(path: Path, value: Any, field: str) -> list[float]:
+def matrix_numbers(path: Path | str, value: Any, field: str) -> list[float]:
     """The numbers of a matrix in row order, from OpenCV's or ROS's {rows, cols, data} or from (nested) lists."""
     if isinstance(value, dict):
         value = value.get("data")

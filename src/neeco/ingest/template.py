@@ -17,7 +17,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_json
 from neeco.ingest.columns import MATRIX, RecognisedColumns, recognise_pose, recognise_time, recognise_value, split_unit
 from neeco.ingest.formats import IMAGES as IMAGE_STREAMS
-from neeco.ingest.formats import OTHER, POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.formats import POSES, READINGS, Stream, format_of, read_table
 from neeco.ingest.lens import read_lens
 from neeco.ingest.video import IMAGES
 
@@ -31,14 +31,19 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 
 @dataclass(frozen=True)
 class _Log:
-    """A log: its file, relative to the folder, and which stream of it."""
+    """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, where
+    the format says so."""
 
     file: str
     stream: str | None = None
+    body: str | None = None
+    hints: tuple[str, ...] = ()
 
     @property
     def stem(self) -> str:
         """What it may be called."""
+        if self.body is not None:
+            return self.body
         return Path(self.file).stem if self.stream is None else re.sub(r"[^A-Za-z0-9]+", "_", self.stream).strip("_")
 
     def lines(self) -> list[str]:
@@ -54,7 +59,7 @@ class _FolderFiles:
     lenses: list[str] = field(default_factory=list)
     syncs: list[str] = field(default_factory=list)
     poses: list[tuple[_Log, RecognisedColumns]] = field(default_factory=list)
-    joints: list[tuple[_Log, RecognisedColumns, str]] = field(default_factory=list)
+    joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
 
@@ -95,6 +100,7 @@ def write_template(source: Path) -> str:
         lenses=found.lenses,
         instruments=_instruments(found, poses),
         scope=_pose_lines(*scopes[0]) if scopes else None,
+        scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
         others=found.others[:MAX_OTHERS],
@@ -146,13 +152,14 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.others.append(" ".join(str(error).replace(str(path), name).split()))
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream.name)
-        if stream.kind == IMAGE_STREAMS:
+        log = _Log(name, stream.name, stream.body, stream.hints)
+        used = stream.offered and stream.count > 0
+        if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
-        elif stream.kind in (POSES, READINGS) and stream.count:
+        elif used and stream.kind in (POSES, READINGS):
             _classify_stream(found, log, stream, path)
-        rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
-        if stream.kind == OTHER:
+        else:
+            rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
             found.others.append(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
     return bool(streams)
 
@@ -163,9 +170,9 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
     if stream.kind == POSES:
         found.poses.append((log, recognise_pose(table.header)))
         return
-    for column in table.header:  # every angle is a joint
-        if split_unit(column, "angle")[1] and column not in (when.time or ()):
-            found.joints.append((log, when, column))
+    angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
+    named = [(None, column) for column in angles] if stream.joints is None else stream.joints
+    found.joints += [(log, when, column, joint) for joint, column in named]
 
 
 def _frames_line(log: _Log) -> str:
@@ -186,7 +193,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     if pose.rotation or "rotation" in pose.unclear:
         found.poses.append((log, pose))
     elif value and when.time:
-        found.joints.append((log, when, value))
+        found.joints.append((log, when, value, None))
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
@@ -211,20 +218,22 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
     if not poses and not found.joints:
         return []
     names = _unique([log.stem for log, _ in poses]) or ["instrument"]
-    # a joint's log belongs to the instrument that its name begins with, else to the first
+    # a joint's log belongs to the instrument of its body or that its name begins with, else to the first
     owners = {
-        log: next((name for name in names if log.stem.startswith(name.split("_")[0])), names[0])
+        log: next((name for name in names if log.stem == name), None)
+        or next((name for name in names if log.stem.startswith(name.split("_")[0])), names[0])
         for log, *_ in found.joints
     }
     instruments = []
     for index, name in enumerate(names):
         logs = [log for log in found.joints if owners[log[0]] == name]
-        joints = _unique([_joint_name(log, value) for log, _, value in logs])
+        joints = _unique([joint or _joint_name(log, value) for log, _, value, joint in logs])
         instruments.append(
             {
                 "name": name,
                 "poses": _pose_lines(*poses[index]) if poses else None,
-                "joints": [(joint, _joint_lines(found, *log)) for joint, log in zip(joints, logs, strict=True)],
+                "joints": [(joint, _joint_lines(found, *log[:3])) for joint, log in zip(joints, logs, strict=True)],
+                "hints": poses[index][0].hints if poses else (),
             }
         )
     return instruments
@@ -253,7 +262,7 @@ def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value:
     tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]
     if tables:
         lines.append(f"calibration: {_scalar(tables[0])}")
-    else:
+    elif log.stream is None:
         lines.append("# calibration: table.csv   # of counts and angle_rad, where the values are counts")
     lines += _unit_lines(when, {} if tables else {"angle": (value,)})
     return [*lines, "# limits: [0, 1.5]   # rad, of the joint"]

@@ -67,13 +67,21 @@ class Table:
 @dataclass(frozen=True)
 class Stream:
     """One of what a file holds. name: as a recording says it (`stream: NAME`); kind: POSES, READINGS, IMAGES or OTHER;
-    type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows."""
+    type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows.
+
+    For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
+    format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body.
+    """
 
     name: str
     kind: str
     type: str
     count: int
     rate_hz: float | None = None
+    offered: bool = True
+    body: str | None = None
+    joints: tuple[tuple[str, str], ...] | None = None
+    hints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

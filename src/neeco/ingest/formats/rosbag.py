@@ -1,0 +1,224 @@
+"""ROS 1 and ROS 2 bags and MCAP files: poses, joints, transforms, images and lenses by topic.
+
+Times are those of the messages' headers, in s from the first image (without images: the first message) on; where a
+header has none, the time of receipt. Lengths come in m and angles in rad, as ROS has them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neeco.capture.lens import Lens
+from neeco.errors import NeecoError
+from neeco.ingest.columns import CAMERA
+from neeco.ingest.formats import (
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+)
+
+if TYPE_CHECKING:
+    from neeco.ingest.formats._bagsurvey import Samples, Survey
+
+DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
+POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+LATE = 1.0  # s between stamps and receipt that tell of another clock
+_DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
+_DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
+_DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|state_jaw_current)$", re.IGNORECASE)
+_WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
+_WANTED = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # not what was measured
+_SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
+
+
+class RosBag(RecordingFormat):
+    """Bags. A stream is a topic; of transforms, `tf:CHILD`, in the child's parent, or `tf:CHILD in FRAME`."""
+
+    format = "ROS bag"
+    holds = "poses, transforms, joints, images and lenses by topic: ROS 1 .bag, ROS 2 folders, .mcap, .db3"
+    suffixes = (".bag", ".mcap", ".db3")
+    package = "rosbags"
+    extra = "ros"
+
+    def claims(self, path: Path) -> bool:
+        if not path.is_dir():
+            return super().claims(path)
+        try:
+            with (path / "metadata.yaml").open("rb") as file:
+                return b"rosbag2_bagfile_information" in file.read(4096)
+        except OSError:
+            return False
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        survey = self._survey(path)
+        images = [self._image_stream(survey, name) for name in sorted(survey.images, key=_camera_order)]
+        poses = [self._pose_stream(survey, name) for name in sorted(survey.poses)]
+        joints = [self._joint_stream(survey, name) for name in sorted(survey.joints)]
+        return (*images, *poses, *joints, *survey.others)
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        survey = self._survey(path)
+        if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
+            from neeco.ingest.formats._transforms import chained
+
+            return chained(survey, stream, _camera_frames(survey))
+        chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
+        if chosen in survey.joints:
+            readings = survey.joints[chosen]
+            header = ("t_s", *(_joint_column(name) for name in readings.columns))
+            return _table(survey, chosen, readings, header, readings.table())
+        poses = survey.poses[chosen]
+        names = poses.frame_names()
+        if len(names) > 1:
+            listed = ", ".join(sorted(names)[:4])
+            raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
+        frame = CAMERA if names and names <= _camera_frames(survey) else None
+        return _table(survey, chosen, poses, POSE_HEADER, poses.table(), frame)
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        from neeco.ingest.formats._rosimages import open_topic
+
+        survey = self._survey(path)
+        if stream in survey.images:
+            chosen = str(stream)
+        else:
+            chosen = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        log = survey.images[chosen]
+        received = np.array(log.received, np.int64)[np.array(log.numbers, np.int64)]
+        seconds = survey.seconds(log.stamps, received.tolist())
+        notes = _time_notes(f"{path.name}: {chosen}", log.stamps, received)
+        return open_topic(path, chosen, log, seconds, notes)
+
+    def lens(self, path: Path, stream: str | None = None) -> Lens | None:
+        from neeco.ingest.formats._rosimages import lens_of
+
+        survey = self._survey(path)
+        chosen = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
+        plain = chosen.removesuffix("/compressed")
+        topic = f"{plain.rpartition('/')[0]}/camera_info"
+        if topic not in survey.lenses:
+            return None
+        rectified = plain.rpartition("/")[2].startswith("image_rect")
+        return lens_of(f"{path}: {topic}", survey.lenses[topic], rectified)
+
+    def _survey(self, path: Path) -> Survey:
+        self.require_package(path)
+        from neeco.ingest.formats._bagsurvey import survey_of
+
+        try:
+            files = sorted(path.iterdir()) if path.is_dir() else [path]
+            state = tuple((str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files)
+        except OSError:
+            raise NeecoError(f"{path}: cannot be read; correct the path or allow it") from None
+        return survey_of(path, state)
+
+    def _image_stream(self, survey: Survey, name: str) -> Stream:
+        log = survey.images[name]
+        received = [log.received[number] for number in log.numbers]
+        rate = _rate(survey.seconds(log.stamps, received))
+        usable = len(log.numbers) > 0
+        why = "" if usable or not log.bad else f": one {log.bad.most_common(1)[0][0]}"
+        kind = f"{survey.image_types[name]}{f' ({log.description})' if usable else why}"
+        return Stream(name, IMAGES if usable else OTHER, kind, len(log.received), rate)
+
+    def _pose_stream(self, survey: Survey, name: str) -> Stream:
+        log, frames = survey.poses[name], survey.poses[name].frame_names()
+        dvrk = {other for other in survey.poses if _DVRK_POSE.search(other)}
+        if dvrk:
+            offered = name in dvrk
+        elif name.startswith("tf:"):
+            offered = not log.static and all(other.startswith("tf:") for other in survey.poses)
+        else:
+            offered = not _WANTED.search(name)
+        frame = ", ".join(sorted(frames)) or "no named frame"
+        hints = [f"stated in {frame}{', the frame of the camera' if frames <= _camera_frames(survey) else ''}"]
+        if name in dvrk and _body(name) == DVRK_CAMERA:
+            of_arms = {base for other in dvrk - {name} for base in survey.poses[other].frame_names()}
+            if of_arms - frames - _camera_frames(survey):
+                hints.append(f"the arms' poses are stated in {', '.join(sorted(of_arms))}: these do not register them")
+        elif name in dvrk:
+            hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
+        kind, static = (OTHER, ", static") if log.static else (POSES, "")
+        rate = _rate(survey.seconds(log.stamps, log.received))
+        title = f"{log.type} in {frame}{static}"
+        return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints))
+
+    def _joint_stream(self, survey: Survey, name: str) -> Stream:
+        log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
+        if _DVRK.search(name):
+            offered = bool(_DVRK_JOINTS.search(name))
+            plain = {joint.removeprefix("outer_"): joint for joint in log.columns}
+            wrist = tuple((joint, _joint_column(plain[joint])) for joint in _WRIST if joint in plain)
+        rate = _rate(survey.seconds(log.stamps, log.received))
+        return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist)
+
+
+def _table(
+    survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray, frame: str | None = None
+) -> Table:
+    seconds = survey.seconds(log.stamps, log.received)
+    title = f"{survey.path.name}: {name}"
+    notes = _time_notes(title, log.stamps, np.array(log.received, np.int64))
+    if log.damaged:
+        notes.append(f"{title}: {log.damaged} message{' is' if log.damaged == 1 else 's are'} damaged; left out")
+    rows = np.column_stack([seconds, values])
+    return Table(survey.path, header, rows, np.arange(1, len(rows) + 1), False, name, "message", frame, tuple(notes))
+
+
+def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list[str]:
+    """What is odd about the stamps of a stream."""
+    given = np.array(stamps, np.int64)
+    none = given == 0
+    notes = []
+    if none.any():
+        what = "its headers have no times" if none.all() else f"{int(none.sum())} headers have no time"
+        notes.append(f"{title}: {what}; those of receipt are taken")
+    if not none.all() and len(given):
+        late = float(np.median(received[~none] - given[~none])) * 1e-9
+        if abs(late) > LATE:
+            notes.append(
+                f"{title}: its headers' times are {late:.2f} s before those of receipt, on another clock; where "
+                "the streams do not share one, name its `clock` and give `sync`"
+            )
+    return notes
+
+
+def _rate(seconds: np.ndarray) -> float | None:
+    length = float(np.ptp(seconds)) if len(seconds) > 1 else 0.0
+    return (len(seconds) - 1) / length if length > 0 else None
+
+
+def _camera_frames(survey: Survey) -> set[str]:
+    """Frames of the images' cameras."""
+    return ({DVRK_CAMERA} | {name.lstrip("/") for log in survey.images.values() for name in log.frames}) - {""}
+
+
+def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
+    """The left camera first, then any that is not the right one; images as they are before packed ones."""
+    name = topic.lower()
+    return "right" in name, "left" not in name, name.endswith("/compressed"), topic
+
+
+def _body(topic: str) -> str | None:
+    """The arm of the dVRK, else the topic's namespace."""
+    if topic.startswith("tf:"):
+        return topic.removeprefix("tf:")
+    arm = _DVRK.search(topic)
+    if arm:
+        return arm[1].upper()
+    return topic.strip("/").rpartition("/")[0].replace("/", "_") or None
+
+
+def _joint_column(name: str) -> str:
+    return f"{name}_{'m' if _SLIDES.search(name) else 'rad'}"
