@@ -37,7 +37,7 @@ class PoseLog:
 
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
     first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
-    are stated in, CAMERA or BASE.
+    are stated in, CAMERA or BASE; stated_in: what the file calls it, None where it does not, or the recording says.
     """
 
     path: Path
@@ -48,6 +48,7 @@ class PoseLog:
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
+    stated_in: str | None = None
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -110,7 +111,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
     gaps, gap_notes = _gaps(table, times)
     notes, frame = (*rows.notes(), *gap_notes), source.frame or table.frame or named.BASE
-    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame)
+    stated_in = table.stated_in if source.frame is None else None
+    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame, stated_in)
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:

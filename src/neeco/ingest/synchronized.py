@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.columns import VIDEO_CLOCK
+from neeco.ingest.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
@@ -34,6 +34,7 @@ class SynchronizedRecording:
             for item in recording.instruments
         }
         self.scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
+        self._check_bases()
         progress("reading video", 0, 0)
         self.video = recording.open()
         self.times = self.video.times  # [V] s, every frame
@@ -101,6 +102,17 @@ class SynchronizedRecording:
                 columns.append(np.where(valid, values, 0.0)[:, None])
                 self._check_overlap(reading, valid)
         return np.concatenate(columns or [np.zeros((len(self.times), 6))], 1), usable
+
+    def _check_bases(self) -> None:
+        """Raise NeecoError where the scope's poses and an instrument's are stated in bases of different names: nothing
+        would register them."""
+        scope = None if self.scope is None else self.scope.stated_in
+        for name, log in self.poses.items():
+            if scope is not None and log.stated_in not in (None, scope) and log.frame == BASE:
+                raise NeecoError(
+                    f"{self.recording.path}: laparoscope: its poses are stated in {scope}, those of {name} in "
+                    f"{log.stated_in}; leave it out, or where these are one frame say `frame: base` for both"
+                )
 
     def _check_video(self) -> None:
         """Raise NeecoError for times that no recording has, and for frames too small."""

@@ -240,6 +240,8 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
+    if log.stream is not None and columns.time and columns.position and columns.rotation:
+        return [*log.lines(), *_unit_lines(columns, {"length": columns.position})]  # recognised again when read
     lines = [*log.lines(), *(["clock: em"] if log.stream is None else [])]
     given = [
         ("time", columns.time),
@@ -256,7 +258,8 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
 
 
 def _joint_lines(found: _FolderFiles, log: _Log, when: RecognisedColumns, value: str) -> list[str]:
-    lines = [*log.lines(), "columns:", f"  time: {_list(when.time or ())}", f"  value: {_scalar(value)}"]
+    time = [f"  time: {_list(when.time)}"] if when.time and log.stream is None else []
+    lines = [*log.lines(), "columns:", *time, f"  value: {_scalar(value)}"]
     stem = log.stem.lower()
     tables = [name for name, header in found.calibrations if value in header]
     tables += [name for name, _ in found.calibrations if Path(name).stem.lower().startswith(stem)]

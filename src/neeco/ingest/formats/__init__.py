@@ -36,7 +36,8 @@ class Table:
     """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
     (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
-    stated in, CAMERA or BASE, where the file says it; notes: what reading it changed or left out, in words."""
+    stated in, CAMERA or BASE, where the file says it, stated_in: by the file's own name; notes: what reading it changed
+    or left out, in words."""
 
     path: Path
     header: tuple[str, ...]
@@ -46,6 +47,7 @@ class Table:
     stream: str | None = None
     record: str = "line"
     frame: str | None = None
+    stated_in: str | None = None
     notes: tuple[str, ...] = ()
 
     @property

@@ -7,6 +7,7 @@ it. The types that are read have been the same for years, and a bag whose digest
 from __future__ import annotations
 
 import bz2
+import re
 import struct
 import sys
 from collections.abc import Collection, Generator, Iterator, Mapping
@@ -41,6 +42,7 @@ LARGEST_METADATA = 16 * MIB
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": ZstdDecompressor}
+_NESTED = re.compile(r"\([\"'](.*)[\"'],\)")  # of an error within an error
 _REMEDIES = {
     ".bag": "repair it with `rosbag reindex`, or copy it again",
     ".mcap": "repair it with `mcap recover`, or copy it again",
@@ -149,7 +151,7 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise NeecoError(f"{path}: may not be read; allow it") from error
     # damaged bags make rosbags raise nearly anything: struct.error, KeyError, AssertionError, OverflowError ...
     except Exception as error:
-        reason = " ".join(str(error).split())[:160].rstrip(".") or "its records do not fit together"
+        reason = " ".join(_NESTED.sub(r"\1", str(error)).split())[:160].rstrip(".") or "its records do not fit together"
         remedy = _REMEDIES["" if path.is_dir() else path.suffix.lower()]
         raise NeecoError(f"{path}: is cut short or damaged, or no bag ({reason}); {remedy}") from error
 

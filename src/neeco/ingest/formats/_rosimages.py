@@ -184,7 +184,8 @@ def open_topic(path: Path, topic: str, log: ImageLog, seconds: np.ndarray, notes
     order = np.argsort(seconds, kind="stable")
     fresh = np.concatenate([[True], np.diff(seconds[order]) > 0])
     if not fresh.all():
-        notes.append(f"{name}: {int((~fresh).sum())} images share a time with another; left out")
+        count = int((~fresh).sum())
+        notes.append(f"{name}: {count} image{' shares' if count == 1 else 's share'} a time with another; left out")
     order = order[fresh]
     if len(order) < MIN_IMAGES:
         raise NeecoError(f"{where}: all images have one time; record them with their own")

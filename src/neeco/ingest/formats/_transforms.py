@@ -23,7 +23,7 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     known = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
-    parents = {next(iter(survey.poses[f"tf:{name}"].frames)).lstrip("/") for name in known}
+    parents = {parent for name in known for parent in survey.poses[f"tf:{name}"].frame_names()}
     for name, there in ((child, known | parents if word else known), (frame, known | parents)):
         if name not in there and (word or name is child):
             listed = printable(", ".join(sorted(there)), 300).strip("'") or "none"
@@ -46,8 +46,10 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     quats = np.full((len(seconds), 4), np.nan)
     quats[known_rows] = Rotation.from_matrix(frame_from_child[known_rows, :3, :3]).as_quat()
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
-    stated = CAMERA if frame in cameras else None
-    return Table(survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), False, stream, "message", stated)
+    return Table(
+        survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
+        frame=CAMERA if frame in cameras else None, stated_in=frame,
+    )  # fmt: skip
 
 
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
@@ -69,7 +71,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
 
 
 def _parent(survey: Survey, where: str, child: str) -> str:
-    frames = {name.lstrip("/") for name in survey.poses[f"tf:{child}"].frames}
+    frames = survey.poses[f"tf:{child}"].frame_names()
     if len(frames) > 1:
         raise NeecoError(f"{where}: {child} hangs from several frames ({', '.join(sorted(frames)[:4])}); name another")
     return next(iter(frames))

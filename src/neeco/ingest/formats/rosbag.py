@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ from neeco.ingest.formats import (
 )
 
 if TYPE_CHECKING:
-    from neeco.ingest.formats._bagsurvey import Samples, Survey
+    from neeco.ingest.formats._bagsurvey import Joints, Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -37,6 +38,7 @@ LATE = 1.0  # s between stamps and receipt that tell of another clock
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
 _DVRK_JOINTS = re.compile(r"(^|/)PSM\d/((jaw/)?measured_js|state_joint_current|state_jaw_current)$", re.IGNORECASE)
+DVRK_JOINTS = ("outer_yaw", "outer_pitch", "outer_insertion", "outer_roll", "outer_wrist_pitch", "outer_wrist_yaw")
 _WRIST = ("wrist_pitch", "wrist_yaw", "jaw")  # of an instrument; the joints before them move all of it
 _WANTED = re.compile(r"setpoint|goal|desired|command|target|servo|move_", re.IGNORECASE)  # not what was measured
 _SLIDES = re.compile(r"insertion|prismatic", re.IGNORECASE)  # joints in m
@@ -76,15 +78,16 @@ class RosBag(RecordingFormat):
         chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
-            header = ("t_s", *(_joint_column(name) for name in readings.columns))
+            header = ("t_s", *map(_joint_column, _joint_names(chosen, readings)))
             return _table(survey, chosen, readings, header, readings.table())
         poses = survey.poses[chosen]
         names = poses.frame_names()
         if len(names) > 1:
             listed = ", ".join(sorted(names)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
-        frame = CAMERA if names and names <= _camera_frames(survey) else None
-        return _table(survey, chosen, poses, POSE_HEADER, poses.table(), frame)
+        stated_in = next(iter(names), None) or None
+        frame = CAMERA if stated_in in _camera_frames(survey) else None
+        return replace(_table(survey, chosen, poses, POSE_HEADER, poses.table()), frame=frame, stated_in=stated_in)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.formats._rosimages import open_topic
@@ -133,47 +136,45 @@ class RosBag(RecordingFormat):
         return Stream(name, IMAGES if usable else OTHER, kind, len(log.received), rate)
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
-        log, frames = survey.poses[name], survey.poses[name].frame_names()
-        dvrk = {other for other in survey.poses if _DVRK_POSE.search(other)}
+        log, cameras = survey.poses[name], _camera_frames(survey)
+        frames, dvrk = log.frame_names(), {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
         if dvrk:
             offered = name in dvrk
         elif name.startswith("tf:"):
-            offered = not log.static and all(other.startswith("tf:") for other in survey.poses)
+            offered = not log.static and all(topic.startswith("tf:") for topic in survey.poses)
         else:
             offered = not _WANTED.search(name)
         frame = ", ".join(sorted(frames)) or "no named frame"
-        hints = [f"stated in {frame}{', the frame of the camera' if frames <= _camera_frames(survey) else ''}"]
+        title = f"{log.type} in {frame}{', static' if log.static else ''}"
+        hints = [f"poses are stated in {frame}{', the frame of the camera' if frames <= cameras else ''}"]
         if name in dvrk and _body(name) == DVRK_CAMERA:
-            of_arms = {base for other in dvrk - {name} for base in survey.poses[other].frame_names()}
-            if of_arms - frames - _camera_frames(survey):
-                hints.append(f"the arms' poses are stated in {', '.join(sorted(of_arms))}: these do not register them")
+            of_arms = {base for topic in dvrk - {name} for base in survey.poses[topic].frame_names()}
+            if of_arms - frames - cameras:  # these would not register them
+                offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
             hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
-        kind, static = (OTHER, ", static") if log.static else (POSES, "")
         rate = _rate(survey.seconds(log.stamps, log.received))
-        title = f"{log.type} in {frame}{static}"
+        kind = OTHER if log.static else POSES
         return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints))
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
         log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
         if _DVRK.search(name):
             offered = bool(_DVRK_JOINTS.search(name))
-            plain = {joint.removeprefix("outer_"): joint for joint in log.columns}
+            plain = {joint.removeprefix("outer_"): joint for joint in _joint_names(name, log)}
             wrist = tuple((joint, _joint_column(plain[joint])) for joint in _WRIST if joint in plain)
         rate = _rate(survey.seconds(log.stamps, log.received))
         return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist)
 
 
-def _table(
-    survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray, frame: str | None = None
-) -> Table:
+def _table(survey: Survey, name: str, log: Samples, header: tuple[str, ...], values: np.ndarray) -> Table:
     seconds = survey.seconds(log.stamps, log.received)
     title = f"{survey.path.name}: {name}"
     notes = _time_notes(title, log.stamps, np.array(log.received, np.int64))
     if log.damaged:
         notes.append(f"{title}: {log.damaged} message{' is' if log.damaged == 1 else 's are'} damaged; left out")
-    rows = np.column_stack([seconds, values])
-    return Table(survey.path, header, rows, np.arange(1, len(rows) + 1), False, name, "message", frame, tuple(notes))
+    rows, numbers = np.column_stack([seconds, values]), np.arange(1, len(seconds) + 1)
+    return Table(survey.path, header, rows, numbers, stream=name, record="message", notes=tuple(notes))
 
 
 def _time_notes(title: str, stamps: Sequence[int], received: np.ndarray) -> list[str]:
@@ -218,6 +219,13 @@ def _body(topic: str) -> str | None:
     if arm:
         return arm[1].upper()
     return topic.strip("/").rpartition("/")[0].replace("/", "_") or None
+
+
+def _joint_names(topic: str, log: Joints) -> list[str]:
+    """As the messages have them; where a dVRK's have none, as it calls its joints."""
+    names, usual = list(log.columns), {6: DVRK_JOINTS, 1: ("jaw",)}
+    unnamed = names == [f"joint_{number + 1}" for number in range(len(names))]
+    return list(usual.get(len(names), names)) if unnamed and _DVRK_JOINTS.search(topic) else names
 
 
 def _joint_column(name: str) -> str:

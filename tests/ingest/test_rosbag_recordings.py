@@ -1,0 +1,363 @@
+"""A bag becomes a recording by one command, and what cannot be read of one is said in one line."""
+
+from __future__ import annotations
+
+import bz2
+import shutil
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from bag_world import KINDS, BagWriter
+from scipy.spatial.transform import Rotation
+
+from neeco.cli import main
+from neeco.errors import NeecoError
+from neeco.ingest.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
+from neeco.ingest.formats import format_of, read_table
+from neeco.ingest.logs import read_pose_log, read_reading_log
+from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.synchronized import SynchronizedRecording
+from neeco.ingest.template import write_template
+
+SIZE = (64, 48)  # px
+LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
+OLD = ("position_cartesian_current", "state_joint_current", "state_jaw_current")
+NEW = ("measured_cp", "measured_js", "jaw/measured_js")
+CASES = 40
+
+
+def shaft(time: float) -> np.ndarray:
+    """[3] m"""
+    return np.array([0.02 * np.sin(2 * time), 0.01, 0.1 + 0.01 * time])
+
+
+def write_dvrk(bag: BagWriter, names: tuple[str, str, str] = NEW, frame: str = "ECM", scope: str = "world") -> None:
+    """PSM1 and PSM2, ECM, setpoints, tf and two cameras, 2 s."""
+    cp, js, jaw = names
+    for time in np.arange(0, 2, 0.02):
+        angles = Rotation.from_rotvec([0.3 * time, 0.1, 0]).as_quat(scalar_first=True)
+        for arm in ("PSM1", "PSM2"):
+            bag.pose(f"/dvrk/{arm}/{cp}", time, shaft(time), angles, frame)
+            bag.pose(f"/dvrk/{arm}/setpoint_cp", time, shaft(time), angles, frame)
+            bag.joints(
+                f"/dvrk/{arm}/{js}",
+                time,
+                outer_yaw=0.1,
+                outer_insertion=0.1,
+                outer_wrist_pitch=time,
+                outer_wrist_yaw=0.2,
+            )
+            bag.joints(f"/dvrk/{arm}/{jaw}", time, jaw=0.3 * time)
+        bag.joints("/dvrk/MTMR/measured_js", time, outer_yaw=0.1)
+        bag.pose(f"/dvrk/ECM/{cp}", time, [0, 0, 0.1], [1, 0, 0, 0], scope)
+        bag.tf(time, [0, 0, 0.1], [1, 0, 0, 0], "world", "table")
+    for number in range(50):
+        for topic in (RIGHT, LEFT):
+            bag.image(topic, number / 25, np.full((*SIZE[::-1], 3), number, np.uint8), "bgr8", "stereo_left")
+    bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, 60.0)
+
+
+def refusal(action: Callable[[], object]) -> str:
+    with pytest.raises(NeecoError) as caught:
+        action()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def read_arm(path: Path) -> object:
+    return read_pose_log(PoseColumns(path, stream="/dvrk/PSM1/measured_cp"))
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A short bag of every kind, by its kind."""
+    folder, found = tmp_path_factory.mktemp("bags"), {}
+    for kind in KINDS:
+        with BagWriter(folder, kind) as bag:
+            for time in np.arange(12) / 25:
+                bag.pose("/dvrk/PSM1/measured_cp", time, shaft(time), [1, 0, 0, 0], "ECM")
+                bag.joints("/dvrk/PSM1/jaw/measured_js", time, jaw=time)
+                bag.tf(time, shaft(time), [1, 0, 0, 0], "world", "table")
+                bag.compressed("/left/compressed", time, np.full((*SIZE[::-1], 3), 90, np.uint8))
+                bag.image(RIGHT, time, np.full((8, 8, 3), 90, np.uint8), "bgr8")
+            bag.camera_info("/left/camera_info", 0.0, SIZE, 60.0)
+        found[kind] = bag.path
+    return found
+
+
+@pytest.mark.parametrize("names", [NEW, OLD])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_dvrks_bag_becomes_a_recording_by_one_command(
+    tmp_path: Path, kind: str, names: tuple[str, str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagWriter(tmp_path, kind) as bag:
+        write_dvrk(bag, names)
+    assert main(["ingest", "--init", str(bag.path)]) == 0
+    text = (tmp_path / "recording.yaml").read_text()
+    recording = read_recording(tmp_path / "recording.yaml")
+    assert (recording.video, recording.stream) == (bag.path, LEFT)
+    assert [item.name for item in recording.instruments] == ["PSM1", "PSM2"]
+    assert all(set(item.joints) == {"wrist_pitch", "wrist_yaw", "jaw"} for item in recording.instruments)
+    assert text.count("# kinematics: {dvrk_tool: TOOL.json}") == 2
+    assert text.count("# poses are stated in ECM, the frame of the camera") == 2
+    assert recording.laparoscope is not None
+    assert recording.laparoscope.stream == f"/dvrk/ECM/{names[0]}"
+    assert recording.clocks == (VIDEO_CLOCK,)
+    for unused in ("setpoint_cp: geometry_msgs/PoseStamped in ECM, 100 at 50 a second", "MTMR/measured_js", "tf:table"):
+        assert unused in text.partition("not used:")[2]
+    lens, _ = recording.read_lens()
+    assert lens is not None
+    assert lens.intrinsics == (60.0, 60.0, 32.0, 24.0)
+    data = SynchronizedRecording(recording, lambda what, done, total: None)
+    times = data.times[2:-2]
+    states, usable = data.states_at(times)
+    assert usable.all()
+    found, joints = states["PSM2"]
+    np.testing.assert_allclose(found[:, :3, 3], [1000 * shaft(time) for time in times], atol=0.01)
+    np.testing.assert_allclose(joints["wrist_pitch"], times, atol=1e-6)
+    np.testing.assert_allclose(joints["jaw"], 0.3 * times, atol=1e-6)
+    assert data.poses["PSM1"].frame == CAMERA
+
+
+def test_a_laparoscope_in_another_base_than_the_arms_is_not_taken_for_registration(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        write_dvrk(bag, frame="PSM_base", scope="ECM_base")
+    text = write_template(bag.path)
+    document = yaml.safe_load(text)
+    assert "laparoscope" not in document
+    assert "in ECM_base, the arms' in PSM_base" in text
+    scope: dict[str, object] = {"file": "recording.bag", "stream": "/dvrk/ECM/measured_cp"}
+    for frame, refused in ((None, True), ("base", False)):
+        path = tmp_path / "recording.yaml"
+        path.write_text(yaml.safe_dump(document | {"laparoscope": scope | ({"frame": frame} if frame else {})}))
+        recording = read_recording(path)
+        if refused:
+            message = refusal(lambda recording=recording: SynchronizedRecording(recording, lambda *_: None))
+            assert "laparoscope: its poses are stated in ECM_base, those of PSM1 in PSM_base" in message
+        else:
+            SynchronizedRecording(recording, lambda *_: None)
+
+
+def test_bags_of_other_robots_offer_what_was_measured(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording-mcap") as bag:
+        for time in np.arange(40) / 25:
+            for topic in ("/tool/left/pose", "/tool/right/pose", "/tool/left/pose_goal"):
+                bag.pose(topic, time, shaft(time), [1, 0, 0, 0], "tracker")
+            bag.joints("/tool/right/joint_states", time, grip=time)
+            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
+    document = yaml.safe_load(write_template(bag.path))
+    assert [item["name"] for item in document["instruments"]] == ["tool_left", "tool_right"]
+    assert list(document["instruments"][1]["joints"]) == ["grip"]
+    assert "joints" not in document["instruments"][0]
+
+
+def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -> None:
+    for kind in ("first.bag", "second-db3"):
+        with BagWriter(tmp_path, kind) as bag:
+            write_dvrk(bag)
+    (tmp_path / "notes.csv").write_text("t_s,x_mm\n1,2\n")
+    document = yaml.safe_load(write_template(tmp_path))
+    assert {item["poses"]["file"] for item in document["instruments"]} == {"first.bag", "second-db3"}
+
+
+# --- what cannot be read
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.97])
+def test_a_truncated_bag_is_refused_with_what_repairs_it(
+    tmp_path: Path, bags: dict[str, Path], kind: str, share: float
+) -> None:
+    path = _copy(bags[kind], tmp_path)
+    file = _messages(path)
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    message = refusal(lambda: read_arm(path))
+    assert message.startswith(f"{path}: is cut short or damaged, or no bag (")
+    assert {"recording.bag": "rosbag reindex"}.get(kind, "ros2 bag reindex") in message
+    if kind != "recording.bag":
+        assert message.partition("(")[0] != refusal(lambda: read_arm(file)).partition("(")[0]
+
+
+def test_a_bag_that_was_not_closed_is_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
+    path = _copy(bags["recording.bag"], tmp_path)
+    content = path.read_bytes()
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
+    assert "(Bag is not indexed, reindex before reading); repair it with `rosbag reindex`" in refusal(
+        lambda: read_arm(path)
+    )
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
+@pytest.mark.parametrize("content", [b"", b"#ROSBAG V1.2\n", b"nothing of the kind" * 100])
+def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert refusal(lambda: read_arm(path)).startswith(f"{path}: is cut short or damaged, or no bag")
+
+
+def test_topics_that_are_not_there_or_not_of_the_kind_are_named(bags: dict[str, Path]) -> None:
+    path = bags["recording.bag"]
+    images = format_of(path)
+    assert images is not None
+    poses = "name one of /dvrk/PSM1/measured_cp, tf:table, /dvrk/PSM1/jaw/measured_js"
+    assert f"stream: holds no '/PSM1/measured_cp'; {poses}" in refusal(lambda: read_table(path, "/PSM1/measured_cp"))
+    message = f"'{RIGHT}' is sensor_msgs/Image (bgr8, 8x8), not poses or readings; {poses}"
+    assert message in refusal(lambda: read_table(path, RIGHT))
+    assert f"holds 2 streams of images; name one as `stream`: /left/compressed, {RIGHT}" in refusal(
+        lambda: images.open_images(path)
+    )
+    assert "'tf:table' is tf2_msgs/TFMessage in world, not images" in refusal(
+        lambda: images.open_images(path, "tf:table")
+    )
+
+
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1", "32FC1", "yuv420"])
+def test_encodings_that_are_not_read_are_named(tmp_path: Path, encoding: str) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for time in range(3):
+            bag.image(LEFT, float(time), np.zeros((8, 8, 2), np.uint8), encoding)
+    known = format_of(bag.path)
+    assert known is not None
+    message = refusal(lambda: known.open_images(bag.path, LEFT))
+    assert f"{bag.path}: {LEFT}: 0 of 3 images can be used: 3 are not: one is in encoding '{encoding}'" in message
+    assert "holds no video" in refusal(lambda: write_template(bag.path))
+
+
+def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for number in range(4):
+            bag.image(LEFT, number / 25, np.zeros((8, 8 + 8 * (number > 1), 3), np.uint8), "rgb8")
+        bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, 60.0, binning=2)
+    known = format_of(bag.path)
+    assert known is not None
+    assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known.open_images(bag.path))
+    assert "camera_info: speaks of binning" in refusal(lambda: known.lens(bag.path, LEFT))
+
+
+def test_a_type_that_is_defined_otherwise_is_not_read(tmp_path: Path, bags: dict[str, Path]) -> None:
+    path = _copy(bags["recording.bag"], tmp_path)
+    content = path.read_bytes()
+    known = b"d3812c3cbc69362b77dc0b19b345f8f5"  # md5 of geometry_msgs/PoseStamped
+    assert known in content
+    path.write_bytes(content.replace(known, b"0" * 32))
+    assert "which defines geometry_msgs/PoseStamped otherwise than ROS, not poses" in refusal(lambda: read_arm(path))
+
+
+def test_without_rosbags_what_to_install_is_said(bags: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
+    for path in bags.values():
+        for action in (read_arm, write_template):
+            said = refusal(lambda action=action, path=path: action(path))
+            assert said == f"{path}: ROS bag: needs rosbags; pip install 'neeco[ros]'"
+
+
+def test_files_packed_as_a_whole_are_refused(tmp_path: Path, bags: dict[str, Path]) -> None:
+    path = _copy(bags["recording-db3"], tmp_path)
+    metadata = path / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("compression_mode: ''", "compression_mode: FILE"))
+    assert "FILE" in metadata.read_text()
+    assert "its files are packed as a whole; unpack one with `zstd -d`" in refusal(lambda: read_arm(path))
+
+
+def test_chunks_that_unpack_without_measure_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is lowered: a bomb of its real size would take seconds to make."""
+    from neeco.ingest.formats import _bagfile
+
+    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 60_000)
+    for kind, packed in (("a.bag", "bz2"), ("b.bag", "lz4"), ("c.bag", None), ("d-mcap", "zstd"), ("e-db3", "zstd")):
+        with BagWriter(tmp_path, kind, packed=packed) as bag:
+            for time in range(4):
+                bag.pose("/dvrk/PSM1/measured_cp", float(time), [0, 0, 0], [1, 0, 0, 0])
+                bag.image(LEFT, float(time), np.zeros((200, 200, 3), np.uint8), "rgb8")
+        known = format_of(bag.path)
+        assert known is not None
+        assert "a chunk of its messages" in refusal(lambda known=known, bag=bag: known.open_images(bag.path))
+
+
+def test_packed_bytes_are_unpacked_up_to_a_limit_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    from neeco.ingest.formats import _bagfile
+
+    monkeypatch.setattr(_bagfile, "LARGEST_CHUNK", 1000)
+    assert _bagfile.unpack(bz2.compress(bytes(1000)), "bz2") == bytes(1000)
+    for data in (bz2.compress(bytes(1001)), bz2.compress(bytes(900))[:-5], b"BZh"):
+        with pytest.raises((OSError, _bagfile.ReaderError)):
+            _bagfile.unpack(data, "bz2")
+
+
+def test_definitions_in_a_bag_are_never_executed(tmp_path: Path, bags: dict[str, Path]) -> None:
+    """rosbags makes Python of definitions that it is given: a bag's own are not given to it."""
+    before = set(sys.modules)
+    for path in bags.values():
+        read_arm(path)
+    assert "rosbags.usertypes" not in set(sys.modules) - before or _only_ours()
+
+
+def _only_ours() -> bool:
+    module = sys.modules["rosbags.usertypes"]
+    return set(module.FIELDDEFS) <= {"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_happens_to_its_bytes_a_bag_is_read_or_refused_in_one_line(
+    tmp_path: Path, bags: dict[str, Path], kind: str
+) -> None:
+    for case in range(CASES):
+        pick = np.random.default_rng([case, KINDS.index(kind)])
+        path = _copy(bags[kind], tmp_path / str(case))
+        files = [path] if path.is_file() else sorted(path.iterdir())
+        _damage(files[int(pick.integers(len(files)))], pick)
+        known = format_of(path)
+        if known is None:
+            continue
+        jaw = JointColumns(path, "video", stream="/dvrk/PSM1/jaw/measured_js")
+        actions: list[Callable[[], object]] = [
+            lambda path=path: write_template(path),
+            lambda path=path: read_arm(path),
+            lambda jaw=jaw: read_reading_log(jaw),
+            lambda path=path, known=known: list(known.open_images(path, RIGHT).read(range(2))),
+            lambda path=path, known=known: list(known.open_images(path, "/left/compressed").read(range(2))),
+            lambda path=path, known=known: known.lens(path, "/left/compressed"),
+        ]
+        said = [_refused(action) for action in actions]
+        assert all(str(path) in message and "\n" not in message for message in said if message is not None), case
+        shutil.rmtree(tmp_path / str(case))
+
+
+def _refused(action: Callable[[], object]) -> str | None:
+    try:
+        action()
+    except NeecoError as error:
+        return str(error)
+    return None
+
+
+def _damage(file: Path, pick: np.random.Generator) -> None:
+    content = bytearray(file.read_bytes())
+    place = int(pick.integers(len(content)))
+    match int(pick.integers(4)):
+        case 0:
+            content = content[:place]
+        case 1:
+            content = content[:place] + content[place + int(pick.integers(200)) :]
+        case 2:
+            content[place : place + 4] = struct.pack("<I", int(pick.choice([0, 1, 2**31 - 1, 2**32 - 1])))
+        case _:
+            for at in pick.integers(0, len(content), int(pick.choice([1, 3, 30]))):
+                content[at] = int(pick.integers(256))
+    file.write_bytes(content)
+
+
+def _copy(path: Path, folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    copy = folder / path.name
+    return Path((shutil.copytree if path.is_dir() else shutil.copy)(path, copy))
+
+
+def _messages(path: Path) -> Path:
+    return path if path.is_file() else next(file for file in path.iterdir() if file.suffix != ".yaml")
