@@ -146,16 +146,17 @@ class BagWriter:
         topic: str,
         time: float,
         size: tuple[int, int],
-        focal: float,
+        intrinsics: tuple[float, float, float, float],
         distortion: Sequence[float] = (),
         model: str = "plumb_bob",
         binning: int = 0,
     ) -> None:
-        """sensor_msgs/CameraInfo whose rectified camera has 0.9 of the focal length; principal point: the centre."""
+        """sensor_msgs/CameraInfo, whose rectified camera has 0.9 of the focal length. intrinsics: fl_x, fl_y, cx, cy
+        px, from the image's corner."""
         width, height = size
-        cx, cy = width / 2 - 0.5, height / 2 - 0.5
-        matrix = np.array([focal, 0, cx, 0, focal, cy, 0, 0, 1.0])
-        projection = np.array([0.9 * focal, 0, cx, 0, 0, 0.9 * focal, cy, 0, 0, 0, 1.0, 0])
+        fl_x, fl_y, cx, cy = np.array(intrinsics) - [0, 0, 0.5, 0.5]  # ROS counts from the first pixel's centre
+        matrix = np.array([fl_x, 0, cx, 0, fl_y, cy, 0, 0, 1.0])
+        projection = np.array([0.9 * fl_x, 0, cx, 0, 0, 0.9 * fl_y, cy, 0, 0, 0, 1.0, 0])
         region = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         coefficients, kind = np.array(distortion, np.float64), "sensor_msgs/msg/CameraInfo"
         info = self._make(

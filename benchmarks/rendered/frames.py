@@ -44,6 +44,7 @@ class Settings:
     exposure: bool = False  # automatic exposure and white balance
     optics: bool = False  # raw/: the images as an endoscope distorts them, in a round border
     video: bool = False  # recording/: what `neeco ingest` takes
+    bags: bool = False  # recording/bags/: the same as ROS bags
     workers: int = 1
 
     @property
@@ -56,7 +57,8 @@ class Settings:
             (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
             (self.exposure, " --exposure"),
             (self.optics, " --lens"),
-            (self.video, " --video"),
+            (self.video and not self.bags, " --video"),
+            (self.bags, " --bag"),
             (self.every > 1, f" --every {self.every}"),
         ]
         return size + "".join(option for wanted, option in given if wanted)

@@ -78,4 +78,6 @@ def _switched_on(settings: Settings) -> str:
         said.append("`images/` are pinhole, what the border hides is masked.")
     if settings.video:
         said.append("`recording/`: the same as a recording, for `neeco ingest`; the camera rolls.")
+    if settings.bags:
+        said.append("`recording/bags/`: the recording as bags of ROS 1, ROS 2 and MCAP, all on one clock.")
     return "".join(f"{line}\n" for line in said)

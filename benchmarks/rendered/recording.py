@@ -62,6 +62,10 @@ def write_raw_recording(
     if settings.optics:
         write_text(folder / "calibration.yaml", Optics.of(settings.lens).calibration())
     write_text(folder / "recording.yaml", yaml.safe_dump(_document(world, settings, sync), sort_keys=False))
+    if settings.bags:
+        from rendered.bags import write_bags  # needs rosbags
+
+        write_bags(folder, _CLOCKS)
     write_json(
         path / "truth" / "recording.json",
         {

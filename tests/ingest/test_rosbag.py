@@ -21,6 +21,7 @@ ARM, JAW, LEFT = "/PSM1/measured_cp", "/PSM1/jaw/measured_js", "/stereo/left/ima
 STEP = 0.025  # s
 TICKS = np.arange(40) * STEP
 SIZE = (24, 16)  # px
+FOCAL = (30.0, 31.0, 12.5, 8.0)
 NS = 1e-9
 
 
@@ -57,7 +58,7 @@ def whole(folder: Path, kind: str = "recording.bag", frame: str = "PSM1_base") -
     with BagWriter(folder, kind) as bag:
         write_arm(bag, frame)
         write_images(bag)
-        bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, 30.0, [0.1, -0.2, 0.003, 0.004, 0.05])
+        bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL, [0.1, -0.2, 0.003, 0.004, 0.05])
     return bag.path
 
 
@@ -346,19 +347,19 @@ def test_the_lens_is_the_cameras_beside_the_images(tmp_path: Path, kind: str) ->
             for topic in (LEFT, "/stereo/left/image_rect_color", "/other/image_raw", "/fresh/image_raw"):
                 bag.image(topic, time, picture(0), "rgb8")
             bag.compressed(f"{LEFT}/compressed", time, picture(0))
-            bag.camera_info("/stereo/left/camera_info", time, SIZE, 30.0, [0.1, -0.2, 0.003, 0.004, 0.05])
-            bag.camera_info("/fresh/camera_info", time, SIZE, 0.0)
+            bag.camera_info("/stereo/left/camera_info", time, SIZE, FOCAL, [0.1, -0.2, 0.003, 0.004, 0.05])
+            bag.camera_info("/fresh/camera_info", time, SIZE, (0.0, 0.0, 12.0, 8.0))
     known = format_of(bag.path)
     assert known is not None
     for topic in ("image_raw", "image_raw/compressed"):
         lens = known.lens(bag.path, f"/stereo/left/{topic}")
         assert lens is not None
-        assert lens.intrinsics == (30.0, 30.0, 12.0, 8.0)  # ours counts from the corner
+        assert lens.intrinsics == FOCAL
         assert lens.distortion == (0.1, -0.2, 0.003, 0.004, 0.05)
         assert lens.size == SIZE
     straight = known.lens(bag.path, "/stereo/left/image_rect_color")
     assert straight is not None
-    assert straight.intrinsics == pytest.approx((27.0, 27.0, 12.0, 8.0))
+    assert straight.intrinsics == pytest.approx((27.0, 27.9, 12.5, 8.0))
     assert not straight.distorted
     assert known.lens(bag.path, "/other/image_raw") is None
     assert known.lens(bag.path, "/fresh/image_raw") is None  # never calibrated

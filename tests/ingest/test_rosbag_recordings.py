@@ -25,6 +25,7 @@ from neeco.ingest.synchronized import SynchronizedRecording
 from neeco.ingest.template import write_template
 
 SIZE = (64, 48)  # px
+FOCAL = (60.0, 60.0, 32.0, 24.0)
 LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"
 OLD = ("position_cartesian_current", "state_joint_current", "state_jaw_current")
 NEW = ("measured_cp", "measured_js", "jaw/measured_js")
@@ -59,7 +60,7 @@ def write_dvrk(bag: BagWriter, names: tuple[str, str, str] = NEW, frame: str = "
     for number in range(50):
         for topic in (RIGHT, LEFT):
             bag.image(topic, number / 25, np.full((*SIZE[::-1], 3), number, np.uint8), "bgr8", "stereo_left")
-    bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, 60.0)
+    bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL)
 
 
 def refusal(action: Callable[[], object]) -> str:
@@ -85,7 +86,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
                 bag.tf(time, shaft(time), [1, 0, 0, 0], "world", "table")
                 bag.compressed("/left/compressed", time, np.full((*SIZE[::-1], 3), 90, np.uint8))
                 bag.image(RIGHT, time, np.full((8, 8, 3), 90, np.uint8), "bgr8")
-            bag.camera_info("/left/camera_info", 0.0, SIZE, 60.0)
+            bag.camera_info("/left/camera_info", 0.0, SIZE, FOCAL)
         found[kind] = bag.path
     return found
 
@@ -112,7 +113,7 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(
         assert unused in text.partition("not used:")[2]
     lens, _ = recording.read_lens()
     assert lens is not None
-    assert lens.intrinsics == (60.0, 60.0, 32.0, 24.0)
+    assert lens.intrinsics == FOCAL
     data = SynchronizedRecording(recording, lambda what, done, total: None)
     times = data.times[2:-2]
     states, usable = data.states_at(times)
@@ -233,7 +234,7 @@ def test_images_of_two_sizes_and_lenses_of_a_part_are_refused(tmp_path: Path) ->
     with BagWriter(tmp_path, "recording.bag") as bag:
         for number in range(4):
             bag.image(LEFT, number / 25, np.zeros((8, 8 + 8 * (number > 1), 3), np.uint8), "rgb8")
-        bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, 60.0, binning=2)
+        bag.camera_info("/stereo/left/camera_info", 0.0, SIZE, FOCAL, binning=2)
     known = format_of(bag.path)
     assert known is not None
     assert "changes from 8x8 to 16x8 pixels midway" in refusal(lambda: known.open_images(bag.path))

@@ -161,8 +161,11 @@ class RosBag(RecordingFormat):
         log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
         if _DVRK.search(name):
             offered = bool(_DVRK_JOINTS.search(name))
-            plain = {joint.removeprefix("outer_"): joint for joint in _joint_names(name, log)}
-            wrist = tuple((joint, _joint_column(plain[joint])) for joint in _WRIST if joint in plain)
+            names = _joint_names(name, log)
+            found = [(known, joint) for known in _WRIST for joint in names if joint.endswith(known)]
+            if "jaw" in name and len(names) == 1:
+                found = [("jaw", names[0])]
+            wrist = tuple((known, _joint_column(joint)) for known, joint in found)
         rate = _rate(survey.seconds(log.stamps, log.received))
         return Stream(name, READINGS, log.type, len(log.stamps), rate, offered, _body(name), wrist)
 
