@@ -20,7 +20,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.columns import CAMERA, VIDEO_CLOCK, JointColumns, PoseColumns
 from neeco.ingest.formats import format_of, read_table
 from neeco.ingest.logs import read_pose_log, read_reading_log
-from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.recordingfile import read_recording, recording_from_flags
 from neeco.ingest.synchronized import SynchronizedRecording
 from neeco.ingest.template import write_template
 
@@ -166,7 +166,30 @@ def test_a_folder_with_a_bag_and_other_files_is_looked_through(tmp_path: Path) -
     assert {item["poses"]["file"] for item in document["instruments"]} == {"first.bag", "second-db3"}
 
 
+def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> None:
+    with BagWriter(tmp_path, "recording-db3") as bag:
+        for time in np.arange(40) / 25:
+            bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], "tracker")
+            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
+    recording = recording_from_flags(bag.path, bag.path)
+    data = SynchronizedRecording(recording, lambda *_: None)
+    states, usable = data.states_at(data.times)
+    assert usable.all()
+    np.testing.assert_allclose(states["instrument"][0][20, :3, 3], 1000 * shaft(0.8), atol=0.01)
+
+
 # --- what cannot be read
+
+
+def test_a_bag_in_the_place_of_a_recording_says_what_to_do(
+    bags: dict[str, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for path in bags.values():
+        assert main(["ingest", str(path), "--output", str(tmp_path / "out")]) == 1
+        assert capsys.readouterr().err.rstrip().endswith(f"neeco ingest --init {path}")
+    recording = tmp_path / "recording.yaml"
+    recording.write_text(yaml.safe_dump({"video": {"file": str(bags["recording.bag"]), "fps": 25}}))
+    assert "video.fps: the file has times of its own; leave it out" in refusal(lambda: read_recording(recording))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -210,7 +233,7 @@ def test_topics_that_are_not_there_or_not_of_the_kind_are_named(bags: dict[str, 
     assert f"stream: holds no '/PSM1/measured_cp'; {poses}" in refusal(lambda: read_table(path, "/PSM1/measured_cp"))
     message = f"'{RIGHT}' is sensor_msgs/Image (bgr8, 8x8), not poses or readings; {poses}"
     assert message in refusal(lambda: read_table(path, RIGHT))
-    assert f"holds 2 streams of images; name one as `stream`: /left/compressed, {RIGHT}" in refusal(
+    assert f"holds 2 streams of images; name one as `stream` in the recording: /left/compressed, {RIGHT}" in refusal(
         lambda: images.open_images(path)
     )
     assert "'tf:table' is tf2_msgs/TFMessage in world, not images" in refusal(

@@ -59,6 +59,7 @@ class Ingest:
 def run(args: Ingest) -> int:
     """Ingest, convert, or write a template."""
     from neeco.errors import NeecoError
+    from neeco.ingest.formats import format_of
 
     if args.formats:
         _refuse_beside(args, "--formats", keep=("formats",))
@@ -69,6 +70,11 @@ def run(args: Ingest) -> int:
     output = args.output and Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
     if output is None:
         raise NeecoError("--output: give the folder of the capture to write")
+    if args.source is not None and (known := format_of(args.source)) is not None and args.source.exists():
+        raise NeecoError(
+            f"{args.source}: is in a recording's format ({known.format}) but says not what is what in it; write that "
+            f"down first: neeco ingest --init {args.source}"
+        )
     if args.source is not None and args.source.is_dir():
         if (args.source / RECORDING).is_file():
             raise NeecoError(f"{args.source}: holds a recording; give the file: {args.source / RECORDING}")

@@ -68,9 +68,17 @@ def recording_from_flags(
         raise NeecoError(f"--joint {twice}: given twice; give each joint once")
     if joints and instrument is None:
         raise NeecoError(f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to")
-    logs = {joint: JointColumns(Path(log), joint, calibration=table and Path(table)) for joint, log, table in joints}
-    instruments = (InstrumentLogs("instrument", PoseColumns(Path(instrument)), logs),) if instrument else ()
-    scope = PoseColumns(Path(laparoscope)) if laparoscope else None
+
+    def clock(log: Path, otherwise: str) -> str:
+        return VIDEO_CLOCK if Path(log) == Path(video) else otherwise
+
+    logs = {
+        joint: JointColumns(Path(log), clock(log, joint), calibration=table and Path(table))
+        for joint, log, table in joints
+    }
+    poses = None if instrument is None else PoseColumns(Path(instrument), clock(instrument, TRACKER_CLOCK))
+    instruments = () if poses is None else (InstrumentLogs("instrument", poses, logs),)
+    scope = None if laparoscope is None else PoseColumns(Path(laparoscope), clock(laparoscope, TRACKER_CLOCK))
     values: Path | tuple[float, ...] | None = None
     if isinstance(intrinsics, str | Path):
         values = Path(intrinsics)
@@ -84,7 +92,7 @@ def recording_from_flags(
     if fps is not None and not 0 < fps < 1e6:  # NaN compares false
         raise NeecoError(f"--fps: {fps:g} is no frame rate; give frames per second")
     video = Path(video)
-    film, folder = (None, video) if video.is_dir() else (video, None)
+    film, folder = (None, video) if video.is_dir() and format_of(video) is None else (video, None)
     return Recording(video, film, folder, fps, None, values, instruments, scope, offsets, frames, None, notes)
 
 
@@ -219,6 +227,8 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     source = section.path(keys[0], required=True)
     fps = section.number("fps", above=0.0)
     if images is None:
+        if fps is not None and format_of(source) is not None:
+            raise section.error("fps", "the file has times of its own; leave it out")
         stream = section.text("stream")
         if stream is not None and format_of(source) is None:
             raise section.error("stream", "a video has one; leave it out")

@@ -172,7 +172,8 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
         if len(fitting) == 1:
             return fitting[0]
         raise NeecoError(
-            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream`: {listed}"
+            f"{path}: holds {len(fitting)} streams of {' or '.join(kinds)}; name one as `stream` in the recording: "
+            f"{listed}"
         )
     found = next((stream for stream in streams if stream.name == wanted), None)
     if found is None:

@@ -194,7 +194,7 @@ class _Mcap(McapReader):
         for chunk in sorted(self.chunks, key=lambda chunk: chunk.message_start_time):
             late = stop is not None and chunk.message_start_time >= stop
             early = start is not None and chunk.message_end_time < start
-            if late or early or not any(chunk.channel_count.get(channel) for channel in channels):
+            if late or early or (chunk.channel_count and not channels.keys() & chunk.channel_count.keys()):
                 continue
             found = []
             for channel, received, data in _records(self._chunk(chunk)):
