@@ -15,8 +15,11 @@ from rendered.bagwriter import BagWriter
 BASE = "tracker"  # the frame of all poses
 LEFT = "/stereo/left"
 METRES = 1e-3
-# the bag, how its chunks or messages are packed, how its images are: raw, or as such a file
-LAYOUTS = (("recording.bag", "lz4", None), ("recording-db3", None, ".png"), ("recording-mcap", "zstd", None))
+LAYOUTS = {
+    "ros1": ("recording.bag", "lz4", None),
+    "ros2": ("recording-db3", None, ".png"),
+    "mcap": ("recording-mcap", "zstd", None),
+}  # the bag, how its chunks are packed, how its images are: raw, or as such files
 
 
 def write_bags(folder: Path, clocks_s: Mapping[str, float]) -> None:
@@ -31,7 +34,7 @@ def write_bags(folder: Path, clocks_s: Mapping[str, float]) -> None:
     lens, _ = recording.read_lens()
     assert lens is not None
     film = recording.open()
-    for (kind, packed, ending), name in zip(LAYOUTS, ("ros1", "ros2", "mcap"), strict=True):
+    for name, (kind, packed, ending) in LAYOUTS.items():
         (folder / "bags" / name).mkdir(parents=True)
         with BagWriter(folder / "bags" / name, kind, packed=packed) as bag:
             for body, log in logs.items():

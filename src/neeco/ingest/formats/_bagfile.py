@@ -39,6 +39,7 @@ else:
 MIB = 2**20
 LARGEST_CHUNK = 256 * MIB  # of messages, unpacked: recorders write some MiB
 LARGEST_METADATA = 16 * MIB
+LONGEST_NAME = 200
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
 _DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": ZstdDecompressor}
@@ -68,10 +69,12 @@ class Bag:
         self.path, self._sources, self._compressed = path, sources, compressed
         self._ros1 = path.suffix.lower() == ".bag"
         self.store = _store(self._ros1)
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, Topic] = {}  # by name
         for connection in connections:
             before = self.topics.get(connection.topic)
-            kind, problem = connection.msgtype.replace("/msg/", "/"), self._problem(connection)
+            kind, problem = plain(connection.msgtype.replace("/msg/", "/")), self._problem(connection)
+            if plain(connection.topic) != connection.topic:
+                problem = "has a name that is none"
             if before is not None and before.type != kind:
                 problem = f"holds both {before.type} and {kind}"
             count = connection.msgcount + (before.count if before else 0)
@@ -151,9 +154,15 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise NeecoError(f"{path}: may not be read; allow it") from error
     # damaged bags make rosbags raise nearly anything: struct.error, KeyError, AssertionError, OverflowError ...
     except Exception as error:
-        reason = " ".join(_NESTED.sub(r"\1", str(error)).split())[:160].rstrip(".") or "its records do not fit together"
+        said = plain(" ".join(_NESTED.sub(r"\1", str(error)).split())).rstrip(".")
+        reason = said or "its records do not fit together"
         remedy = _REMEDIES["" if path.is_dir() else path.suffix.lower()]
         raise NeecoError(f"{path}: is cut short or damaged, or no bag ({reason}); {remedy}") from error
+
+
+def plain(name: str) -> str:
+    """A name out of a bag without what a terminal, or a recording.yaml, would take for more than its letters."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:LONGEST_NAME])
 
 
 def unpack(data: bytes, compression: str) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neeco.ingest.formats import OTHER, Stream
-from neeco.ingest.formats._bagfile import Bag, open_bag
+from neeco.ingest.formats._bagfile import Bag, open_bag, plain
 from neeco.ingest.formats._rosimages import ImageLog
 
 POSE = {"geometry_msgs/PoseStamped", "geometry_msgs/TransformStamped"}
@@ -32,17 +32,13 @@ class Samples:
     type: str
     stamps: array[int] = field(default_factory=lambda: array("q"))
     received: array[int] = field(default_factory=lambda: array("q"))
-    frames: set[str] = field(default_factory=set)  # that poses are stated in
+    frames: set[str] = field(default_factory=set)  # that poses are stated in, as ROS 2 writes them: without a slash
     damaged: int = 0
 
     def stamp(self, header: Any, received: int) -> None:
         self.stamps.append(header.stamp.sec * 10**9 + header.stamp.nanosec)
         self.received.append(received)
-        self.frames.add(header.frame_id)
-
-    def frame_names(self) -> set[str]:
-        """Frames as ROS 2 writes them, without a slash before."""
-        return {name.lstrip("/") for name in self.frames}
+        self.frames.add(plain(header.frame_id).lstrip("/"))
 
 
 @dataclass
@@ -69,7 +65,7 @@ class Joints(Samples):
 
     def add(self, received: int, message: Any) -> None:
         positions = message.position
-        names = message.name or [f"joint_{number + 1}" for number in range(len(positions))]
+        names = [plain(name) for name in message.name] or [f"joint_{number + 1}" for number in range(len(positions))]
         if len(names) != len(positions):
             self.damaged += 1
             return
@@ -110,7 +106,7 @@ class Survey:
                 self.lenses[topic] = message
         elif kind in TRANSFORMS:
             for item in [] if message is None else message.transforms:
-                name = f"tf:{item.child_frame_id.lstrip('/')}"
+                name = f"tf:{plain(item.child_frame_id).lstrip('/')}"
                 if name not in self.poses and len(self.poses) < MOST_FRAMES:
                     self.poses[name] = Poses(kind, static=topic.endswith("tf_static"))
                 if name in self.poses:
@@ -160,7 +156,7 @@ def _fill(survey: Survey, bag: Bag) -> None:
                 survey.images[topic.name], survey.image_types[topic.name] = ImageLog(), topic.type
         else:
             kind = topic.type if topic.problem is None else f"{topic.type}, which {topic.problem}"
-            survey.others.append(Stream(topic.name, OTHER, kind, topic.count))
+            survey.others.append(Stream(plain(topic.name), OTHER, kind, topic.count))
     for name, received, message in bag.messages(set(kinds)):
         survey.add(name, kinds[name], received, message)
     logs: list[Any] = [log for log in survey.images.values() if log.stamps]

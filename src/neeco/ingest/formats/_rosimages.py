@@ -18,7 +18,7 @@ from neeco.capture.documents import printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.ingest.formats import VideoSource
-from neeco.ingest.formats._bagfile import open_bag
+from neeco.ingest.formats._bagfile import open_bag, plain
 from neeco.ingest.lens import opencv_lens
 
 LARGEST_IMAGE = 90_000_000  # px, as for files of images
@@ -67,7 +67,7 @@ class ImageLog:
         if problem is not None:
             self.bad[problem] += 1
             return
-        self.frames.add(message.header.frame_id)
+        self.frames.add(plain(message.header.frame_id).lstrip("/"))
         stamp = message.header.stamp
         self.stamps.append(stamp.sec * 10**9 + stamp.nanosec)
         self.numbers.append(len(self.received) - 1)

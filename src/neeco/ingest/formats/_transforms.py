@@ -23,7 +23,7 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     known = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
-    parents = {parent for name in known for parent in survey.poses[f"tf:{name}"].frame_names()}
+    parents = {parent for name in known for parent in survey.poses[f"tf:{name}"].frames}
     for name, there in ((child, known | parents if word else known), (frame, known | parents)):
         if name not in there and (word or name is child):
             listed = printable(", ".join(sorted(there)), 300).strip("'") or "none"
@@ -71,7 +71,7 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
 
 
 def _parent(survey: Survey, where: str, child: str) -> str:
-    frames = survey.poses[f"tf:{child}"].frame_names()
+    frames = survey.poses[f"tf:{child}"].frames
     if len(frames) > 1:
         raise NeecoError(f"{where}: {child} hangs from several frames ({', '.join(sorted(frames)[:4])}); name another")
     return next(iter(frames))

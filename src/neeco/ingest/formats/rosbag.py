@@ -81,7 +81,7 @@ class RosBag(RecordingFormat):
             header = ("t_s", *map(_joint_column, _joint_names(chosen, readings)))
             return _table(survey, chosen, readings, header, readings.table())
         poses = survey.poses[chosen]
-        names = poses.frame_names()
+        names = poses.frames
         if len(names) > 1:
             listed = ", ".join(sorted(names)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
@@ -137,7 +137,7 @@ class RosBag(RecordingFormat):
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
         log, cameras = survey.poses[name], _camera_frames(survey)
-        frames, dvrk = log.frame_names(), {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
+        frames, dvrk = log.frames, {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
         if dvrk:
             offered = name in dvrk
         elif name.startswith("tf:"):
@@ -148,7 +148,7 @@ class RosBag(RecordingFormat):
         title = f"{log.type} in {frame}{', static' if log.static else ''}"
         hints = [f"poses are stated in {frame}{', the frame of the camera' if frames <= cameras else ''}"]
         if name in dvrk and _body(name) == DVRK_CAMERA:
-            of_arms = {base for topic in dvrk - {name} for base in survey.poses[topic].frame_names()}
+            of_arms = {base for topic in dvrk - {name} for base in survey.poses[topic].frames}
             if of_arms - frames - cameras:  # these would not register them
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
@@ -205,7 +205,7 @@ def _rate(seconds: np.ndarray) -> float | None:
 
 def _camera_frames(survey: Survey) -> set[str]:
     """Frames of the images' cameras."""
-    return ({DVRK_CAMERA} | {name.lstrip("/") for log in survey.images.values() for name in log.frames}) - {""}
+    return ({DVRK_CAMERA} | {name for log in survey.images.values() for name in log.frames}) - {""}
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
