@@ -32,9 +32,9 @@ from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
 
 if sys.version_info >= (3, 14):
-    from compression.zstd import ZstdDecompressor
+    from compression import zstd
 else:
-    from backports.zstd import ZstdDecompressor
+    from backports import zstd
 
 MIB = 2**20
 LARGEST_CHUNK = 256 * MIB  # of messages, unpacked: recorders write some MiB
@@ -42,7 +42,7 @@ LARGEST_METADATA = 16 * MIB
 LONGEST_NAME = 200
 METADATA = "metadata.yaml"
 INFORMATION = "rosbag2_bagfile_information"
-_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": ZstdDecompressor}
+_DECOMPRESSORS = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
 _NESTED = re.compile(r"\([\"'](.*)[\"'],\)")  # of an error within an error
 _REMEDIES = {
     ".bag": "repair it with `rosbag reindex`, or copy it again",
@@ -171,6 +171,10 @@ def unpack(data: bytes, compression: str) -> bytes:
         return data
     if compression not in _DECOMPRESSORS:
         raise ReaderError(f"its chunks are packed by {compression}")
+    if compression == "zstd" and zstd.get_frame_size(data) == len(data):
+        size = zstd.get_frame_info(data).decompressed_size
+        if size is not None and size <= LARGEST_CHUNK:
+            return zstd.decompress(data)  # of the size that its one frame states, into one piece of memory
     machine = _DECOMPRESSORS[compression]()
     parts = [machine.decompress(data, max_length=LARGEST_CHUNK + 1)]
     if len(parts[0]) > LARGEST_CHUNK:
@@ -196,7 +200,7 @@ class _Mcap(McapReader):
 
     def messages(
         self, connections: Collection[Any], start: int | None = None, stop: int | None = None
-    ) -> Generator[tuple[Any, int, bytes], None, None]:
+    ) -> Generator[tuple[Any, int, Any], None, None]:
         if connections and not self.chunks and self.metadata.message_count:
             raise ReaderError("its messages are not in chunks")
         channels = {connection.id: connection for connection in connections}
@@ -223,9 +227,9 @@ class _Mcap(McapReader):
         return data
 
 
-def _records(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+def _records(chunk: bytes) -> Iterator[tuple[int, int, memoryview]]:
     """(channel, log time ns, message) of the messages in an MCAP chunk."""
-    place = 0
+    place, data = 0, memoryview(chunk)
     while place < len(data):
         opcode, length = struct.unpack_from("<BQ", data, place)
         place += 9
