@@ -7,6 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
+from plus_world import frame_fields, write_mha, write_nrrd
 
 from neeco.errors import NeecoError
 from neeco.ingest.columns import PoseColumns
@@ -14,7 +15,6 @@ from neeco.ingest.formats import IMAGES, OTHER, POSES, format_of
 from neeco.ingest.logs import read_pose_log
 from neeco.ingest.recordingfile import read_recording
 from neeco.ingest.template import write_template
-from tests.ingest.plus_files import frame_fields, write_mha, write_nrrd
 
 START = 12.5  # of PLUS's clock, s
 COUNT = 30
@@ -31,15 +31,30 @@ def film(channels=3):
     return np.random.default_rng(7).integers(0, 256, (COUNT, 12, 16, channels), dtype=np.uint8)
 
 
+def mha(path, fields, images=None, **more):
+    """A MetaImage sequence; without images, of poses alone."""
+    shape, content = ((COUNT, 0, 0, 1), ()) if images is None else (images.shape, images)
+    return write_mha(path, fields, shape, content, **more)
+
+
+def nrrd(path, fields, images, **more):
+    return write_nrrd(path, fields, images.shape, images, **more)
+
+
 LAYOUTS = {
-    "whole.igs.mha": lambda path, *what: write_mha(path, *what),
-    "packed.mha": lambda path, *what: write_mha(path, *what, compressed=True),
-    "beside.mhd": lambda path, *what: write_mha(path, *what, beside="beside.raw"),
-    "zbeside.mhd": lambda path, *what: write_mha(path, *what, compressed=True, beside="beside.zraw"),
-    "whole.nrrd": lambda path, *what: write_nrrd(path, *what),
-    "packed.nrrd": lambda path, *what: write_nrrd(path, *what, compressed=True),
-    "beside.nhdr": lambda path, *what: write_nrrd(path, *what, compressed=True, beside="beside.raw.gz"),
+    "whole.igs.mha": (mha, {}),
+    "packed.mha": (mha, {"compressed": True}),
+    "beside.mhd": (mha, {"beside": "beside.raw"}),
+    "zbeside.mhd": (mha, {"compressed": True, "beside": "beside.zraw"}),
+    "whole.nrrd": (nrrd, {}),
+    "packed.nrrd": (nrrd, {"compressed": True}),
+    "beside.nhdr": (nrrd, {"compressed": True, "beside": "beside.raw.gz"}),
 }
+
+
+def write(folder, name, fields, images):
+    writer, how = LAYOUTS[name]
+    return writer(folder / name, fields, images, **how)
 
 
 BESIDE = {"beside.mhd": "beside.raw", "zbeside.mhd": "beside.zraw", "beside.nhdr": "beside.raw.gz"}
@@ -49,7 +64,7 @@ BESIDE = {"beside.mhd": "beside.raw", "zbeside.mhd": "beside.zraw", "beside.nhdr
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_poses_and_images_come_back_from_every_layout(world, transforms, name, channels):
     images = film(channels)
-    path = LAYOUTS[name](world.folder / name, frame_fields(TIMES, transforms), images)
+    path = write(world.folder, name, frame_fields(TIMES, transforms), images)
     known = format_of(path)
     kinds = {stream.name: (stream.kind, stream.count) for stream in known.streams(path)}
     assert kinds == {"images": (IMAGES, 30), "StylusToTracker": (POSES, 30), "ImageToProbe": (OTHER, 30)}
@@ -70,7 +85,7 @@ def test_poses_and_images_come_back_from_every_layout(world, transforms, name, c
 
 def test_frames_that_are_not_ok_are_left_out_and_noted(world, transforms):
     statuses = {("StylusToTracker", frame): "MISSING" for frame in (4, 5, 9)}
-    path = write_mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms, statuses, bad_images=(0, 20)), film())
+    path = mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms, statuses, bad_images=(0, 20)), film())
     log = read_pose_log(PoseColumns(path))
     kept = np.delete(np.arange(COUNT), [4, 5, 9])
     first = TIMES[1]  # of the first image that can be used
@@ -86,16 +101,17 @@ def test_frames_that_are_not_ok_are_left_out_and_noted(world, transforms):
 
 def test_a_file_of_poses_alone_keeps_its_clock(world, transforms):
     fields = frame_fields(TIMES, {"StylusToTracker": transforms["StylusToTracker"]})
-    path = write_mha(world.folder / "tracker.igs.mha", fields, COUNT)
+    path = mha(world.folder / "tracker.igs.mha", fields)
     np.testing.assert_allclose(read_pose_log(PoseColumns(path)).times, TIMES, atol=1e-6)
     with pytest.raises(NeecoError, match="0 streams of images"):
         format_of(path).open_images(path)
 
 
 def test_a_transform_may_be_named_in_full(world, transforms):
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, transforms), COUNT)
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms))
     log = read_pose_log(PoseColumns(path, stream="StylusToTrackerTransform"))
     assert len(log.times) == COUNT
+    assert log.stated_in == "Tracker"
 
 
 @pytest.mark.parametrize(
@@ -107,21 +123,21 @@ def test_a_transform_may_be_named_in_full(world, transforms):
     ],
 )
 def test_a_stream_that_holds_no_poses_is_refused(world, transforms, stream, message):
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film())
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film())
     with pytest.raises(NeecoError, match=message):
         read_pose_log(PoseColumns(path, stream=stream))
 
 
 def test_several_tools_must_be_named(world, transforms):
     tools = {"StylusToTracker": transforms["StylusToTracker"], "ScopeToTracker": transforms["StylusToTracker"]}
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, tools), film())
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, tools), film())
     with pytest.raises(NeecoError, match=r"name one as `stream` .*: ScopeToTracker, StylusToTracker"):
         read_pose_log(PoseColumns(path))
 
 
 def test_a_template_of_a_sequence_is_complete(world, transforms):
     tools = {**transforms, "ScopeToTracker": transforms["StylusToTracker"]}
-    path = write_mha(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
+    path = mha(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
     text = write_template(path)
     recording = read_recording(world.text(text, "recording.yaml"))
     assert recording.video == path
@@ -129,6 +145,7 @@ def test_a_template_of_a_sequence_is_complete(world, transforms):
     assert instrument.poses.stream == "StylusToTracker"
     assert recording.laparoscope.stream == "ScopeToTracker"
     assert recording.laparoscope.clock == instrument.poses.clock == "video"
+    assert instrument.name == "Stylus"
     assert "ImageToProbe" in text
     assert len(read_pose_log(instrument.poses).times) == COUNT
     assert recording.open().size == (16, 12)
@@ -161,7 +178,7 @@ def changed(path, old, new):
     ],
 )
 def test_a_header_that_cannot_be_is_refused_in_one_line(world, transforms, old, new, message):
-    path = changed(write_mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms), film()), old, new)
+    path = changed(mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms), film()), old, new)
     with pytest.raises(NeecoError, match=message) as caught:
         format_of(path).open_images(path)
     assert str(caught.value).startswith(str(path))
@@ -170,60 +187,60 @@ def test_a_header_that_cannot_be_is_refused_in_one_line(world, transforms, old, 
 
 def test_truncated_and_damaged_images_are_refused(world, transforms):
     fields = frame_fields(TIMES, transforms)
-    for name, write in LAYOUTS.items():
-        path = write(world.folder / name, fields, film())
+    for name in LAYOUTS:
+        path = write(world.folder, name, fields, film())
         data = world.folder / BESIDE.get(name, name)
         whole = data.read_bytes()
         data.write_bytes(whole[:-700])
         with pytest.raises(NeecoError, match=r"speaks of|end early") as caught:
-            format_of(path).open_images(path)
+            list(format_of(path).open_images(path).read(range(COUNT)))
         assert len(str(caught.value).splitlines()) == 1
         if name not in ("whole.igs.mha", "whole.nrrd", "beside.mhd"):
             content = bytearray(whole)
             content[-3000] ^= 0xFF
             data.write_bytes(content)
             with pytest.raises(NeecoError, match=r"damaged|end early"):
-                format_of(path).open_images(path)
+                list(format_of(path).open_images(path).read(range(COUNT)))
 
 
 def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
     changed(path, b"16 12 1 30", b"8000 8000 1 3000")
     with pytest.raises(NeecoError, match="of which no 3000 images"):
-        format_of(path).open_images(path)
+        list(format_of(path).open_images(path).read(range(COUNT)))
     # and one whose header fits the little that it says, while far more comes out
     content = path.read_bytes().replace(b"8000 8000 1 3000", b"16 12 1 30")
     start = content.index(b"LOCAL\n") + 6
     path.write_bytes(content[:start] + zlib.compress(bytes(50_000_000)))
     with pytest.raises(NeecoError, match="more images than its header says"):
-        format_of(path).open_images(path)
+        list(format_of(path).open_images(path).read(range(COUNT)))
 
 
 def test_a_file_without_transforms_says_so(world):
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, {}), film())
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, {}), film())
     assert [stream.name for stream in format_of(path).streams(path)] == ["images"]
     with pytest.raises(
         NeecoError, match=r"a.mha: holds no transforms \(Seq_Frame0000_StylusToTrackerTransform\); name"
     ):
         read_pose_log(PoseColumns(path))
-    volume = write_mha(world.folder / "ct.mha", [], film())
+    volume = mha(world.folder / "ct.mha", [], film())
     with pytest.raises(NeecoError, match="no PLUS sequence"):
         read_pose_log(PoseColumns(volume))
 
 
 def test_statuses_all_invalid_are_said(world, transforms):
     statuses = {("StylusToTracker", frame): "INVALID" for frame in range(COUNT)}
-    path = write_mha(world.folder / "a.mha", frame_fields(TIMES, transforms, statuses), film())
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms, statuses), film())
     with pytest.raises(NeecoError, match=r"StylusToTracker: no frame can be used: .*Status is 'INVALID'"):
         read_pose_log(PoseColumns(path))
-    path = write_mha(world.folder / "b.mha", frame_fields(TIMES, transforms, bad_images=tuple(range(COUNT))), film())
+    path = mha(world.folder / "b.mha", frame_fields(TIMES, transforms, bad_images=tuple(range(COUNT))), film())
     with pytest.raises(NeecoError, match=r"0 of 30 images can be used \(30 images are not OK"):
         format_of(path).open_images(path)
 
 
 def test_a_folder_lists_what_it_cannot_read(world, transforms):
-    write_mha(world.folder / "ct.mha", [], film())
-    write_mha(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())
+    mha(world.folder / "ct.mha", [], film())
+    mha(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())
     text = write_template(world.folder)
     assert "ct.mha: holds no fields of frames" in text
     recording = read_recording(world.text(text, "recording.yaml"))
@@ -233,7 +250,7 @@ def test_a_folder_lists_what_it_cannot_read(world, transforms):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_no_bytes_make_reading_raise(world, transforms, name):
-    path = LAYOUTS[name](world.folder / name, frame_fields(TIMES, transforms), film())
+    path = write(world.folder, name, frame_fields(TIMES, transforms), film())
     whole = path.read_bytes()
     head = whole.find(b"Seq_Frame0001")
     messages = []

@@ -259,8 +259,9 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
-    if log.stream is not None and columns.time and columns.position and columns.rotation:
-        return [*log.lines(), *_unit_lines(columns, {"length": columns.position})]  # recognised again when read
+    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
+    if log.stream is not None and columns.time and of_length and columns.rotation:
+        return [*log.lines(), *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     lines = [*log.lines(), *(["clock: em"] if log.stream is None else [])]
     given = [
         ("time", columns.time),
@@ -272,7 +273,6 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     lines += ["columns:", *known] if known else []
     lines += ["  good: [OK]"] if columns.state else []
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
-    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
     return lines + _unit_lines(columns, {"length": of_length})
 
 

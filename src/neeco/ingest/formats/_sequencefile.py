@@ -230,13 +230,6 @@ class SequenceImages(VideoSource):
             yield index, np.repeat(pixels, 3, axis=2) if self.sequence.channels == 1 else pixels
 
 
-def require_whole(sequence: FrameSequence) -> None:
-    """Unpack compressed images once. Raises NeecoError where they are not as many as the header says, or damaged."""
-    if sequence.window is not None:
-        for _ in _unpacked(sequence, [sequence.count - 1], whole=True):
-            pass
-
-
 def _pixels(sequence: FrameSequence, numbers: list[int]) -> Iterator[np.ndarray]:
     """uint8 [H, W, C] of frames in increasing order."""
     shape = (sequence.size[1], sequence.size[0], sequence.channels)
@@ -258,8 +251,9 @@ def _pixels(sequence: FrameSequence, numbers: list[int]) -> Iterator[np.ndarray]
         raise NeecoError(f"{file}: cannot read: {error.strerror or error}; do not change the file") from None
 
 
-def _unpacked(sequence: FrameSequence, numbers: list[int], *, whole: bool = False) -> Iterator[bytes]:
-    """The bytes of frames in increasing order; whole: and see that the data ends with the last of them."""
+def _unpacked(sequence: FrameSequence, numbers: list[int]) -> Iterator[bytes]:
+    """The bytes of frames in increasing order. Raises NeecoError where the data ends before them, is damaged, or does
+    not end with the last of the sequence."""
     file, start = sequence.data
     length = sequence.size[0] * sequence.size[1] * sequence.channels
     assert sequence.window is not None
@@ -274,7 +268,7 @@ def _unpacked(sequence: FrameSequence, numbers: list[int], *, whole: bool = Fals
                 content = source.take(length)
                 reached += length
                 yield content
-            if whole and not source.at_end():
+            if reached == sequence.count * length and not source.at_end():
                 raise NeecoError(f"{file}: holds more images than its header says; export the sequence again")
     except OSError as error:
         raise NeecoError(f"{file}: cannot read: {error.strerror or error}; correct the path") from None

@@ -301,7 +301,7 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     if set(when) <= set(table.header):
         stamps = numbers(table, when)[0] @ [1.0, 1e-9]
         times = np.where(stamps == 0, times, stamps)
-    frame = None
+    frame = stated_in = None
     if stream.kind == POSES:
         header: tuple[str, ...] = POSE_HEADER
         if "header.frame_id" in table.header:
@@ -312,7 +312,8 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
                 raise NeecoError(
                     f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame"
                 )
-            frame = CAMERA if names == {DVRK_CAMERA} else None
+            stated_in = next(iter(names), None)
+            frame = CAMERA if stated_in == DVRK_CAMERA else None
     else:
         header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
         if len(set(header)) < len(header):
@@ -320,4 +321,6 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     values, _, bad = numbers(table, columns)
     notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
     rows = np.column_stack([times - start, values])
-    return Table(path, header, rows, table.lines, stream=stream.name, frame=frame, notes=tuple(notes))
+    return Table(
+        path, header, rows, table.lines, stream=stream.name, frame=frame, stated_in=stated_in, notes=tuple(notes)
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -21,13 +23,14 @@ from neeco.ingest.formats import (
     choose_stream,
     parse_number,
 )
-from neeco.ingest.formats._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence, require_whole
+from neeco.ingest.formats._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
 
 TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
 IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
 GOOD = "ok"
 IMAGE_STREAM = "images"
 MIN_IMAGES = 2
+_ENDS = re.compile(r"(\w+?)To([A-Z0-9]\w*)")
 HEADER = (
     "t_s",
     *(f"m{row}{column}{'_mm' if column == 3 and row < 3 else ''}" for row in range(4) for column in range(4)),
@@ -48,15 +51,16 @@ class PlusSequence(RecordingFormat):
         found = []
         if sequence.has_images:
             count = len(_image_frames(sequence)[0])
-            kind = "grey" if sequence.channels == 1 else "RGB"
-            title = f"{kind} images of {sequence.size[0]}x{sequence.size[1]}"
+            color = "grey" if sequence.channels == 1 else "RGB"
+            title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
             found.append(Stream(IMAGE_STREAM, IMAGES, title, count, _rate(times, sequence.count)))
         for name in _transforms(sequence):
             texts = sequence.fields[name + TRANSFORM]
             # what is the same in every frame is a calibration (ImageToProbe), no motion
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             title = "fixed transform" if fixed else "transform"
-            found.append(Stream(name, OTHER if fixed else POSES, title, len(texts), _rate(times, len(texts))))
+            body, kind = _ends(name)[0], OTHER if fixed else POSES
+            found.append(Stream(name, kind, title, len(texts), _rate(times, len(texts)), body=body))
         return tuple(found)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
@@ -83,7 +87,9 @@ class PlusSequence(RecordingFormat):
             else:
                 rows.append([times[frame], *matrix])
                 frames.append(frame)
-        table = Table(path, HEADER, np.array(rows).reshape(-1, 17), np.array(frames, np.int64), False, name, "frame")
+        values, numbers = np.array(rows).reshape(-1, 17), np.array(frames, np.int64)
+        _, stated_in = _ends(name)
+        table = Table(path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in)
         notes = [
             f"{table.title}: {len(lost)} frame{'' if len(lost) == 1 else 's'} dropped: {why} ({table.list_rows(lost)})"
             for why, lost in dropped.items()
@@ -91,7 +97,7 @@ class PlusSequence(RecordingFormat):
         if not rows:
             why = next(iter(dropped))
             raise NeecoError(f"{table.where}: no frame can be used: {why}; record again, or name another transform")
-        return Table(path, HEADER, table.rows, table.lines, stream=name, record="frame", notes=tuple(notes))
+        return replace(table, notes=tuple(notes))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         sequence = _sequence_of(path)
@@ -100,7 +106,6 @@ class PlusSequence(RecordingFormat):
         if len(frames) < MIN_IMAGES:
             why = f" ({notes[0].partition(': ')[2]})" if notes else ""
             raise NeecoError(f"{path}: {len(frames)} of {sequence.count} images can be used{why}; record again")
-        require_whole(sequence)
         times = _times(sequence)
         seconds = np.array([times[frame] for frame in frames])
         return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence, tuple(frames))
@@ -121,7 +126,15 @@ def _cached(path: Path, size: int, changed: int) -> FrameSequence:
 
 
 def _transforms(sequence: FrameSequence) -> list[str]:
-    return sorted(name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM) and "To" in name)
+    names = [name.removesuffix(TRANSFORM) for name in sequence.fields if name.endswith(TRANSFORM)]
+    return sorted(name for name in names if _ENDS.fullmatch(name))
+
+
+def _ends(name: str) -> tuple[str, str]:
+    """What a transform maps from and to: Stylus and Tracker of StylusToTracker."""
+    match = _ENDS.fullmatch(name)
+    assert match is not None
+    return match[1], match[2]
 
 
 def _stamps(sequence: FrameSequence) -> dict[int, float]:

@@ -91,7 +91,8 @@ class SurgPose(RecordingFormat):
             frames, values = arms.joints[chosen.name.removesuffix(JOINTS_BEHIND)]
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
-        return Table(path, header, rows, frames, False, chosen.name, "frame")
+        stated_in = f"{chosen.name}_base" if chosen.kind == POSES else None
+        return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
