@@ -84,6 +84,30 @@ def write_bag(kind: str, packed: str | None, jpeg: bool) -> Callable[[Contents, 
     return write
 
 
+def write_sequence(compressed: bool) -> Callable[[Contents, Path], Path]:
+    """A writer of sequences of the PLUS toolkit, whose poses are those at its images."""
+
+    def write(contents: Contents, folder: Path) -> Path:
+        from rendered.pluswriter import frame_fields, write_mha
+        from scipy.spatial.transform import Rotation
+
+        from neeco.ingest.template import write_template
+
+        states = list(contents.states())[:: LOG_HZ // RATE_HZ][: contents.frames]
+        poses = np.tile(np.eye(4), (len(states), 1, 1))
+        poses[:, :3, :3] = Rotation.from_quat([turn for _, _, turn, _ in states], scalar_first=True).as_matrix()
+        poses[:, :3, 3] = [1000 * place for _, place, _, _ in states]
+        fields = frame_fields(np.arange(len(states)) / RATE_HZ, {f"{arm}ToTracker": poses for arm in ARMS})
+        shape = (contents.frames, contents.size[1], contents.size[0], 3)
+        images = (pixels for _, pixels in contents.images())
+        sequence = write_mha(folder / "recording.igs.mha", fields, shape, images, compressed)
+        path = folder / "recording.yaml"
+        path.write_text(write_template(sequence), encoding="utf-8")
+        return path
+
+    return write
+
+
 RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
     "ros1-jpeg": write_bag("recording.bag", None, jpeg=True),
     "ros1-raw": write_bag("recording.bag", None, jpeg=False),
@@ -92,6 +116,8 @@ RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
     "db3-raw": write_bag("recording-db3", None, jpeg=False),
     "mcap-jpeg": write_bag("recording-mcap", "zstd", jpeg=True),
     "mcap-raw": write_bag("recording-mcap", "zstd", jpeg=False),
+    "plus-raw": write_sequence(compressed=False),
+    "plus-zlib": write_sequence(compressed=True),
 }
 
 

@@ -45,6 +45,7 @@ class Settings:
     optics: bool = False  # raw/: the images as an endoscope distorts them, in a round border
     video: bool = False  # recording/: what `neeco ingest` takes
     bags: bool = False  # recording/bags/: the same as ROS bags
+    plus: bool = False  # recording/plus/: the same as a PLUS sequence
     workers: int = 1
 
     @property
@@ -57,8 +58,9 @@ class Settings:
             (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
             (self.exposure, " --exposure"),
             (self.optics, " --lens"),
-            (self.video and not self.bags, " --video"),
+            (self.video and not (self.bags or self.plus), " --video"),
             (self.bags, " --bag"),
+            (self.plus, " --plus"),
             (self.every > 1, f" --every {self.every}"),
         ]
         return size + "".join(option for wanted, option in given if wanted)

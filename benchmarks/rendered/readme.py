@@ -80,4 +80,6 @@ def _switched_on(settings: Settings) -> str:
         said.append("`recording/`: the same as a recording, for `neeco ingest`; the camera rolls.")
     if settings.bags:
         said.append("`recording/bags/`: the recording as bags of ROS 1, ROS 2 and MCAP, all on one clock.")
+    if settings.plus:
+        said.append("`recording/plus/`: images and poses as a sequence of the PLUS toolkit, on one clock.")
     return "".join(f"{line}\n" for line in said)

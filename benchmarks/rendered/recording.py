@@ -17,6 +17,7 @@ from rendered import errors
 from rendered.frames import Settings, Shot, image_name
 from rendered.motion import FRAME_RATE, Array, Trajectory, rigid
 from rendered.optics import Optics
+from rendered.plus import write_plus
 from rendered.truth import JOINT, World
 
 EM_HZ, JAW_HZ = 40.0, 50.0
@@ -66,6 +67,8 @@ def write_raw_recording(
         from rendered.bags import write_bags  # needs rosbags
 
         write_bags(folder, _CLOCKS)
+    if settings.plus:
+        write_plus(folder, _CLOCKS)
     write_json(
         path / "truth" / "recording.json",
         {

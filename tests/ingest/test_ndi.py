@@ -4,6 +4,8 @@ import pytest
 from neeco.errors import NeecoError
 from neeco.ingest.columns import PoseColumns, Units
 from neeco.ingest.logs import read_pose_log
+from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.template import write_template
 
 # as NDI Track exports: two tools with two and one markers
 TOOL = "Frame,Time [sec],Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,Markers"
@@ -105,3 +107,51 @@ def test_a_tool_in_another_file_is_refused(world):
     path = world.write("t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows())
     with pytest.raises(NeecoError, match=r"tool: there are no columns of tools"):
         read_pose_log(PoseColumns(path, tool="0x01"))
+
+
+@pytest.fixture
+def stray(world):
+    """Three tools as a tracker that loses them writes: cells empty where a tool or a marker is not seen, the last tool
+    unplugged midway with the row ending early, one more comma behind the header."""
+    header = f"Tools,Port 0x01: 8700340,{TOOL}{MARKER * 2},Port 0x02: needle driver,{TOOL}{MARKER}"
+    lines = []
+    for number, row in enumerate(world.rows()):
+        time, place, quat = float(row[0]), list(map(float, row[1:4])), list(map(float, row[4:]))
+        first = ["01", number, time, 0, "OK", 1.0, 0.0, 0.0, 0.0, 900.0, 901.0, 902.0, 0.1, 2]
+        first += ["OK", 5.0, 6.0, 7.0, "Missing", "", "", ""]
+        unseen = ["02", number, time, 0, "Partially Out Of Volume", *[""] * 8, 1, "Missing", "", "", ""]
+        second = ["02", number, time, 0, "OK", *quat, *place, 0.2, 1, "OK", 1.0, 2.0, 3.0]
+        third = ["03", number, time, 0, "OK", *quat, *(value / 2 for value in place), 0.2, 1, "OK", 1.0, 2.0, 3.0]
+        lines.append(
+            [
+                3,
+                *first,
+                *(unseen if number in (7, 8) else second),
+                *(third if number < 150 else ["03", "", "", "", "Disabled"]),
+            ]
+        )
+    return world.write(f"{header},Port 0x03: endoscope,{TOOL}{MARKER},", lines)
+
+
+def test_a_tool_that_drops_out_takes_no_other_with_it(world, stray):
+    whole = world.positions(world.times)
+    log = read_pose_log(PoseColumns(stray, tool="endoscope"))
+    np.testing.assert_allclose(log.positions, whole[:150] / 2, atol=1e-6)
+    assert any("50 rows dropped: State is 'Disabled'" in note for note in log.notes)
+    log = read_pose_log(PoseColumns(stray, tool="needle driver"))
+    np.testing.assert_allclose(log.positions, np.delete(whole, [7, 8], axis=0), atol=1e-6)
+    assert any("2 rows dropped: State is 'Partially Out Of V" in note for note in log.notes)
+    assert len(read_pose_log(PoseColumns(stray, tool="8700340")).times) == len(world.times)
+
+
+def test_a_template_lists_every_tool(world, stray):
+    (world.folder / "video.mp4").write_bytes(b"film")
+    recording = read_recording(world.text(write_template(world.folder), "recording.yaml"))
+    poses = [instrument.poses for instrument in recording.instruments]
+    assert [(instrument.name, instrument.poses.tool) for instrument in recording.instruments] == [
+        ("tool_8700340", "8700340"),
+        ("needle_driver", "needle driver"),
+    ]
+    assert recording.laparoscope.tool == "endoscope"
+    assert len(read_pose_log(recording.laparoscope).times) == 150
+    assert [len(read_pose_log(log).times) for log in poses] == [200, 198]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -24,6 +25,8 @@ class _Tool:
 
     columns: tuple[int, ...]
     title: str
+    port: str
+    name: str
     names: frozenset[str]
 
 
@@ -61,6 +64,19 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
     return replace(table, header=header, rows=rows)
 
 
+def tool_names(table: Table) -> tuple[str, ...]:
+    """What a recording may call each tool of an export of several, by name or serial number, else by port; () for other
+    tables."""
+    tools = _tools(table)
+    if len(tools) < 2:
+        return ()
+    shared = Counter(name for tool in tools for name in tool.names)
+    return tuple(
+        next((word for word in (tool.name, tool.port) if word and shared[_canonical(word)] == 1), tool.title)
+        for tool in tools
+    )
+
+
 def _tools(table: Table) -> list[_Tool]:
     plain = [_NUMBERED.sub("", name).strip() for name in table.header]
     starts = [index for index, name in enumerate(plain) if _PORT.match(name)]
@@ -80,7 +96,8 @@ def _tools(table: Table) -> list[_Tool]:
             cell = next((cells[start] for cells in table.rows if start < len(cells) and cells[start]), "")
             words = [plain[start], match["port"], match["name"], cell]
             title = plain[start] if match["port"] or match["name"] else cell or plain[start]
-            found.append(_Tool(tuple(own), printable(title), frozenset(_canonical(word) for word in words if word)))
+            names = frozenset(_canonical(word) for word in words if word)
+            found.append(_Tool(tuple(own), printable(title), match["port"] or cell, match["name"] or "", names))
     return found
 
 

@@ -15,10 +15,19 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError
 from neeco.files import read_json
-from neeco.ingest.columns import MATRIX, RecognisedColumns, recognise_pose, recognise_time, recognise_value, split_unit
+from neeco.ingest.columns import (
+    MATRIX,
+    PoseColumns,
+    RecognisedColumns,
+    recognise_pose,
+    recognise_time,
+    recognise_value,
+    split_unit,
+)
 from neeco.ingest.formats import IMAGES as IMAGE_STREAMS
 from neeco.ingest.formats import POSES, READINGS, Stream, format_of, read_table
 from neeco.ingest.lens import read_lens
+from neeco.ingest.ndi import tool_columns, tool_names
 from neeco.ingest.video import IMAGES
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".mpg", ".mpeg", ".m4v", ".webm", ".ts", ".wmv", ".mxf")
@@ -32,22 +41,27 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 @dataclass(frozen=True)
 class _Log:
     """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, where
-    the format says so."""
+    the format says so; tool: which of several in an NDI export."""
 
     file: str
     stream: str | None = None
     body: str | None = None
     hints: tuple[str, ...] = ()
+    tool: str | None = None
 
     @property
     def stem(self) -> str:
         """What it may be called."""
         if self.body is not None:
             return self.body
+        if self.tool is not None:
+            name = re.sub(r"[^A-Za-z0-9]+", "_", self.tool).strip("_")
+            return name if name[:1].isalpha() else f"tool_{name}"
         return Path(self.file).stem if self.stream is None else re.sub(r"[^A-Za-z0-9]+", "_", self.stream).strip("_")
 
     def lines(self) -> list[str]:
-        return [f"file: {_scalar(self.file)}", *([] if self.stream is None else [f"stream: {_scalar(self.stream)}"])]
+        given = [("file", self.file), ("stream", self.stream), ("tool", self.tool)]
+        return [f"{key}: {_scalar(value)}" for key, value in given if value is not None]
 
 
 @dataclass
@@ -186,6 +200,11 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     except NeecoError as error:
         found.others.append(" ".join(str(error).replace(str(file), name).split()))
         return
+    if tools := tool_names(table):
+        for tool in tools:
+            own = tool_columns(table, PoseColumns(file, tool=tool))
+            found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
+        return
     pose = recognise_pose(table.header)
     value, when = recognise_value(table.header)
     columns = [column for column in table.header if column]
@@ -240,8 +259,9 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
 
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
-    if log.stream is not None and columns.time and columns.position and columns.rotation:
-        return [*log.lines(), *_unit_lines(columns, {"length": columns.position})]  # recognised again when read
+    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
+    if log.stream is not None and columns.time and of_length and columns.rotation:
+        return [*log.lines(), *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     lines = [*log.lines(), *(["clock: em"] if log.stream is None else [])]
     given = [
         ("time", columns.time),
@@ -253,7 +273,6 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     lines += ["columns:", *known] if known else []
     lines += ["  good: [OK]"] if columns.state else []
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
-    of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
     return lines + _unit_lines(columns, {"length": of_length})
 
 

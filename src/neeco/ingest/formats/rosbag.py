@@ -115,6 +115,10 @@ class RosBag(RecordingFormat):
         rectified = plain.rpartition("/")[2].startswith("image_rect")
         return lens_of(f"{path}: {topic}", survey.lenses[topic], rectified)
 
+    def origin_s(self, path: Path) -> float:
+        """The moment that the times of its streams count from, s of the recorder's clock."""
+        return self._survey(path).origin * 1e-9
+
     def _survey(self, path: Path) -> Survey:
         self.require_package(path)
         from neeco.ingest.formats._bagsurvey import survey_of

@@ -1,0 +1,275 @@
+"""Sequences of the PLUS toolkit: the same poses and images from every layout, and one line for what is wrong."""
+
+from __future__ import annotations
+
+import json
+import zlib
+
+import numpy as np
+import pytest
+from plus_world import frame_fields, write_mha, write_nrrd
+
+from neeco.errors import NeecoError
+from neeco.ingest.columns import PoseColumns
+from neeco.ingest.formats import IMAGES, OTHER, POSES, format_of
+from neeco.ingest.logs import read_pose_log
+from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.template import write_template
+
+START = 12.5  # of PLUS's clock, s
+COUNT = 30
+TIMES = START + np.arange(COUNT) / 25
+
+
+@pytest.fixture
+def transforms(world):
+    fixed = np.tile(np.diag([0.2, 0.2, 0.2, 1.0]), (COUNT, 1, 1))
+    return {"StylusToTracker": world.poses(TIMES - START), "ImageToProbe": fixed}
+
+
+def film(channels=3):
+    return np.random.default_rng(7).integers(0, 256, (COUNT, 12, 16, channels), dtype=np.uint8)
+
+
+def mha(path, fields, images=None, **more):
+    """A MetaImage sequence; without images, of poses alone."""
+    shape, content = ((COUNT, 0, 0, 1), ()) if images is None else (images.shape, images)
+    return write_mha(path, fields, shape, content, **more)
+
+
+def nrrd(path, fields, images, **more):
+    return write_nrrd(path, fields, images.shape, images, **more)
+
+
+LAYOUTS = {
+    "whole.igs.mha": (mha, {}),
+    "packed.mha": (mha, {"compressed": True}),
+    "beside.mhd": (mha, {"beside": "beside.raw"}),
+    "zbeside.mhd": (mha, {"compressed": True, "beside": "beside.zraw"}),
+    "whole.nrrd": (nrrd, {}),
+    "packed.nrrd": (nrrd, {"compressed": True}),
+    "beside.nhdr": (nrrd, {"compressed": True, "beside": "beside.raw.gz"}),
+}
+
+
+def write(folder, name, fields, images):
+    writer, how = LAYOUTS[name]
+    return writer(folder / name, fields, images, **how)
+
+
+BESIDE = {"beside.mhd": "beside.raw", "zbeside.mhd": "beside.zraw", "beside.nhdr": "beside.raw.gz"}
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_poses_and_images_come_back_from_every_layout(world, transforms, name, channels):
+    images = film(channels)
+    path = write(world.folder, name, frame_fields(TIMES, transforms), images)
+    known = format_of(path)
+    kinds = {stream.name: (stream.kind, stream.count) for stream in known.streams(path)}
+    assert kinds == {"images": (IMAGES, 30), "StylusToTracker": (POSES, 30), "ImageToProbe": (OTHER, 30)}
+    assert all(stream.rate_hz == pytest.approx(25) for stream in known.streams(path))
+
+    log = read_pose_log(PoseColumns(path))
+    np.testing.assert_allclose(log.times, TIMES - START, atol=1e-7)
+    np.testing.assert_allclose(log.positions, world.positions(TIMES - START), atol=1e-6)
+    assert np.abs((log.quats * world.quats(TIMES - START)).sum(axis=1)).min() > 1 - 1e-9
+
+    video = known.open_images(path)
+    assert video.size == (16, 12)
+    np.testing.assert_allclose(video.times, TIMES - START, atol=1e-7)
+    for index, pixels in video.read([29, 3, 3, 17]):
+        np.testing.assert_array_equal(pixels, np.broadcast_to(images[index], (12, 16, 3)))
+    assert [index for index, _ in video.read([29, 3, 3, 17])] == [3, 17, 29]
+
+
+def test_frames_that_are_not_ok_are_left_out_and_noted(world, transforms):
+    statuses = {("StylusToTracker", frame): "MISSING" for frame in (4, 5, 9)}
+    path = mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms, statuses, bad_images=(0, 20)), film())
+    log = read_pose_log(PoseColumns(path))
+    kept = np.delete(np.arange(COUNT), [4, 5, 9])
+    first = TIMES[1]  # of the first image that can be used
+    np.testing.assert_allclose(log.times, TIMES[kept] - first, atol=1e-7)
+    assert any("StylusToTrackerTransformStatus is 'MISSING' (frames 4, 5, 9)" in note for note in log.notes)
+    video = format_of(path).open_images(path)
+    np.testing.assert_allclose(video.times, np.delete(TIMES, [0, 20]) - first, atol=1e-7)
+    assert "2 images are not OK" in video.notes[0]
+    index, pixels = next(iter(video.read([19])))
+    assert index == 19
+    np.testing.assert_array_equal(pixels, film()[21])
+
+
+def test_a_file_of_poses_alone_keeps_its_clock(world, transforms):
+    fields = frame_fields(TIMES, {"StylusToTracker": transforms["StylusToTracker"]})
+    path = mha(world.folder / "tracker.igs.mha", fields)
+    np.testing.assert_allclose(read_pose_log(PoseColumns(path)).times, TIMES, atol=1e-6)
+    with pytest.raises(NeecoError, match="0 streams of images"):
+        format_of(path).open_images(path)
+
+
+def test_a_transform_may_be_named_in_full(world, transforms):
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms))
+    log = read_pose_log(PoseColumns(path, stream="StylusToTrackerTransform"))
+    assert len(log.times) == COUNT
+    assert log.stated_in == "Tracker"
+
+
+@pytest.mark.parametrize(
+    ("stream", "message"),
+    [
+        ("ProbeToTracker", "holds no 'ProbeToTracker'; name one of StylusToTracker"),
+        ("ImageToProbe", "is fixed transform, not poses"),
+        ("images", "not poses"),
+    ],
+)
+def test_a_stream_that_holds_no_poses_is_refused(world, transforms, stream, message):
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film())
+    with pytest.raises(NeecoError, match=message):
+        read_pose_log(PoseColumns(path, stream=stream))
+
+
+def test_several_tools_must_be_named(world, transforms):
+    tools = {"StylusToTracker": transforms["StylusToTracker"], "ScopeToTracker": transforms["StylusToTracker"]}
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, tools), film())
+    with pytest.raises(NeecoError, match=r"name one as `stream` .*: ScopeToTracker, StylusToTracker"):
+        read_pose_log(PoseColumns(path))
+
+
+def test_a_template_of_a_sequence_is_complete(world, transforms):
+    tools = {**transforms, "ScopeToTracker": transforms["StylusToTracker"]}
+    path = mha(world.folder / "surgery.igs.mha", frame_fields(TIMES, tools), film())
+    text = write_template(path)
+    recording = read_recording(world.text(text, "recording.yaml"))
+    assert recording.video == path
+    (instrument,) = recording.instruments
+    assert instrument.poses.stream == "StylusToTracker"
+    assert recording.laparoscope.stream == "ScopeToTracker"
+    assert recording.laparoscope.clock == instrument.poses.clock == "video"
+    assert instrument.name == "Stylus"
+    assert "ImageToProbe" in text
+    assert len(read_pose_log(instrument.poses).times) == COUNT
+    assert recording.open().size == (16, 12)
+
+
+def changed(path, old, new):
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"16 12 1 30", b"16 12 1 31", "holds 30 images, its header speaks of 31"),
+        (b"16 12 1 30", b"16 12 1 29", "holds 30 images, its header speaks of 29"),
+        (b"16 12 1 30", b"99999 99999 1 30", "is beyond all measure"),
+        (b"16 12 1 30", b"16 12 1 999999999", "is beyond all measure"),
+        (b"16 12 1 30", b"16 12 3 30", "is no sequence of images"),
+        (b"16 12 1 30", b"16 twelve 1 30", "expected whole numbers"),
+        (b"16 12 1 30", b"-16 12 1 30", "expected whole numbers"),
+        (b"NumberOfChannels = 3", b"NumberOfChannels = 4", "has 4 channels"),
+        (b"MET_UCHAR", b"MET_FLOAT", "ElementType: is 'MET_FLOAT', and MET_UCHAR is read"),
+        (b"BinaryData = True", b"BinaryData = False", "BinaryData: is 'False'"),
+        (b"= LOCAL", b"= ../../etc/passwd", "is no file beside"),
+        (b"= LOCAL", b"= LIST", "'LIST' is no file beside"),
+        (b"domain list", b"list domain", "kinds: are not domain ... list"),
+        (b"ObjectType =", b"ObjectType ", "is no `Name = value`"),
+    ],
+)
+def test_a_header_that_cannot_be_is_refused_in_one_line(world, transforms, old, new, message):
+    path = changed(mha(world.folder / "a.igs.mha", frame_fields(TIMES, transforms), film()), old, new)
+    with pytest.raises(NeecoError, match=message) as caught:
+        format_of(path).open_images(path)
+    assert str(caught.value).startswith(str(path))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_truncated_and_damaged_images_are_refused(world, transforms):
+    fields = frame_fields(TIMES, transforms)
+    for name in LAYOUTS:
+        path = write(world.folder, name, fields, film())
+        data = world.folder / BESIDE.get(name, name)
+        whole = data.read_bytes()
+        data.write_bytes(whole[:-700])
+        with pytest.raises(NeecoError, match=r"speaks of|end early") as caught:
+            list(format_of(path).open_images(path).read(range(COUNT)))
+        assert len(str(caught.value).splitlines()) == 1
+        if name not in ("whole.igs.mha", "whole.nrrd", "beside.mhd"):
+            content = bytearray(whole)
+            content[-3000] ^= 0xFF
+            data.write_bytes(content)
+            with pytest.raises(NeecoError, match=r"damaged|end early"):
+                list(format_of(path).open_images(path).read(range(COUNT)))
+
+
+def test_a_compressed_bomb_is_refused_before_it_is_unpacked(world, transforms):
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms), film(), compressed=True)
+    changed(path, b"16 12 1 30", b"8000 8000 1 3000")
+    with pytest.raises(NeecoError, match="of which no 3000 images"):
+        list(format_of(path).open_images(path).read(range(COUNT)))
+    # and one whose header fits the little that it says, while far more comes out
+    content = path.read_bytes().replace(b"8000 8000 1 3000", b"16 12 1 30")
+    start = content.index(b"LOCAL\n") + 6
+    path.write_bytes(content[:start] + zlib.compress(bytes(50_000_000)))
+    with pytest.raises(NeecoError, match="more images than its header says"):
+        list(format_of(path).open_images(path).read(range(COUNT)))
+
+
+def test_a_file_without_transforms_says_so(world):
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, {}), film())
+    assert [stream.name for stream in format_of(path).streams(path)] == ["images"]
+    with pytest.raises(
+        NeecoError, match=r"a.mha: holds no transforms \(Seq_Frame0000_StylusToTrackerTransform\); name"
+    ):
+        read_pose_log(PoseColumns(path))
+    volume = mha(world.folder / "ct.mha", [], film())
+    with pytest.raises(NeecoError, match="no PLUS sequence"):
+        read_pose_log(PoseColumns(volume))
+
+
+def test_statuses_all_invalid_are_said(world, transforms):
+    statuses = {("StylusToTracker", frame): "INVALID" for frame in range(COUNT)}
+    path = mha(world.folder / "a.mha", frame_fields(TIMES, transforms, statuses), film())
+    with pytest.raises(NeecoError, match=r"StylusToTracker: no frame can be used: .*Status is 'INVALID'"):
+        read_pose_log(PoseColumns(path))
+    path = mha(world.folder / "b.mha", frame_fields(TIMES, transforms, bad_images=tuple(range(COUNT))), film())
+    with pytest.raises(NeecoError, match=r"0 of 30 images can be used \(30 images are not OK"):
+        format_of(path).open_images(path)
+
+
+def test_a_folder_lists_what_it_cannot_read(world, transforms):
+    mha(world.folder / "ct.mha", [], film())
+    mha(world.folder / "surgery.mha", frame_fields(TIMES, transforms), film())
+    text = write_template(world.folder)
+    assert "ct.mha: holds no fields of frames" in text
+    recording = read_recording(world.text(text, "recording.yaml"))
+    assert recording.video.name == "surgery.mha"
+    assert json.dumps(recording.instruments[0].poses.stream) == '"StylusToTracker"'
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_no_bytes_make_reading_raise(world, transforms, name):
+    path = write(world.folder, name, frame_fields(TIMES, transforms), film())
+    whole = path.read_bytes()
+    head = whole.find(b"Seq_Frame0001")
+    messages = []
+    known = format_of(path)
+    for seed in range(40):
+        pick = np.random.default_rng(seed)
+        content = bytearray(whole[: int(pick.integers(0, len(whole)))] if seed % 4 == 0 else whole)
+        within = len(content) if seed % 2 else head  # more of the damage where it does most
+        for place in pick.integers(0, max(min(within, len(content)), 1), min(1 + seed, len(content))):
+            content[place] = int(pick.integers(0, 256))
+        path.write_bytes(content)
+        for read in (
+            lambda: known.streams(path),
+            lambda: read_pose_log(PoseColumns(path, stream="StylusToTracker")),
+            lambda: list(known.open_images(path).read([0, 1])),
+        ):
+            try:
+                read()
+            except NeecoError as error:
+                messages.append(str(error))
+    assert messages
+    assert all(len(message.splitlines()) == 1 and str(world.folder) in message for message in messages)

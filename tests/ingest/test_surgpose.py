@@ -1,0 +1,122 @@
+"""A SurgPose trajectory becomes a recording by its folder alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from neeco.errors import NeecoError
+from neeco.ingest.columns import JointColumns, PoseColumns
+from neeco.ingest.formats import format_of
+from neeco.ingest.logs import read_pose_log, read_reading_log
+from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.template import write_template
+from tests.ingest.test_stereofile import LEFT, RIGHT, ini
+
+COUNT = 30
+TIMES = np.arange(COUNT) / 30
+
+
+@pytest.fixture
+def trajectory(world):
+    """The published layout: two arms, six joints each, two videos, a calibration, labels."""
+    folder = world.folder / "000003"
+    (folder / "regular").mkdir(parents=True)
+    poses = world.poses(TIMES)
+    arms = {"PSM1": 1.0, "PSM3": 0.5}
+    cp = {
+        str(i): {
+            arm: {"R": pose[:3, :3].tolist(), "t": (pose[:3, 3] * scale / 1000).tolist()} for arm, scale in arms.items()
+        }
+        for i, pose in enumerate(poses)
+    }
+    jp = {str(i): {arm: [0.1, 0.2, 0.12, 0.3, float(world.jaw(t)), -0.2] for arm in arms} for i, t in enumerate(TIMES)}
+    for name, document in (("api_cp_data", cp), ("api_jp_data", jp), ("keypoints_left", {"0": {"1": [3, 4]}})):
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
+    for side in ("left", "right"):
+        world.video(f"000003/regular/{side}_video.mp4", COUNT, lambda i: round(i * 1000 / 30))
+    ini(folder)
+    return folder
+
+
+def test_poses_and_joints_come_back(world, trajectory):
+    log = read_pose_log(PoseColumns(trajectory, stream="PSM1"))
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
+    np.testing.assert_allclose(log.positions, world.positions(TIMES), atol=1e-9)
+    assert np.abs((log.quats * world.quats(TIMES)).sum(axis=1)).min() > 1 - 1e-12
+    other = read_pose_log(PoseColumns(trajectory, stream="PSM3"))
+    np.testing.assert_allclose(other.positions, world.positions(TIMES) / 2, atol=1e-9)
+    joints = JointColumns(trajectory, "video", value="wrist_pitch_rad", stream="PSM1_joints")
+    np.testing.assert_allclose(read_reading_log(joints).values, world.jaw(TIMES), atol=1e-12)
+
+
+def test_the_lens_is_the_camera_s(trajectory):
+    known = format_of(trajectory)
+    left, right = (known.lens(trajectory, f"regular/{side}_video.mp4") for side in ("left", "right"))
+    assert left.intrinsics == (LEFT[0, 0], LEFT[1, 1], LEFT[0, 2] + 0.5, LEFT[1, 2] + 0.5)
+    assert right.fl_x == RIGHT[0, 0]
+
+
+def test_a_template_of_the_folder_is_complete(world, trajectory):
+    recording = read_recording(world.text(write_template(trajectory), "recording.yaml"))
+    assert (recording.video, recording.stream) == (trajectory, "regular/left_video.mp4")
+    assert [instrument.name for instrument in recording.instruments] == ["PSM1", "PSM3"]
+    for instrument in recording.instruments:
+        assert instrument.poses.clock == "video"
+        assert set(instrument.joints) == {"wrist_pitch", "wrist_yaw"}
+        assert len(read_pose_log(instrument.poses).times) == COUNT
+        for joint in instrument.joints.values():
+            assert len(read_reading_log(joint).times) == COUNT
+    assert len(recording.open().times) == COUNT
+    assert recording.read_lens()[0].size == (640, 480)
+
+
+def test_a_video_of_another_length_is_refused(world, trajectory):
+    world.video("000003/regular/left_video.mp4", 12, lambda i: round(i * 1000 / 30))
+    with pytest.raises(NeecoError, match=r"left_video.mp4: is 0.4 s long, its states 1.0 s"):
+        format_of(trajectory).open_images(trajectory, "regular/left_video.mp4")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("api_cp_data.yaml", "", "expected states by frame"),
+        ("api_cp_data.yaml", "[1, 2]", "expected states by frame"),
+        ("api_cp_data.yaml", "'0': 3", "frame 0: expected the state of each arm"),
+        ("api_cp_data.yaml", "'0': {PSM1: {R: [[1, 0, 0]], t: [0, 0, 0]}}", "frame 0: 'PSM1': expected R"),
+        ("api_cp_data.yaml", "'0': {PSM1: {R: eye, t: [0, 0, 0]}}", "frame 0: 'PSM1': expected R"),
+        ("api_cp_data.yaml", "first: {PSM1: 1}", "'first' is no number of a frame"),
+        ("api_jp_data.yaml", "'0': {PSM1: [1, 2]}", "expected six or seven joints"),
+        ("api_jp_data.yaml", "'0': {}", "holds no arm's states"),
+        ("api_jp_data.yaml", "'0': {PSM1: [1, 2, 3", "not valid YAML"),
+    ],
+)
+def test_what_is_no_trajectory_is_refused_in_one_line(trajectory, name, text, message):
+    (trajectory / name).write_text(text, encoding="utf-8")
+    with pytest.raises(NeecoError, match=message) as caught:
+        format_of(trajectory).streams(trajectory)
+    assert str(caught.value).startswith(str(trajectory / name))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_no_bytes_make_reading_raise(trajectory):
+    known = format_of(trajectory)
+    messages = []
+    for seed in range(30):
+        pick = np.random.default_rng(seed)
+        path = trajectory / str(pick.choice(["api_cp_data.yaml", "api_jp_data.yaml", "StereoCalibrationDVRK.ini"]))
+        whole = path.read_bytes()
+        content = bytearray(whole[: int(pick.integers(0, len(whole)))] if seed % 4 == 0 else whole)
+        for place in pick.integers(0, max(len(content), 1), min(1 + seed, len(content))):
+            content[place] = int(pick.integers(0, 256))
+        path.write_bytes(content)
+        try:
+            known.streams(trajectory)
+            known.lens(trajectory, "regular/left_video.mp4")
+            read_pose_log(PoseColumns(trajectory, stream="PSM1"))
+        except NeecoError as error:
+            messages.append(str(error))
+        path.write_bytes(whole)
+    assert messages
+    assert all(len(message.splitlines()) == 1 and str(trajectory) in message for message in messages)
