@@ -178,6 +178,21 @@ def test_a_bag_alone_is_enough_where_it_holds_one_of_each(tmp_path: Path) -> Non
     np.testing.assert_allclose(states["instrument"][0][20, :3, 3], 1000 * shaft(0.8), atol=0.01)
 
 
+def test_names_in_a_bag_are_names_and_no_more(tmp_path: Path) -> None:
+    """Neither keys of a recording.yaml nor what a terminal obeys."""
+    bad = "ECM\nsettings: {sfm_features: 1}\x1b[2J"
+    with BagWriter(tmp_path, "recording.bag") as bag:
+        for time in np.arange(40) / 25:
+            bag.pose("/tool/pose", time, shaft(time), [1, 0, 0, 0], bad)
+            bag.tf(time, shaft(time), [1, 0, 0, 0], bad, f"child{bad}")
+            bag.joints("/tool/joint_states", time, **{f"jaw{bad}": time})
+            bag.image("/cam/image_raw", time, np.full((*SIZE[::-1], 3), 9, np.uint8), "bgr8")
+    text = write_template(bag.path)
+    assert "settings" not in yaml.safe_load(text)
+    said = refusal(lambda: read_table(bag.path, "tf:nothing"))
+    assert all(letter.isprintable() or letter == "\n" for letter in text + said)
+
+
 # --- what cannot be read
 
 

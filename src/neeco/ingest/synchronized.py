@@ -40,8 +40,8 @@ class SynchronizedRecording:
         self.times = self.video.times  # [V] s, every frame
         logs: list[PoseLog | ReadingLog] = [*self.poses.values(), *([self.scope] if self.scope else [])]
         logs += [log for joints in self.joints.values() for log in joints.values()]
-        told = [*recording.notes, *(note for log in logs for note in log.notes), *self.video.notes]
-        self.notes = list(dict.fromkeys(told))  # two joints may be of one stream
+        found = [*recording.notes, *(note for log in logs for note in log.notes), *self.video.notes]
+        self.notes = list(dict.fromkeys(found))  # two joints may be of one stream
         for item in recording.instruments:
             if item.poses is None:
                 self.note(f"instrument {item.name!r} was not tracked: it is left out of the capture's states")

@@ -154,8 +154,8 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise NeecoError(f"{path}: may not be read; allow it") from error
     # damaged bags make rosbags raise nearly anything: struct.error, KeyError, AssertionError, OverflowError ...
     except Exception as error:
-        said = plain(" ".join(_NESTED.sub(r"\1", str(error)).split())).rstrip(".")
-        reason = said or "its records do not fit together"
+        words = plain(" ".join(_NESTED.sub(r"\1", str(error)).split())).rstrip(".")
+        reason = words or "its records do not fit together"
         remedy = _REMEDIES["" if path.is_dir() else path.suffix.lower()]
         raise NeecoError(f"{path}: is cut short or damaged, or no bag ({reason}); {remedy}") from error
 

@@ -26,8 +26,9 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     parents = {parent for name in known for parent in survey.poses[f"tf:{name}"].frames}
     for name, there in ((child, known | parents if word else known), (frame, known | parents)):
         if name not in there and (word or name is child):
-            listed = printable(", ".join(sorted(there)), 300).strip("'") or "none"
-            raise NeecoError(f"{where}: there is no transform of {printable(name)}; name one of {listed}")
+            listed = printable(", ".join(sorted(there)), 300).strip("'")
+            remedy = f"name one of {listed}" if there else "the bag has no tf; name a topic"
+            raise NeecoError(f"{where}: there is no transform of {printable(name)}; {remedy}")
     ups, downs = (_to_root(survey, where, name) for name in (child, frame))
     while ups and downs and ups[-1] == downs[-1]:
         ups.pop()
