@@ -161,6 +161,7 @@ _QUATERNIONS = _choices("wxyz", True, "orientation_", "rotation_", "quaternion_"
 _QUATERNIONS += [(prefixed, ["q0", "qx", "qy", "qz"]) for prefixed in (False, True)] + _choices("wxyz", False, "")
 _ROTATION_VECTORS = _choices("xyz", True, "rotvec_", "rotation_vector_", "rodrigues_", "rv", "rvec_", "rotvec", "rvec")
 _EULER_ANGLES = (["roll", "pitch", "yaw"], ["rx", "ry", "rz"], ["alpha", "beta", "gamma"])
+_POSE_WORDS = ("pose", "cp", "tcp", "ee", "eef", "tip", "measured", "state")  # of columns, beside their body's name
 _ROS = re.compile(r"(^|[._/])(pose|transform|transforms\d*)[._/]")
 
 
@@ -207,6 +208,28 @@ def recognise_pose(header: Sequence[str]) -> RecognisedColumns:
     return replace(
         when, position=position, rotation=rotation, form=form, state=state, length_unit=unit, unclear=unclear
     )
+
+
+def pose_bodies(header: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The columns of every body that has a position, by what the body may be called: what tells the columns' prefixes
+    apart, or all that is before `pose` and the like; "" for one body without a prefix."""
+    plain = _by_plain_name(header, "length")
+    for prefixed, names in _POSITIONS:
+        if all(name in plain for name in names):
+            return {"": tuple(header)}
+        ending = "_" + names[0]
+        prefixes = [name.removesuffix(ending) for name in plain if prefixed and name.endswith(ending)]
+        prefixes = [prefix for prefix in prefixes if all(f"{prefix}_{name}" in plain for name in names)]
+        if not prefixes:
+            continue
+        words = {prefix: prefix.split("_") for prefix in prefixes}
+        shared = set.intersection(*map(set, words.values())) if len(words) > 1 else set(_POSE_WORDS)
+        found = {}
+        for prefix in prefixes:
+            name = "_".join(word for word in words[prefix] if word not in shared) or prefix
+            found[name] = tuple(held for key, held in plain.items() if key.startswith(prefix + "_"))
+        return found
+    return {}
 
 
 def recognise_value(header: Sequence[str]) -> tuple[str | None, RecognisedColumns]:

@@ -22,6 +22,7 @@ from neeco.raster.rotations import rotation_error
 
 MIN_SAMPLES = 4  # of a usable log
 WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
+_FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 LISTED_STATES = 8  # states that drop rows and are named in the notes
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
@@ -100,6 +101,11 @@ class Rows:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
+    if table.asks_frame and table.frame is None and source.frame is None:
+        raise NeecoError(
+            f"{table.where}: frame: nothing says what its poses are stated in; say so in the recording: frame: "
+            f"{named.CAMERA}, or frame: {named.BASE} (a robot's base or a tracker)"
+        )
     found = named.recognise_pose(table.header)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
@@ -151,7 +157,7 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
         raise _unclear(table, found, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
-    implied = found.length_unit if position == found.position else None
+    implied = (found if position == found.position else named.recognise_pose((*position, *rotation))).length_unit
     scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
@@ -299,7 +305,8 @@ def _rotation_columns(table: Table, source: PoseColumns, found: RecognisedColumn
 def _unclear(table: Table, found: RecognisedColumns, what: str, expected: str) -> NeecoError:
     reason = found.unclear.get(what) or (found.unclear.get("quaternion") if what == "rotation" else None)
     problem = (
-        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns"
+        f"no {expected} found among {', '.join(table.header[:12])[:120]!r}; name them in the recording under columns: "
+        + ("position" if what == "position" else _FORMS)
     )
     return NeecoError(f"{table.where}: header: {f'{what}: {reason}' if reason else problem}")
 

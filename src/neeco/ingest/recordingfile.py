@@ -39,6 +39,7 @@ def read_recording(path: Path) -> Recording:
     laparoscope = top.value.get("laparoscope")
     scope = None if laparoscope is None else _pose_columns(top, "laparoscope", laparoscope, video)
     sync, notes = _sync(top, clocks_of(instruments, scope))
+    _check_one_clock(path, video, stream, instruments, scope)
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
         top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
@@ -272,6 +273,24 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
         found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints))))
     return tuple(found)
+
+
+def _check_one_clock(
+    file: Path, video: Path | None, stream: str | None, instruments: Sequence[InstrumentLogs], scope: PoseColumns | None
+) -> None:
+    """Raise NeecoError when a log is of another part of the images' file than they are, as of another episode."""
+    known = None if video is None else format_of(video)
+    logs: list[PoseColumns | JointColumns | None] = [scope]
+    for instrument in instruments:
+        logs += [instrument.poses, *instrument.joints.values()]
+    for log in logs:
+        if known is None or video is None or log is None or log.path != video or log.clock != VIDEO_CLOCK:
+            continue
+        own, images = known.clock(video, log.stream), known.clock(video, stream)
+        if own and images and own != images:
+            raise NeecoError(
+                f"{file}: stream: {printable(log.stream)} is of {own}, the images of {images}; name the same in both"
+            )
 
 
 def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:

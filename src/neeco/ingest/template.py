@@ -40,13 +40,14 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 
 @dataclass(frozen=True)
 class _Log:
-    """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, where
-    the format says so; tool: which of several in an NDI export."""
+    """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, asks:
+    keys that nothing answers, where the format says so; tool: which of several in an NDI export."""
 
     file: str
     stream: str | None = None
     body: str | None = None
     hints: tuple[str, ...] = ()
+    asks: tuple[str, ...] = ()
     tool: str | None = None
 
     @property
@@ -166,7 +167,7 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.others.append(" ".join(str(error).replace(str(path), name).split()))
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream.name, stream.body, stream.hints)
+        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks)
         used = stream.offered and stream.count > 0
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
@@ -182,7 +183,9 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
     table = read_table(path, stream.name)
     when = recognise_time(table.header)
     if stream.kind == POSES:
-        found.poses.append((log, recognise_pose(table.header)))
+        header = table.header if stream.columns is None else (*(when.time or ()), *stream.columns)
+        found.poses.append((log, recognise_pose(header)))
+        found.joints += [(log, when, column, joint) for joint, column in stream.joints or ()]
         return
     angles = [column for column in table.header if split_unit(column, "angle")[1]]  # every angle is a joint
     named = [(None, column) for column in angles] if stream.joints is None else stream.joints
@@ -270,8 +273,10 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
         ("state", (columns.state,) if columns.state else None),
     ]
     known = [f"  {key}: {_list(names)}" for key, names in given if names]
+    lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
     lines += ["columns:", *known] if known else []
     lines += ["  good: [OK]"] if columns.state else []
+    lines += [f"  # {ask.strip()}" for ask in log.asks if ask.startswith(" ")]
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 

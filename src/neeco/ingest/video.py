@@ -26,16 +26,17 @@ def require_installed(name: str) -> None:
         raise NeecoError("ingest: needs PyAV and pycolmap; pip install 'neeco[ingest]'")
 
 
-def open_video(path: Path, fps: float | None = None) -> VideoSource:
-    """A video file. Its frames are decoded once to find those that can be, with their own times (`fps`: overrides
-    them). What is damaged is left out and noted; raises NeecoError when nothing can be read."""
+def open_video(path: Path, fps: float | None = None, part: tuple[float, float] | None = None) -> VideoSource:
+    """A video file, or the part of it from one time s to another, without it. Its frames are decoded once to find
+    those that can be, with their own times (`fps`: overrides them). What is damaged is left out and noted; raises
+    NeecoError when nothing can be read."""
     path = Path(path)
     if not path.is_file():
         raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
-    scan = _Scan(path).run()
+    scan = _Scan(path, part=part).run()
     if scan.failure or scan.corrupt:
         # decoding frames in parallel, which of the damaged ones are given up differs from run to run
-        scan = _Scan(path, threads="SLICE").run()
+        scan = _Scan(path, threads="SLICE", part=part).run()
     return scan.finish(fps)
 
 
@@ -92,10 +93,11 @@ class _Video(VideoSource):
     stamps: tuple[int, ...]  # of each frame, in the stream's time base; or its number where the stream has no stamps
     numbered: bool
     threads: str
+    part: tuple[float, float] | None = None
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
-        for number, frame in enumerate(_Scan(self.path, self.threads).decoded()):
+        for number, frame in enumerate(_Scan(self.path, self.threads, self.part).decoded()):
             if not wanted:
                 return
             index = wanted.pop(number if self.numbered else frame.pts, None)
@@ -111,6 +113,7 @@ class _Scan:
 
     path: Path
     threads: str = "AUTO"
+    part: tuple[float, float] | None = None
     stamps: list[int | None] = field(default_factory=list)
     size: tuple[int, int] | None = None
     rate: float | None = None
@@ -140,6 +143,9 @@ class _Scan:
             self.promised = int(stream.frames or 0)
             self.rate = float(stream.average_rate) if stream.average_rate else None
             self.time_base = float(stream.time_base) if stream.time_base else None
+            first, last = self._bounds(stream)
+            if first is not None:
+                container.seek(first, stream=stream)  # to the key frame before it
             packets = container.demux(stream)
             while True:
                 try:
@@ -154,10 +160,24 @@ class _Scan:
                     self.corrupt += 1
                     continue
                 for frame in frames:
+                    if first is not None and (frame.pts is None or frame.pts < first):
+                        continue
+                    if last is not None and frame.pts is not None and frame.pts >= last:
+                        return
                     if frame.is_corrupt:
                         self.corrupt += 1
                     else:
                         yield frame
+
+    def _bounds(self, stream: Any) -> tuple[int | None, int | None]:
+        """The part's first stamp and the one that ends it, in the stream's time base: half a frame early, as times in
+        other files are rounded."""
+        if self.part is None or not self.time_base:
+            return None, None
+        early = 0.5 / self.rate if self.rate else 0.0
+        begin = stream.start_time or 0
+        first, last = (begin + round((time - early) / self.time_base) for time in self.part)
+        return first, last
 
     def run(self) -> _Scan:
         """Decode all frames. Raises NeecoError when the file cannot be opened or its frames differ in size."""
@@ -184,7 +204,7 @@ class _Scan:
                 times = np.arange(len(order)) / fps
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads)
+            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads, self.part)
         rate = fps or self.rate
         if not rate:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
@@ -192,14 +212,15 @@ class _Scan:
             notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
         count = len(self.stamps)
         times = np.arange(count) / rate
-        return _Video(self.path, self.size, tuple(notes), times, tuple(range(count)), True, self.threads)
+        numbers = tuple(range(count))
+        return _Video(self.path, self.size, tuple(notes), times, numbers, True, self.threads, self.part)
 
     def _notes(self) -> list[str]:
         notes, read = [], len(self.stamps)
         if self.failure or self.corrupt:
             what = f"{self.failure or 'corrupt frames'}; {read} frames could be read, the others are left out"
             notes.append(f"{self.path.name}: is damaged: {what}")
-        elif self.promised > read:
+        elif self.promised > read and self.part is None:
             notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
         if self.interlaced:
             notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")

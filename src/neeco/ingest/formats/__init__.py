@@ -37,7 +37,7 @@ class Table:
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
     (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
     stated in, CAMERA or BASE, where the file says it, stated_in: by the file's own name; notes: what reading it changed
-    or left out, in words."""
+    or left out, in words; asks_frame: must the recording say the frame where the file does not?"""
 
     path: Path
     header: tuple[str, ...]
@@ -49,6 +49,7 @@ class Table:
     frame: str | None = None
     stated_in: str | None = None
     notes: tuple[str, ...] = ()
+    asks_frame: bool = False
 
     @property
     def where(self) -> str:
@@ -72,7 +73,9 @@ class Stream:
     type: the format's own word for it; count: of its samples; rate_hz: None where nobody knows.
 
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
-    format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body.
+    format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
+    columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
+    as lines for the user to choose from, those of its columns indented.
     """
 
     name: str
@@ -84,6 +87,8 @@ class Stream:
     body: str | None = None
     joints: tuple[tuple[str, str], ...] | None = None
     hints: tuple[str, ...] = ()
+    columns: tuple[str, ...] | None = None
+    asks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -134,6 +139,10 @@ class RecordingFormat(ABC):
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         """Its images, with times on the clock that its tables share."""
         raise NeecoError(f"{path}: {self.format} holds no images; name a video or a folder of images")
+
+    def clock(self, path: Path, stream: str | None) -> str:
+        """What the times of a stream count from: streams of the same share a clock."""
+        return ""
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         """The lens that the images of `stream` were taken through, where the file says it."""

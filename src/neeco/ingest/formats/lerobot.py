@@ -1,0 +1,366 @@
+"""LeRobot data sets, versions 2.0, 2.1 and 3.0: an episode's states as tables, and its cameras' images.
+
+A stream is a feature of an episode: `episode 3/observation.state`. Row i of an episode belongs to its image i: both
+have the row's `timestamp`, in s from the episode's first. Nothing in the format says the unit of a length, the order of
+a quaternion or the frame that poses are stated in; where the columns' names do not, the recording must.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from neeco.capture.documents import printable
+from neeco.errors import NeecoError
+from neeco.ingest.columns import BASE, CAMERA, pose_bodies, recognise_pose
+from neeco.ingest.formats import (
+    IMAGES,
+    OTHER,
+    POSES,
+    READINGS,
+    RecordingFormat,
+    Stream,
+    Table,
+    VideoSource,
+    choose_stream,
+)
+
+if TYPE_CHECKING:
+    from neeco.ingest.formats._lerobotfiles import DataSet, Episode, Feature
+
+TIME = "timestamp_s"
+LARGEST_IMAGE = 90_000_000  # px, as for files of images
+IMAGES_AT_ONCE = 16  # of those that stand in Parquet
+UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
+_NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
+_OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+_JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
+_CAMERA_FRAME = re.compile(r"(^|[_.\-/])(in_)?(camera|cam|ecm|endoscope)(_frame)?([_.\-/]|$)", re.IGNORECASE)
+_BASE_FRAME = re.compile(r"(^|[_.\-/])(in_)?(robot_)?base(_frame)?([_.\-/]|$)", re.IGNORECASE)
+
+
+class LeRobot(RecordingFormat):
+    """Folders with `meta/info.json`."""
+
+    format = "LeRobot data set"
+    holds = "poses, readings and images of an episode: folders of versions 2.0, 2.1 and 3.0 (meta/info.json)"
+    package = "pyarrow"
+    extra = "lerobot"
+
+    def claims(self, path: Path) -> bool:
+        try:
+            with (path / "meta" / "info.json").open("rb") as file:
+                return b'"codebase_version"' in file.read(2**20)
+        except (OSError, ValueError):
+            return False
+
+    def streams(self, path: Path) -> tuple[Stream, ...]:
+        """Those of the first episode; all others have the same."""
+        data = self._data_set(path)
+        count, first, last = data.episodes()
+        found = self._episode_streams(data, data.episode(first))
+        if count > 1:
+            found = (*found, Stream(f"episodes {first} to {last}", OTHER, "the same streams in each", count))
+        return found
+
+    def read(self, path: Path, stream: str | None = None) -> Table:
+        data = self._data_set(path)
+        episode, key = self._chosen(data, stream, (POSES, READINGS))
+        feature, name = data.features[key], f"episode {episode.number}/{key}"
+        times, order, notes = _times(data, episode)
+        from neeco.ingest.formats._lerobotfiles import ParquetFile
+
+        values = ParquetFile(episode.data).read([key], episode.number)[key]
+        if values[0].size != len(feature.names):
+            raise NeecoError(
+                f"{episode.data}: {key}: has {values[0].size} numbers a row, meta/info.json says {len(feature.names)}; "
+                "download the data set again"
+            )
+        rows = np.column_stack([times, values.reshape(len(values), -1)[order].astype(np.float64)])
+        return Table(
+            path, (TIME, *feature.names), rows, np.arange(len(rows)), stream=name, record="frame",
+            frame=_frame_of(key, feature.names), asks_frame=True, notes=notes,
+        )  # fmt: skip
+
+    def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
+        data = self._data_set(path)
+        episode, key = self._chosen(data, stream, (IMAGES,))
+        times, order, notes = _times(data, episode)
+        if data.features[key].dtype == "image":
+            return _open_stored(data, episode, key, times, order, notes)
+        from neeco.ingest.video import open_video
+
+        film = episode.films[key]
+        part = None if film.start is None or film.end is None else (film.start, film.end)
+        video = open_video(film.file, part=part)
+        where = f"{film.file}: episode {episode.number}"
+        numbers = _frame_numbers(video)
+        damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
+        usable = numbers < len(times)
+        if numbers[-1] >= len(times) + (len(times) > 1) or (len(numbers) < len(times) - 1 and not damaged):
+            raise NeecoError(
+                f"{where}: has {numbers[-1] + 1} images for {len(times)} states; they do not belong together: download "
+                "the data set again, or name another episode"
+            )
+        if len(numbers) != len(times) and not damaged:
+            notes = (*notes, f"{film.file.name}: has {len(numbers)} images for {len(times)} states; the last is unused")
+        frames = tuple(np.flatnonzero(usable).tolist())
+        return _Episode(video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames)
+
+    def clock(self, path: Path, stream: str | None) -> str:
+        match = None if stream is None else _NAME.fullmatch(stream)
+        return "" if match is None else f"episode {int(match[1])}"
+
+    def _data_set(self, path: Path) -> DataSet:
+        self.require_package(path)
+        from neeco.ingest.formats._lerobotfiles import read_data_set
+
+        return read_data_set(path)
+
+    def _chosen(self, data: DataSet, stream: str | None, kinds: Sequence[str]) -> tuple[Episode, str]:
+        """The episode and the feature that a stream names; the only ones there are where none is named."""
+        match = None if stream is None else _NAME.fullmatch(stream)
+        if match is None:
+            count, first, last = data.episodes()
+            if stream is None and count > 1:
+                examples = ", ".join(
+                    f"episode {first}/{key}" for key, held in data.features.items() if _kind(held) in kinds
+                )
+                raise NeecoError(
+                    f"{data.path}: stream: missing, and there are episodes {first} to {last}; name one, as in "
+                    f"{examples[:300]}"
+                )
+            chosen = choose_stream(data.path, self.streams(data.path), stream, kinds).name
+            match = _NAME.fullmatch(chosen)
+            assert match is not None
+        number, key = int(match[1]), match[2]
+        feature = data.features.get(key)
+        fitting = [f"episode {number}/{name}" for name, other in data.features.items() if _kind(other) in kinds]
+        if feature is None or _kind(feature) not in kinds:
+            what = "holds no" if feature is None else f"is {feature.dtype}, no {' or '.join(kinds)}:"
+            listed = ", ".join(fitting)[:400] or "none"
+            raise NeecoError(f"{data.path}: stream: {what} {printable(key)}; name one of {listed}")
+        return data.episode(number), key
+
+    def _episode_streams(self, data: DataSet, episode: Episode) -> tuple[Stream, ...]:
+        found = []
+        for key in sorted(data.features, key=_camera_order):
+            feature, name = data.features[key], f"episode {episode.number}/{key}"
+            kind = _kind(feature)
+            if kind == IMAGES:
+                size = "x".join(map(str, feature.shape))
+                found.append(Stream(name, IMAGES, f"{feature.dtype} {size}", episode.length, data.fps))
+        for key, feature in data.features.items():
+            name, kind = f"episode {episode.number}/{key}", _kind(feature)
+            if kind == READINGS:
+                found += self._table_streams(data, feature, name, episode)
+            elif kind == OTHER and key not in _OWN:
+                found.append(Stream(name, OTHER, f"{feature.dtype} {list(feature.shape)}", episode.length, data.fps))
+        return tuple(found)
+
+    def _table_streams(self, data: DataSet, feature: Feature, name: str, episode: Episode) -> list[Stream]:
+        """A stream for every body that the names of a feature's columns tell apart."""
+        title = f"{feature.dtype} of {len(feature.names)}"
+        plain = Stream(name, READINGS, title, episode.length, data.fps, offered=False)
+        if not feature.key.startswith(("observation", "state")):  # an action is what was wanted, not what was measured
+            return [plain]
+        bodies = pose_bodies(feature.names)
+        found = []
+        for body, columns in bodies.items():
+            rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
+            own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
+            joints = tuple((_joint_name(column, body), column) for column in own)
+            poses = recognise_pose(columns)
+            if poses.position is None:
+                continue
+            asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
+            found.append(replace(plain, kind=POSES, offered=True, body=body or None, joints=joints, columns=columns,
+                                 asks=(*_frame_asks(feature.key, columns), *asks)))  # fmt: skip
+        if found:
+            return found
+        asks = _rotation_asks(self._columns(episode, feature, feature.names), feature.names)
+        if asks:
+            asks = (*_frame_asks(feature.key, feature.names), *asks)
+            return [replace(plain, kind=POSES, offered=True, asks=asks, joints=(), columns=())]
+        return [plain]
+
+    def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
+        from neeco.ingest.formats._lerobotfiles import ParquetFile
+
+        values = ParquetFile(episode.data).read([feature.key], episode.number)[feature.key]
+        values = values.reshape(len(values), -1)
+        if values.shape[1] != len(feature.names):
+            return np.zeros((len(values), len(columns)))
+        return values[:, [feature.names.index(column) for column in columns]]
+
+
+@dataclass(frozen=True)
+class _Episode(VideoSource):
+    """The frames of a video that have states. frames: which, of the video's."""
+
+    video: VideoSource
+    frames: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        back = {self.frames[int(index)]: int(index) for index in indices}
+        for number, pixels in self.video.read(list(back)):
+            yield back[number], pixels
+
+
+@dataclass(frozen=True)
+class _Stored(VideoSource):
+    """Images that stand in the Parquet file, as PNG or JPEG. rows: of the episode, in its file, of each image."""
+
+    key: str
+    episode: int
+    rows: tuple[int, ...]
+
+    def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        wanted = {self.rows[int(index)]: int(index) for index in indices}
+        order = []
+        for row, cell in _cells(self.path, self.key, self.episode):
+            if row in wanted:
+                order.append(wanted[row])
+                yield wanted[row], _decoded(f"{self.path}: {self.key}: frame {wanted[row]}", cell, self.size)
+            if len(order) == len(wanted):
+                return
+        raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
+
+
+def _open_stored(
+    data: DataSet, episode: Episode, key: str, times: np.ndarray, order: np.ndarray, notes: tuple[str, ...]
+) -> VideoSource:
+    where = f"{episode.data}: {key}"
+    first = next(iter(_cells(episode.data, key, episode.number)), None)
+    if first is None:
+        raise NeecoError(f"{where}: holds no images of episode {episode.number}; download it again")
+    pixels = _decoded(f"{where}: frame 0", first[1], None)
+    size = (pixels.shape[1], pixels.shape[0])
+    return _Stored(episode.data, size, notes, times, key, episode.number, tuple(order.tolist()))
+
+
+def _cells(file: Path, key: str, episode: int) -> Iterator[tuple[int, Any]]:
+    """(row of the episode, bytes) of a column of images."""
+    import pyarrow
+
+    from neeco.ingest.formats._lerobotfiles import ParquetFile
+
+    row = 0
+    for part in ParquetFile(file).batches(["episode_index", key], episode, IMAGES_AT_ONCE):
+        column = part[key]
+        if pyarrow.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0:
+            column = column.field("bytes")
+        if not (pyarrow.types.is_binary(column.type) or pyarrow.types.is_large_binary(column.type)):
+            raise NeecoError(f"{file}: {key}: holds {printable(str(column.type))}, no images; name another feature")
+        for cell in column:
+            yield row, cell.as_py()
+            row += 1
+
+
+def _decoded(where: str, cell: bytes | None, size: tuple[int, int] | None) -> np.ndarray:
+    if cell is None:
+        raise NeecoError(f"{where}: has no image in it; write the data set with its images")
+    try:
+        with Image.open(BytesIO(cell), formats=("PNG", "JPEG")) as image:
+            if image.size[0] * image.size[1] > LARGEST_IMAGE:
+                raise NeecoError(f"{where}: has {image.size[0]}x{image.size[1]} pixels; make it smaller")
+            pixels = np.array(image.convert("RGB"))
+    except NeecoError:
+        raise
+    except Exception as error:  # Pillow's decoders raise nearly anything
+        raise NeecoError(f"{where}: cannot be decoded; download the episode again") from error
+    if size is not None and pixels.shape[1::-1] != size:
+        raise NeecoError(f"{where}: is {pixels.shape[1]}x{pixels.shape[0]}, the first {size[0]}x{size[1]}")
+    return pixels
+
+
+def _times(data: DataSet, episode: Episode) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Times [R] s of an episode's rows from the first on, which rows of its file these are, and what is odd of them."""
+    from neeco.ingest.formats._lerobotfiles import ParquetFile
+
+    table = ParquetFile(episode.data).read(["timestamp", "frame_index"], episode.number)
+    frames, stamps = table["frame_index"].reshape(-1), table["timestamp"].reshape(-1).astype(np.float64)
+    if len(frames) != episode.length:
+        raise NeecoError(
+            f"{episode.data}: has {len(frames)} rows of episode {episode.number}, meta says {episode.length}; download "
+            "the data set again"
+        )
+    order = np.argsort(frames, kind="stable")
+    frames, stamps = frames[order], stamps[order]
+    if not np.array_equal(frames, np.arange(len(frames))):
+        raise NeecoError(f"{episode.data}: frame_index: does not count from 0 in episode {episode.number}; repair it")
+    steps = np.diff(stamps)
+    if np.isfinite(stamps).all() and (steps > 0).all():
+        return stamps - stamps[0], order, ()
+    note = f"episode {episode.number}: its timestamps do not increase; taken as {data.fps:g} a second"
+    return frames / data.fps, order, (f"{data.path.name}: {note}",)
+
+
+def _frame_numbers(video: VideoSource) -> np.ndarray:
+    """Which frame of the episode each of a video's is: those that cannot be decoded are left out of it."""
+    step = float(np.median(np.diff(video.times)))
+    return np.rint(video.times / step).astype(np.int64)
+
+
+def _kind(feature: Feature) -> str:
+    if feature.dtype in ("video", "image") and not feature.is_depth:
+        return IMAGES
+    return READINGS if feature.names and feature.key not in _OWN else OTHER
+
+
+def _frame_of(key: str, columns: Sequence[str]) -> str | None:
+    """The frame that a feature's name, or those of all its columns, says."""
+    for frame, pattern in ((CAMERA, _CAMERA_FRAME), (BASE, _BASE_FRAME)):
+        if pattern.search(key.partition(".")[2] or key) or all(pattern.search(column) for column in columns):
+            return frame
+    return None
+
+
+def _frame_asks(key: str, columns: Sequence[str]) -> tuple[str, ...]:
+    return () if _frame_of(key, columns) else (f"frame: {CAMERA}   # or {BASE}: nothing says what they are stated in",)
+
+
+def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
+    """What may be a rotation by its numbers [R, C]: four of unit length, or nine that are a rotation matrix."""
+    values = values.astype(np.float64)
+    if not len(values) or not np.isfinite(values).all():
+        return ()
+    asks, place = [], 0
+    while place <= len(columns) - 4:
+        nine = values[:, place : place + 9].reshape(len(values), 3, -1) if place <= len(columns) - 9 else None
+        four = np.linalg.norm(values[:, place : place + 4], axis=1)
+        if nine is not None and np.abs(np.einsum("nji,njk->nik", nine, nine) - np.eye(3)).max() < UNIT_NORM:
+            form, size, why = "rotation_matrix", 9, "or by columns: list them so that the matrix stands row by row"
+        elif np.abs(four - 1).max() < UNIT_NORM and np.abs(np.abs(values[:, place : place + 4]).max(0) - 1).max() > 0:
+            form, size, why = "quaternion_wxyz", 4, "or quaternion_xyzw: their length is 1, nothing says their order"
+        else:
+            place += 1
+            continue
+        if place >= 3:
+            asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
+        asks.append(f"  {form}: {_flow(columns[place : place + size])}   # {why}")
+        place += size
+    return tuple(asks)
+
+
+def _flow(columns: Sequence[str]) -> str:
+    return "[" + ", ".join(f'"{column}"' for column in columns) + "]"
+
+
+def _joint_name(column: str, body: str) -> str:
+    """`jaw` of `psm1_jaw`."""
+    words = [word for word in re.split(r"[_.\-/]+", column) if word and word != body]
+    return "_".join(words) or column
+
+
+def _camera_order(key: str) -> tuple[bool, bool, bool, str]:
+    """Endoscopes before cameras at the wrist, the left one before any other but the right one."""
+    name = key.lower()
+    return "wrist" in name or "psm" in name, "right" in name, "left" not in name, key

@@ -1,0 +1,429 @@
+"""Episodes of LeRobot data sets come with their states, their times and their own images, or are refused in a line."""
+
+from __future__ import annotations
+
+import builtins
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neeco.errors import NeecoError
+from neeco.ingest.columns import CAMERA as CAMERA_FRAME
+from neeco.ingest.columns import PoseColumns, Units
+from neeco.ingest.formats import format_of, read_table
+from neeco.ingest.logs import read_pose_log
+from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.template import write_template
+
+pytest.importorskip("av")
+pyarrow = pytest.importorskip("pyarrow")
+
+from lerobot_world import BODY, CAMERA, DVRK, FPS, LeRobotWriter, left_edge  # noqa: E402
+
+LENGTHS = (20, 30, 25)
+STATE = "observation.state"
+WXYZ = tuple(f"{STATE}[{k}]" for k in range(3, 7))
+
+
+def arm(frames: int, phase: float) -> np.ndarray:
+    """[T, 8] float32: position m, quaternion xyzw, jaw rad."""
+    times = np.arange(frames) / FPS
+    place = np.stack([0.02 * np.sin(2 * times + phase), 0.01 * np.cos(3 * times), 0.1 + 0.01 * np.sin(times)], 1)
+    turns = Rotation.from_rotvec(np.outer(times + phase, [0.3, 0.5, 1.0])).as_quat()
+    return np.column_stack([place, turns, 0.4 + 0.3 * np.sin(4 * times)]).astype(np.float32)
+
+
+def episode(number: int) -> dict[str, np.ndarray]:
+    frames = LENGTHS[number]
+    return {
+        STATE: np.concatenate([arm(frames, number), arm(frames, number + 0.5)], 1),
+        "action": np.zeros((frames, 3), np.float32),
+    }
+
+
+EPISODES = [episode(number) for number in range(len(LENGTHS))]
+
+
+def data_set(folder: Path, **options: Any) -> LeRobotWriter:
+    given: dict[str, Any] = {"states": EPISODES, "names": {STATE: [list(DVRK)]}, "group": 16}
+    writer = LeRobotWriter(folder / "set", **(given | options))
+    writer.write()
+    return writer
+
+
+@pytest.fixture(scope="module", params=["v2.0", "v2.1", "v3.0"])
+def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of three episodes and one camera, of each version."""
+    return data_set(tmp_path_factory.mktemp("lerobot"), version=request.param).folder
+
+
+def read(path: Path, stream: str) -> Any:
+    return read_table(path, stream)
+
+
+def refusal(path: Path, stream: str = f"episode 1/{STATE}", images: bool = False) -> str:
+    known = format_of(path)
+    assert known is not None
+    with pytest.raises(NeecoError) as caught:
+        known.open_images(path, stream) if images else known.read(path, stream)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_an_episode_has_its_own_states_and_times(plain, number):
+    table = read(plain, f"episode {number}/{STATE}")
+    assert table.header == ("timestamp_s", *DVRK)
+    np.testing.assert_array_equal(table.rows[:, 1:], EPISODES[number][STATE].astype(np.float64))
+    np.testing.assert_allclose(table.rows[:, 0], np.arange(LENGTHS[number]) / FPS, atol=1e-6)  # float32 in the file
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_an_episode_has_its_own_images_at_the_times_of_its_states(plain, number):
+    video = format_of(plain).open_images(plain, f"episode {number}/{CAMERA}")
+    assert (video.size, video.notes) == ((64, 48), ())
+    np.testing.assert_array_equal(video.times, read(plain, f"episode {number}/{STATE}").rows[:, 0])
+    last = LENGTHS[number] - 1
+    shown = list(video.read([last, 0, 7]))
+    assert [index for index, _ in shown] == [0, 7, last]
+    assert [left_edge(pixels) for _, pixels in shown] == [0, 7, last]
+    assert all(abs(int(pixels[2, 2, 0]) - 20 - 15 * number) <= 3 for _, pixels in shown)  # the episode's grey
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_images_in_parquet_are_read_as_they_are(tmp_path, version):
+    path = data_set(tmp_path, version=version, embedded=True).folder
+    video = format_of(path).open_images(path, f"episode 1/{CAMERA}")
+    assert (video.size, len(video.times)) == ((64, 48), LENGTHS[1])
+    shown = list(video.read([29, 3]))
+    assert [(index, left_edge(pixels), int(pixels[2, 2, 0])) for index, pixels in shown] == [(3, 3, 35), (29, 29, 35)]
+
+
+def test_both_ways_to_write_a_stream(plain):
+    np.testing.assert_array_equal(read(plain, f"episode 2: {STATE}").rows, read(plain, f"episode 2/{STATE}").rows)
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (list(BODY), BODY),
+        ([list(BODY)], BODY),
+        ({"motors": list(BODY)}, BODY),
+        ({name: index for index, name in enumerate(BODY)}, BODY),
+        (None, tuple(f"{STATE}[{k}]" for k in range(7))),
+        (["state"], tuple(f"{STATE}[{k}]" for k in range(7))),
+        (["x"] * 7, tuple(f"{STATE}[{k}]" for k in range(7))),
+        ({"arm": list(BODY[:3]), "turn": list(BODY[3:])}, BODY),
+    ],
+)
+def test_columns_are_named_as_the_features_name_them_else_by_index(tmp_path, given, names):
+    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :7]}], names={STATE: given}, cameras=()).folder
+    assert read(path, f"episode 0/{STATE}").header == ("timestamp_s", *names)
+
+
+def test_matrices_are_columns_row_by_row(tmp_path):
+    poses = np.tile(np.eye(4, dtype=np.float32), (12, 1, 1))
+    poses[:, 0, 3] = np.arange(12)
+    path = data_set(tmp_path, states=[{"observation.pose": poses}], names={}, cameras=()).folder
+    table = read(path, "episode 0/observation.pose")
+    assert table.header[4] == "observation.pose[0,3]"
+    np.testing.assert_array_equal(table.rows[:, 4], np.arange(12))
+
+
+def pose_columns(path: Path, **given: Any) -> PoseColumns:
+    options: dict[str, Any] = {
+        "stream": f"episode 0/{STATE}",
+        "position": tuple(f"{STATE}[{k}]" for k in range(3)),
+        "rotation": WXYZ,
+        "form": "quaternion_xyzw",
+        "units": Units(length="m"),
+        "frame": "camera",
+    }
+    return PoseColumns(path, **(options | given))
+
+
+@pytest.fixture(scope="module")
+def nameless(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set whose features name nothing."""
+    states = [{STATE: arm(40, 0.0)}]
+    return data_set(tmp_path_factory.mktemp("nameless"), states=states, names={}).folder
+
+
+def test_poses_are_what_the_recording_says_they_are(nameless):
+    log = read_pose_log(pose_columns(nameless))
+    values = arm(40, 0.0).astype(np.float64)
+    np.testing.assert_allclose(log.positions, 1000 * values[:, :3], atol=1e-9)
+    wanted = Rotation.from_quat(values[:, 3:7])
+    off = (Rotation.from_quat(log.quats, scalar_first=True).inv() * wanted).magnitude()
+    assert off.max() < 1e-6
+    assert log.frame == CAMERA_FRAME
+
+
+def test_the_order_of_a_quaternion_is_not_guessed(nameless):
+    with pytest.raises(
+        NeecoError, match=r"set: episode 0/observation\.state: header: .*quaternion_wxyz, quaternion_xyz"
+    ):
+        read_pose_log(pose_columns(nameless, rotation=None, form=None))
+
+
+def test_the_convention_of_angles_is_not_guessed(tmp_path):
+    names = {STATE: ["x", "y", "z", "roll", "pitch", "yaw"]}
+    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :6]}], names=names, cameras=()).folder
+    columns = PoseColumns(path, stream=f"episode 0/{STATE}", units=Units(length="m", angle="rad"), frame="base")
+    with pytest.raises(
+        NeecoError, match=r"roll, pitch, yaw have no one meaning; name them .* with an euler_convention"
+    ):
+        read_pose_log(columns)
+
+
+def test_the_frame_of_poses_is_not_guessed(nameless):
+    with pytest.raises(NeecoError, match=r"frame: nothing says .* frame: camera, or frame: base"):
+        read_pose_log(pose_columns(nameless, frame=None))
+
+
+def test_the_unit_of_lengths_is_not_guessed(nameless):
+    with pytest.raises(NeecoError, match=r"in which length unit\?"):
+        read_pose_log(pose_columns(nameless, units=Units()))
+
+
+@pytest.mark.parametrize(
+    ("key", "frame"),
+    [
+        ("observation.state.camera_frame", "camera"),
+        ("observation.pose_in_ecm", "camera"),
+        ("observation.state_base", "base"),
+        ("observation.robot_base_frame", "base"),
+        ("observation.state", None),
+        ("observation.campaign", None),
+    ],
+)
+def test_the_frame_that_a_features_name_says(tmp_path, key, frame):
+    path = data_set(tmp_path, states=[{key: arm(12, 0)[:, :7]}], names={key: list(BODY)}, cameras=()).folder
+    assert read(path, f"episode 0/{key}").frame == frame
+
+
+def test_a_template_names_every_arm_with_its_jaw(plain):
+    text = write_template(plain)
+    place = plain.parent / "recording.yaml"
+    place.write_text(text)
+    recording = read_recording(place)
+    assert recording.stream == f"episode 0/{CAMERA}"
+    assert [item.name for item in recording.instruments] == ["psm1", "psm2"]
+    first, second = (item.poses for item in recording.instruments)
+    assert first is not None
+    assert second is not None
+    assert first.rotation == tuple(f"psm1_pose.orientation.{axis}" for axis in "wxyz")
+    assert first.form == "quaternion_wxyz"
+    assert [dict(item.joints)["jaw"].value for item in recording.instruments] == ["psm1_jaw", "psm2_jaw"]
+    assert {log.clock for log in (first, second)} == {"video"}
+    assert "# frame: camera   # or base" in text
+    with pytest.raises(NeecoError, match="frame: nothing says"):
+        read_pose_log(first)
+    place.write_text(text.replace("# frame: camera", "frame: camera"))
+    chosen = read_recording(place).instruments[1].poses
+    assert chosen is not None
+    log = read_pose_log(chosen)
+    np.testing.assert_allclose(log.positions, 1000 * EPISODES[0][STATE][:, 8:11].astype(np.float64), atol=1e-9)
+    assert log.frame == CAMERA_FRAME
+
+
+def test_a_template_asks_what_a_nameless_vector_may_be(nameless):
+    text = write_template(nameless)
+    assert f'# position: ["{STATE}[0]", "{STATE}[1]", "{STATE}[2]"]' in text
+    assert f'# quaternion_wxyz: ["{STATE}[3]", "{STATE}[4]", "{STATE}[5]", "{STATE}[6]"]   # or quaternion_xyzw' in text
+    lines = [line.replace("# ", "", 1) if "# position: [\"o" in line or "# quaternion_wxyz: [\"o" in line
+             or "# frame: camera  " in line else line for line in text.splitlines()]  # fmt: skip
+    place = nameless.parent / "recording.yaml"
+    place.write_text("\n".join(lines).replace('quaternion_wxyz: ["o', 'quaternion_xyzw: ["o'))
+    poses = read_recording(place).instruments[0].poses
+    assert poses is not None
+    assert (poses.rotation, poses.form, poses.frame) == (WXYZ, "quaternion_xyzw", "camera")
+
+
+def test_logs_of_another_episode_than_the_images(plain):
+    place = plain.parent / "mixed.yaml"
+    place.write_text(
+        f"video: {{file: set, stream: episode 1/{CAMERA}}}\n"
+        "instruments:\n"
+        "  - name: psm1\n"
+        f"    poses: {{file: set, stream: episode 0/{STATE}, frame: camera}}\n"
+    )
+    with pytest.raises(NeecoError, match=r"'episode 0/observation\.state' is of episode 0, the images of episode 1"):
+        read_recording(place)
+
+
+def test_which_episode_must_be_said_where_there_are_several(plain):
+    known = format_of(plain)
+    with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
+        known.read(plain)
+    with pytest.raises(NeecoError, match=r"there are episodes 0 to 2; name one, as in episode 0/"):
+        known.open_images(plain)
+
+
+def test_what_is_not_there(plain):
+    assert "holds no episode 7; its episodes are 0 to 2" in refusal(plain, f"episode 7/{STATE}")
+    assert f"holds no 'wrong'; name one of episode 1/{STATE}, episode 1/action" in refusal(plain, "episode 1/wrong")
+    assert "is float32, no images" in refusal(plain, f"episode 1/{STATE}", images=True)
+    assert "holds no 'nonsense'" in refusal(plain, "nonsense")
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(("shown", "refused"), [(29, False), (20, True), (40, True)])
+def test_a_film_of_another_length_than_its_states(tmp_path, version, shown, refused):
+    states = [EPISODES[0], EPISODES[1]]
+    path = data_set(tmp_path, version=version, states=states, frames={1: shown}).folder
+    if version == "v3.0" and shown > 29:
+        pytest.skip("meta says where the episode ends")
+    if refused:
+        assert f"has {shown} images for 30 states" in refusal(path, f"episode 1/{CAMERA}", images=True)
+    else:
+        video = format_of(path).open_images(path, f"episode 1/{CAMERA}")
+        assert len(video.times) == shown
+        assert "has 29 images for 30 states" in video.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("data_path", "../../etc/passwd", "no path inside the data set"),
+        ("data_path", "/etc/passwd", "no path inside the data set"),
+        ("data_path", "data/{episode_index.__class__}.parquet", "no path inside the data set"),
+        ("data_path", "data/{other}.parquet", r"'\{other\}' is none of"),
+        ("data_path", 7, "data_path: is no text"),
+        ("video_path", "..\\{video_key}", "no path inside the data set"),
+        ("codebase_version", "v1.6", "'v1.6' is not read"),
+        ("codebase_version", None, "None is not read"),
+        ("fps", 0, "0 is no frame rate"),
+        ("fps", "x", "'x' is no frame rate"),
+        ("chunks_size", 0, "0 is no count"),
+        ("features", [], "expected an object"),
+        ("features", {"a": {"dtype": "float32"}}, "'a': shape: None is none"),
+        ("features", {"a": 3}, "'a': has no dtype"),
+        ("video_path", None, "video_path: missing"),
+    ],
+)
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_descriptions_that_cannot_be(tmp_path, version, field, value, message):
+    path = data_set(tmp_path, version=version, states=EPISODES[:2], info={field: value}).folder
+    with pytest.raises(NeecoError, match=message) as caught:
+        format_of(path).read(path, f"episode 1/{STATE}")
+    assert "\n" not in str(caught.value)
+
+
+def test_links_out_of_the_data_set(tmp_path):
+    path = data_set(tmp_path, version="v2.1").folder
+    file = path / "data/chunk-000/episode_000001.parquet"
+    file.rename(tmp_path / "elsewhere.parquet")
+    file.symlink_to(tmp_path / "elsewhere.parquet")
+    assert "a link leads out of" in refusal(path)
+
+
+def test_the_hubs_cache_holds_links(tmp_path):
+    made = data_set(tmp_path, version="v2.1").folder
+    cached = tmp_path / "datasets--some--set" / "snapshots" / "abc"
+    (cached.parents[1] / "blobs").mkdir(parents=True)
+    for number, file in enumerate(sorted(entry for entry in made.rglob("*") if entry.is_file())):
+        blob = cached.parents[1] / "blobs" / str(number)
+        file.rename(blob)
+        link = cached / file.relative_to(made)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(blob)
+    assert len(read(cached, f"episode 1/{STATE}").rows) == LENGTHS[1]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_damaged_files(tmp_path, version):
+    path = data_set(tmp_path, version=version).folder
+    file = sorted((path / "data").rglob("*.parquet"))[-2 if version == "v2.1" else 0]
+    whole = file.read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"PAR1" + bytes(200) + b"PAR1"):
+        file.write_bytes(content)
+        assert "cannot be read as Parquet" in refusal(path)
+    file.unlink()
+    assert "no such file; download the episode's files, too" in refusal(path)
+
+
+def test_parquet_of_other_columns(tmp_path):
+    path = data_set(tmp_path, version="v2.1").folder
+    file = path / "data/chunk-000/episode_000001.parquet"
+    table = pyarrow.parquet.read_table(file)
+    pyarrow.parquet.write_table(table.drop_columns([STATE]), file)
+    assert f"has no column '{STATE}'; its columns are action, timestamp" in refusal(path)
+    texts = pyarrow.array(["x"] * LENGTHS[1])
+    pyarrow.parquet.write_table(table.set_column(0, STATE, texts), file)
+    assert f"{STATE}: holds string, no numbers" in refusal(path)
+    ragged = pyarrow.array([[1.0] * (1 + row % 2) for row in range(LENGTHS[1])])
+    pyarrow.parquet.write_table(table.set_column(0, STATE, ragged), file)
+    assert f"{STATE}: its rows have different lengths" in refusal(path)
+    short = pyarrow.array([[1.0]] * LENGTHS[1])
+    pyarrow.parquet.write_table(table.set_column(0, STATE, short), file)
+    assert f"{STATE}: has 1 numbers a row, meta/info.json says 16" in refusal(path)
+    pyarrow.parquet.write_table(table.slice(0, 11), file)
+    assert "has 11 rows of episode 1, meta says 30" in refusal(path)
+
+
+def test_lines_of_episodes_that_are_none(tmp_path):
+    path = data_set(tmp_path, version="v2.1").folder
+    for line in ("{", "[]", '{"episode_index": 0}', '{"episode_index": true, "length": 3}'):
+        (path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 20}\n' + line + "\n")
+        assert "episodes.jsonl: line 2: is no episode" in refusal(path)
+
+
+def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
+    path = data_set(tmp_path, version="v2.1").folder
+    file = path / "data/chunk-000/episode_000001.parquet"
+    table = pyarrow.parquet.read_table(file)
+    still = pyarrow.array(np.full(LENGTHS[1], 1.7e9, np.float32))  # nanoseconds since 1970 as float32 s
+    pyarrow.parquet.write_table(table.set_column(table.schema.get_field_index("timestamp"), "timestamp", still), file)
+    found = read(path, f"episode 1/{STATE}")
+    np.testing.assert_allclose(found.rows[:, 0], np.arange(LENGTHS[1]) / FPS)
+    assert "timestamps do not increase; taken as 25 a second" in found.notes[0]
+
+
+def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
+    from neeco.ingest.formats._lerobotfiles import ParquetFile
+
+    states = [{STATE: arm(20, number)} for number in range(40)]
+    path = data_set(tmp_path, states=states, names={}, cameras=(), group=20).folder
+    asked: list[list[int]] = []
+    own = ParquetFile._groups
+
+    def note(self: ParquetFile, columns: Any, number: int | None) -> list[int]:
+        asked.append(own(self, columns, number))
+        return asked[-1]
+
+    monkeypatch.setattr(ParquetFile, "_groups", note)
+    assert len(read(path, f"episode 33/{STATE}").rows) == 20
+    assert [33] in asked
+    assert all(len(groups) == 1 for groups in asked)
+
+
+def test_without_the_package(tmp_path, monkeypatch):
+    path = data_set(tmp_path, states=EPISODES[:1], cameras=()).folder
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name, *rest)
+    )
+    monkeypatch.setattr(builtins, "__import__", _without(builtins.__import__, "pyarrow"))
+    assert "LeRobot data set: needs pyarrow; pip install 'neeco[lerobot]'" in refusal(path)
+
+
+def _without(own: Any, name: str) -> Any:
+    def load(module: str, *rest: Any) -> Any:
+        if module.partition(".")[0] == name:
+            raise ImportError(module)
+        return own(module, *rest)
+
+    return load
+
+
+def test_other_folders_are_none(tmp_path):
+    (tmp_path / "meta").mkdir()
+    assert format_of(tmp_path) is None
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"version": 1}))
+    assert format_of(tmp_path) is None
