@@ -41,13 +41,16 @@ _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)"
 @dataclass(frozen=True)
 class _Log:
     """A log: its file, relative to the folder, and which stream of it; body: what it is of, hints: lines on it, asks:
-    keys that nothing answers, where the format says so; tool: which of several in an NDI export."""
+    keys that nothing answers, clock: of its times, where the format says so; is_whole: are all columns the body's?
+    tool: which of several in an NDI export."""
 
     file: str
     stream: str | None = None
     body: str | None = None
     hints: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
+    clock: str | None = None
+    is_whole: bool = True
     tool: str | None = None
 
     @property
@@ -167,7 +170,7 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         found.others.append(" ".join(str(error).replace(str(path), name).split()))
         return path.is_dir()
     for stream in streams:
-        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks)
+        log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
         used = stream.offered and stream.count > 0
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
@@ -263,20 +266,21 @@ def _instruments(found: _FolderFiles, poses: Sequence[tuple[_Log, RecognisedColu
 
 def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     of_length = (columns.rotation or ())[3:4] if columns.form == MATRIX else columns.position
-    if log.stream is not None and columns.time and of_length and columns.rotation:
-        return [*log.lines(), *_unit_lines(columns, {"length": of_length})]  # recognised again when read
-    lines = [*log.lines(), *(["clock: em"] if log.stream is None else [])]
+    clock = "em" if log.stream is None else log.clock
+    lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
+    lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
+    if log.stream is not None and log.is_whole and columns.time and of_length and columns.rotation:
+        return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     given = [
         ("time", columns.time),
         ("position", columns.position),
         (columns.form or "", columns.rotation),
         ("state", (columns.state,) if columns.state else None),
     ]
-    known = [f"  {key}: {_list(names)}" for key, names in given if names]
-    lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
+    known = [f"  {key}: {_list(names)}" for key, names in given if names and not (log.stream and key == "time")]
+    known += [f"  # {ask.strip()}" for ask in log.asks if ask.startswith(" ")]
     lines += ["columns:", *known] if known else []
     lines += ["  good: [OK]"] if columns.state else []
-    lines += [f"  # {ask.strip()}" for ask in log.asks if ask.startswith(" ")]
     lines += [f"# columns: {what} is not clear: {why}" for what, why in columns.unclear.items()]
     return lines + _unit_lines(columns, {"length": of_length})
 

@@ -75,7 +75,7 @@ class Stream:
     For a template: offered: is it what is recorded most likely, or only there, too? body: what it is of, where the
     format tells; joints: (name, column) of the readings worth having, None: all angles; hints: remarks on the body;
     columns: of the table, those that are the body's (None: all); asks: keys of the log that nothing in the file says,
-    as lines for the user to choose from, those of its columns indented.
+    as lines for the user to choose from, those of its columns indented; clock: that of a file without images.
     """
 
     name: str
@@ -89,6 +89,7 @@ class Stream:
     hints: tuple[str, ...] = ()
     columns: tuple[str, ...] | None = None
     asks: tuple[str, ...] = ()
+    clock: str | None = None
 
 
 @dataclass(frozen=True)

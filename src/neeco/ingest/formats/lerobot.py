@@ -42,8 +42,10 @@ UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
-_CAMERA_FRAME = re.compile(r"(^|[_.\-/])(in_)?(camera|cam|ecm|endoscope)(_frame)?([_.\-/]|$)", re.IGNORECASE)
-_BASE_FRAME = re.compile(r"(^|[_.\-/])(in_)?(robot_)?base(_frame)?([_.\-/]|$)", re.IGNORECASE)
+# a frame, not a body: `pose_in_ecm`, `camera_frame`
+_FRAME = r"(^|[_.\-/])((in|wrt)[_.\-/]({0})|({0})[_.\-/]?frame)([_.\-/]|$)"
+_CAMERA_FRAME = re.compile(_FRAME.format("camera|cam|ecm|endoscope"), re.IGNORECASE)
+_BASE_FRAME = re.compile(_FRAME.format("(robot[_.\\-/]?)?base"), re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):
@@ -318,7 +320,7 @@ def _kind(feature: Feature) -> str:
 def _frame_of(key: str, columns: Sequence[str]) -> str | None:
     """The frame that a feature's name, or those of all its columns, says."""
     for frame, pattern in ((CAMERA, _CAMERA_FRAME), (BASE, _BASE_FRAME)):
-        if pattern.search(key.partition(".")[2] or key) or all(pattern.search(column) for column in columns):
+        if pattern.search(key) or all(pattern.search(column) for column in columns):
             return frame
     return None
 
