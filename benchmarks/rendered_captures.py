@@ -29,6 +29,8 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      `neeco ingest --init OUT/recording/bags/ros1/recording.bag`; brings --video
     --plus           also recording/plus/: images and poses as a sequence of the PLUS toolkit, for
                      `neeco ingest OUT/recording/plus/recording.yaml`; brings --video
+    --lerobot        also recording/lerobot/: the recording as LeRobot data sets v2.1 and v3.0 (needs pyarrow, too),
+                     each with a recording.yaml; brings --video
 
 CPU seconds a frame, written, on one core of an EPYC: 0.6 at 320x256 (0.7 with detail), 1.3 at 640x512, 2.3 at 1280x720,
 4.1 at 1920x1080; two to three times that with `--lens`.
@@ -105,10 +107,11 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--video", action="store_true", help="also recording/: video and logs for `neeco ingest`")
     parser.add_argument("--bag", action="store_true", help="also recording/bags/: the recording as ROS bags")
     parser.add_argument("--plus", action="store_true", help="also recording/plus/: the recording as PLUS has it")
+    parser.add_argument("--lerobot", action="store_true", help="also recording/lerobot/: the recording as data sets")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
     arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
-    arguments.video |= arguments.bag or arguments.plus
+    arguments.video |= arguments.bag or arguments.plus or arguments.lerobot
     if arguments.video and spec.encoders is not None:
         parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
     settings = Settings(
@@ -122,6 +125,7 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         video=arguments.video,
         bags=arguments.bag,
         plus=arguments.plus,
+        lerobot=arguments.lerobot,
         workers=arguments.workers,
     )
     if arguments.video:

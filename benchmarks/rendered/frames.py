@@ -46,6 +46,7 @@ class Settings:
     video: bool = False  # recording/: what `neeco ingest` takes
     bags: bool = False  # recording/bags/: the same as ROS bags
     plus: bool = False  # recording/plus/: the same as a PLUS sequence
+    lerobot: bool = False  # recording/lerobot/: the same as LeRobot data sets
     workers: int = 1
 
     @property
@@ -58,9 +59,10 @@ class Settings:
             (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
             (self.exposure, " --exposure"),
             (self.optics, " --lens"),
-            (self.video and not (self.bags or self.plus), " --video"),
+            (self.video and not (self.bags or self.plus or self.lerobot), " --video"),
             (self.bags, " --bag"),
             (self.plus, " --plus"),
+            (self.lerobot, " --lerobot"),
             (self.every > 1, f" --every {self.every}"),
         ]
         return size + "".join(option for wanted, option in given if wanted)

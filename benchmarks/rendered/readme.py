@@ -82,4 +82,6 @@ def _switched_on(settings: Settings) -> str:
         said.append("`recording/bags/`: the recording as bags of ROS 1, ROS 2 and MCAP, all on one clock.")
     if settings.plus:
         said.append("`recording/plus/`: images and poses as a sequence of the PLUS toolkit, on one clock.")
+    if settings.lerobot:
+        said.append("`recording/lerobot/`: the recording as LeRobot data sets v2.1 and v3.0, states at the images.")
     return "".join(f"{line}\n" for line in said)

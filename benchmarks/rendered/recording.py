@@ -69,6 +69,10 @@ def write_raw_recording(
         write_bags(folder, _CLOCKS)
     if settings.plus:
         write_plus(folder, _CLOCKS)
+    if settings.lerobot:
+        from rendered.lerobotsets import write_data_sets  # needs pyarrow
+
+        write_data_sets(folder, _CLOCKS)
     write_json(
         path / "truth" / "recording.json",
         {

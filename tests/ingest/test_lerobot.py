@@ -23,7 +23,7 @@ from neeco.ingest.template import write_template
 pytest.importorskip("av")
 pyarrow = pytest.importorskip("pyarrow")
 
-from lerobot_world import BODY, CAMERA, DVRK, FPS, LeRobotWriter, left_edge  # noqa: E402
+from lerobot_world import BODY, CAMERA, DVRK, FPS, left_edge, write_data_set  # noqa: E402
 
 LENGTHS = (20, 30, 25)
 STATE = "observation.state"
@@ -49,17 +49,15 @@ def episode(number: int) -> dict[str, np.ndarray]:
 EPISODES = [episode(number) for number in range(len(LENGTHS))]
 
 
-def data_set(folder: Path, **options: Any) -> LeRobotWriter:
-    given: dict[str, Any] = {"states": EPISODES, "names": {STATE: [list(DVRK)]}, "group": 16}
-    writer = LeRobotWriter(folder / "set", **(given | options))
-    writer.write()
-    return writer
+def data_set(folder: Path, **options: Any) -> Path:
+    given: dict[str, Any] = {"version": "v3.0", "states": EPISODES, "names": {STATE: [list(DVRK)]}, "group": 16}
+    return write_data_set(folder / "set", **(given | options))
 
 
 @pytest.fixture(scope="module", params=["v2.0", "v2.1", "v3.0"])
 def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of three episodes and one camera, of each version."""
-    return data_set(tmp_path_factory.mktemp("lerobot"), version=request.param).folder
+    return data_set(tmp_path_factory.mktemp("lerobot"), version=request.param)
 
 
 def read(path: Path, stream: str) -> Any:
@@ -97,7 +95,7 @@ def test_an_episode_has_its_own_images_at_the_times_of_its_states(plain, number)
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_images_in_parquet_are_read_as_they_are(tmp_path, version):
-    path = data_set(tmp_path, version=version, embedded=True).folder
+    path = data_set(tmp_path, version=version, embedded=True)
     video = format_of(path).open_images(path, f"episode 1/{CAMERA}")
     assert (video.size, len(video.times)) == ((64, 48), LENGTHS[1])
     shown = list(video.read([29, 3]))
@@ -122,14 +120,14 @@ def test_both_ways_to_write_a_stream(plain):
     ],
 )
 def test_columns_are_named_as_the_features_name_them_else_by_index(tmp_path, given, names):
-    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :7]}], names={STATE: given}, cameras=()).folder
+    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :7]}], names={STATE: given}, cameras=())
     assert read(path, f"episode 0/{STATE}").header == ("timestamp_s", *names)
 
 
 def test_matrices_are_columns_row_by_row(tmp_path):
     poses = np.tile(np.eye(4, dtype=np.float32), (12, 1, 1))
     poses[:, 0, 3] = np.arange(12)
-    path = data_set(tmp_path, states=[{"observation.pose": poses}], names={}, cameras=()).folder
+    path = data_set(tmp_path, states=[{"observation.pose": poses}], names={}, cameras=())
     table = read(path, "episode 0/observation.pose")
     assert table.header[4] == "observation.pose[0,3]"
     np.testing.assert_array_equal(table.rows[:, 4], np.arange(12))
@@ -151,7 +149,7 @@ def pose_columns(path: Path, **given: Any) -> PoseColumns:
 def nameless(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set whose features name nothing."""
     states = [{STATE: arm(40, 0.0)}]
-    return data_set(tmp_path_factory.mktemp("nameless"), states=states, names={}).folder
+    return data_set(tmp_path_factory.mktemp("nameless"), states=states, names={})
 
 
 def test_poses_are_what_the_recording_says_they_are(nameless):
@@ -173,7 +171,7 @@ def test_the_order_of_a_quaternion_is_not_guessed(nameless):
 
 def test_the_convention_of_angles_is_not_guessed(tmp_path):
     names = {STATE: ["x", "y", "z", "roll", "pitch", "yaw"]}
-    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :6]}], names=names, cameras=()).folder
+    path = data_set(tmp_path, states=[{STATE: arm(12, 0)[:, :6]}], names=names, cameras=())
     columns = PoseColumns(path, stream=f"episode 0/{STATE}", units=Units(length="m", angle="rad"), frame="base")
     with pytest.raises(
         NeecoError, match=r"roll, pitch, yaw have no one meaning; name them .* with an euler_convention"
@@ -196,14 +194,15 @@ def test_the_unit_of_lengths_is_not_guessed(nameless):
     [
         ("observation.state.camera_frame", "camera"),
         ("observation.pose_in_ecm", "camera"),
-        ("observation.state_base", "base"),
+        ("observation.pose_in_base", "base"),
         ("observation.robot_base_frame", "base"),
         ("observation.state", None),
-        ("observation.campaign", None),
+        ("observation.camera_pose", None),
+        ("observation.base_state", None),
     ],
 )
 def test_the_frame_that_a_features_name_says(tmp_path, key, frame):
-    path = data_set(tmp_path, states=[{key: arm(12, 0)[:, :7]}], names={key: list(BODY)}, cameras=()).folder
+    path = data_set(tmp_path, states=[{key: arm(12, 0)[:, :7]}], names={key: list(BODY)}, cameras=())
     assert read(path, f"episode 0/{key}").frame == frame
 
 
@@ -276,7 +275,7 @@ def test_what_is_not_there(plain):
 @pytest.mark.parametrize(("shown", "refused"), [(29, False), (20, True), (40, True)])
 def test_a_film_of_another_length_than_its_states(tmp_path, version, shown, refused):
     states = [EPISODES[0], EPISODES[1]]
-    path = data_set(tmp_path, version=version, states=states, frames={1: shown}).folder
+    path = data_set(tmp_path, version=version, states=states, shown={1: shown})
     if version == "v3.0" and shown > 29:
         pytest.skip("meta says where the episode ends")
     if refused:
@@ -309,14 +308,14 @@ def test_a_film_of_another_length_than_its_states(tmp_path, version, shown, refu
 )
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_descriptions_that_cannot_be(tmp_path, version, field, value, message):
-    path = data_set(tmp_path, version=version, states=EPISODES[:2], info={field: value}).folder
+    path = data_set(tmp_path, version=version, states=EPISODES[:2], info={field: value})
     with pytest.raises(NeecoError, match=message) as caught:
         format_of(path).read(path, f"episode 1/{STATE}")
     assert "\n" not in str(caught.value)
 
 
 def test_links_out_of_the_data_set(tmp_path):
-    path = data_set(tmp_path, version="v2.1").folder
+    path = data_set(tmp_path, version="v2.1")
     file = path / "data/chunk-000/episode_000001.parquet"
     file.rename(tmp_path / "elsewhere.parquet")
     file.symlink_to(tmp_path / "elsewhere.parquet")
@@ -324,7 +323,7 @@ def test_links_out_of_the_data_set(tmp_path):
 
 
 def test_the_hubs_cache_holds_links(tmp_path):
-    made = data_set(tmp_path, version="v2.1").folder
+    made = data_set(tmp_path, version="v2.1")
     cached = tmp_path / "datasets--some--set" / "snapshots" / "abc"
     (cached.parents[1] / "blobs").mkdir(parents=True)
     for number, file in enumerate(sorted(entry for entry in made.rglob("*") if entry.is_file())):
@@ -338,7 +337,7 @@ def test_the_hubs_cache_holds_links(tmp_path):
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_damaged_files(tmp_path, version):
-    path = data_set(tmp_path, version=version).folder
+    path = data_set(tmp_path, version=version)
     file = sorted((path / "data").rglob("*.parquet"))[-2 if version == "v2.1" else 0]
     whole = file.read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"PAR1" + bytes(200) + b"PAR1"):
@@ -349,7 +348,7 @@ def test_damaged_files(tmp_path, version):
 
 
 def test_parquet_of_other_columns(tmp_path):
-    path = data_set(tmp_path, version="v2.1").folder
+    path = data_set(tmp_path, version="v2.1")
     file = path / "data/chunk-000/episode_000001.parquet"
     table = pyarrow.parquet.read_table(file)
     pyarrow.parquet.write_table(table.drop_columns([STATE]), file)
@@ -368,14 +367,14 @@ def test_parquet_of_other_columns(tmp_path):
 
 
 def test_lines_of_episodes_that_are_none(tmp_path):
-    path = data_set(tmp_path, version="v2.1").folder
+    path = data_set(tmp_path, version="v2.1")
     for line in ("{", "[]", '{"episode_index": 0}', '{"episode_index": true, "length": 3}'):
         (path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "length": 20}\n' + line + "\n")
         assert "episodes.jsonl: line 2: is no episode" in refusal(path)
 
 
 def test_timestamps_that_stand_still_are_replaced_with_a_note(tmp_path):
-    path = data_set(tmp_path, version="v2.1").folder
+    path = data_set(tmp_path, version="v2.1")
     file = path / "data/chunk-000/episode_000001.parquet"
     table = pyarrow.parquet.read_table(file)
     still = pyarrow.array(np.full(LENGTHS[1], 1.7e9, np.float32))  # nanoseconds since 1970 as float32 s
@@ -389,7 +388,7 @@ def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
     from neeco.ingest.formats._lerobotfiles import ParquetFile
 
     states = [{STATE: arm(20, number)} for number in range(40)]
-    path = data_set(tmp_path, states=states, names={}, cameras=(), group=20).folder
+    path = data_set(tmp_path, states=states, names={}, cameras=(), group=20)
     asked: list[list[int]] = []
     own = ParquetFile._groups
 
@@ -404,7 +403,7 @@ def test_only_the_rows_of_the_episode_are_read(tmp_path, monkeypatch):
 
 
 def test_without_the_package(tmp_path, monkeypatch):
-    path = data_set(tmp_path, states=EPISODES[:1], cameras=()).folder
+    path = data_set(tmp_path, states=EPISODES[:1], cameras=())
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "pyarrow" else found(name, *rest)
