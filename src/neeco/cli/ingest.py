@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 PAGE = "ingest.html"
 RECORDING = "recording.yaml"
+CHOICES = "recording_choices.png"
 
 
 @dataclass(frozen=True)
@@ -109,11 +110,14 @@ def _init(folder: Path) -> int:
     from neeco.errors import NeecoError
     from neeco.files import write_text
     from neeco.ingest.template import holds_streams, write_template
+    from neeco.report.choice_picture import write_choice_picture
 
     path = (folder.parent if holds_streams(folder) else folder) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
     write_text(path, write_template(folder))
+    if holds_streams(folder) and write_choice_picture(folder, path.with_name(CHOICES)):
+        print(f"wrote {path.with_name(CHOICES)}: what its poses would be under each choice that the file leaves open")
     print(f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE")
     return 0
 

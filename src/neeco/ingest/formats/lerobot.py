@@ -19,7 +19,8 @@ from PIL import Image
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.columns import BASE, CAMERA, pose_bodies, recognise_pose
+from neeco.ingest.choices import find_rotations
+from neeco.ingest.columns import BASE, CAMERA, QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -36,9 +37,9 @@ if TYPE_CHECKING:
     from neeco.ingest.formats._lerobotfiles import DataSet, Episode, Feature
 
 TIME = "timestamp_s"
+UNNAMED = "instrument"  # what a body is called that nothing names
 LARGEST_IMAGE = 90_000_000  # px, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
-UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
@@ -183,14 +184,14 @@ class LeRobot(RecordingFormat):
             if poses.position is None:
                 continue
             asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
-            found.append(replace(plain, kind=POSES, offered=True, body=body or None, joints=joints, columns=columns,
+            found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
                                  asks=(*_frame_asks(feature.key, columns), *asks)))  # fmt: skip
         if found:
             return found
         asks = _rotation_asks(self._columns(episode, feature, feature.names), feature.names)
         if asks:
             asks = (*_frame_asks(feature.key, feature.names), *asks)
-            return [replace(plain, kind=POSES, offered=True, asks=asks, joints=(), columns=())]
+            return [replace(plain, kind=POSES, offered=True, body=UNNAMED, asks=asks, joints=(), columns=())]
         return [plain]
 
     def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
@@ -330,25 +331,16 @@ def _frame_asks(key: str, columns: Sequence[str]) -> tuple[str, ...]:
 
 
 def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:
-    """What may be a rotation by its numbers [R, C]: four of unit length, or nine that are a rotation matrix."""
-    values = values.astype(np.float64)
-    if not len(values) or not np.isfinite(values).all():
-        return ()
-    asks, place = [], 0
-    while place <= len(columns) - 4:
-        nine = values[:, place : place + 9].reshape(len(values), 3, -1) if place <= len(columns) - 9 else None
-        four = np.linalg.norm(values[:, place : place + 4], axis=1)
-        if nine is not None and np.abs(np.einsum("nji,njk->nik", nine, nine) - np.eye(3)).max() < UNIT_NORM:
-            form, size, why = "rotation_matrix", 9, "or by columns: list them so that the matrix stands row by row"
-        elif np.abs(four - 1).max() < UNIT_NORM and np.abs(np.abs(values[:, place : place + 4]).max(0) - 1).max() > 0:
-            form, size, why = "quaternion_wxyz", 4, "or quaternion_xyzw: their length is 1, nothing says their order"
-        else:
-            place += 1
-            continue
+    """What may be a rotation by its numbers [R, C], as lines to choose from."""
+    asks = []
+    for place, kind in find_rotations(values):
+        size, why = 4, "or quaternion_xyzw: their length is 1, nothing says their order"
+        if kind == ROTATION_MATRIX:
+            size, why = 9, "or column by column: list them so that they stand row by row"
         if place >= 3:
             asks.append(f"  position: {_flow(columns[place - 3 : place])}   # stands before the rotation")
+        form = kind if kind == ROTATION_MATRIX else QUATERNION_WXYZ
         asks.append(f"  {form}: {_flow(columns[place : place + size])}   # {why}")
-        place += size
     return tuple(asks)
 
 

@@ -1,0 +1,142 @@
+"""A picture of what a recording's poses would be under each choice that its file leaves open."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from neeco.files import write_atomically
+from neeco.ingest.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
+from neeco.ingest.columns import BASE, CAMERA
+from neeco.ingest.formats import IMAGES, VideoSource, format_of
+from neeco.report.charts import page_style
+
+FRAMES = 3  # shown
+MARGIN = 0.15  # of an image's sides, shown around it
+AXIS_SHARE = 0.2  # of a body's distance, that its axes are drawn long
+COLORS = ("#d62728", "#2ca02c", "#1f77b4")  # x, y, z
+LINES = 24  # of a shaft, drawn
+MOST_ROWS = 10  # of choices
+
+
+@page_style()
+def write_choice_picture(source: Path, picture: Path) -> bool:
+    """Write a PNG of every way to read the poses in `source` of which something is not said, on three frames as in the
+    camera's frame, and beside them their shaft's lines; False where nothing is open. Raises NeecoError."""
+    bodies = open_poses(source)
+    rows = [(poses, reading) for poses in bodies for reading in poses.readings]
+    if not rows:
+        return False
+    known = format_of(source)
+    assert known is not None
+    cameras = [stream.name for stream in known.streams(source) if stream.kind == IMAGES and stream.count]
+    scene, how = None, ""
+    if cameras:
+        video, lens = known.open_images(source, cameras[0]), known.lens(source, cameras[0])
+        width, height = video.size
+        how = "" if lens else ", focal length assumed to be the image's width"
+        scene = _Scene(video, lens.intrinsics if lens else (width, width, width / 2, height / 2))
+    shown = rows[:MOST_ROWS]
+    columns = FRAMES + 1
+    figure = Figure(figsize=(3.6 * columns, 3.1 * len(shown) + 0.7), dpi=80, layout="constrained")
+    grid = figure.subplots(len(shown), columns, squeeze=False)
+    for axes, (poses, reading) in zip(grid, shown, strict=True):
+        _draw_frames(axes[:-1], poses, reading, scene)
+        _draw_lines(axes[-1], poses, reading)
+    figure.suptitle(
+        f"Left: the poses as in the camera's frame (x red, y green, z blue{how}).\n"
+        "Right: lines along the axis that a trocar holds together best, whatever the frame; the path in black.",
+        fontsize=10,
+    )
+    write_atomically(picture, lambda temporary: figure.savefig(temporary, format="png"))
+    return True
+
+
+def _draw_frames(row: np.ndarray, poses: OpenPoses, reading: Reading, scene: _Scene | None) -> None:
+    """Three frames with the body's axes on them."""
+    for axes in row:
+        axes.set_axis_off()
+    row[0].set_title(f"{poses.title}\n{reading.title}", fontsize=9, loc="left")
+    if scene is None:
+        return
+    width, height = scene.video.size
+    samples = scene.samples(poses)
+    numbers = [int(np.abs(scene.video.times - poses.times[sample]).argmin()) for sample in samples]
+    pictures = dict(scene.video.read(numbers))
+    for axes, number, sample in zip(row, numbers, samples, strict=True):
+        axes.imshow(pictures[number])
+        if poses.frame == BASE:
+            words = "stated in a base's frame"
+        else:
+            words = _draw_body(axes, poses.positions[sample], reading.quats[sample], scene)
+        axes.text(0.02, 0.02, words, transform=axes.transAxes, fontsize=8, color="white", backgroundcolor="#0008")
+        axes.set_xlim(-MARGIN * width, (1 + MARGIN) * width)
+        axes.set_ylim((1 + MARGIN) * height, -MARGIN * height)
+
+
+def _draw_body(axes: Axes, place: np.ndarray, quat: np.ndarray, scene: _Scene) -> str:
+    """Axes of a body as a camera at the origin sees them (OpenCV's axes); returns where it is, in words."""
+    if place[2] <= 0:
+        return f"behind the camera in frame: {CAMERA}"
+    start = scene.seen(place)
+    for axis, color in enumerate(COLORS):
+        point = place + AXIS_SHARE * place[2] * axis_directions(quat[None], axis)[0]
+        ends = np.stack([start, scene.seen(point)]).T
+        axes.plot(*ends, color="white", linewidth=4)
+        axes.plot(*ends, color=color, linewidth=2.2)
+    inside = (start >= 0).all() and (start < scene.video.size).all()
+    return f"frame: {CAMERA}" if inside else f"outside the image in frame: {CAMERA}"
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The images and what they were taken through. lens: fl_x, fl_y, cx, cy px."""
+
+    video: VideoSource
+    lens: tuple[float, float, float, float]
+
+    def seen(self, point: np.ndarray) -> np.ndarray:
+        """[2] px of a point [3] before the camera."""
+        return np.array(self.lens[:2]) * point[:2] / max(float(point[2]), 1e-9) + self.lens[2:]
+
+    def samples(self, poses: OpenPoses) -> list[int]:
+        """Of each part of the poses, the sample whose place is seen nearest to the middle of the image; the part's
+        middle one where all are behind the camera."""
+        depths = np.maximum(poses.positions[:, 2:], 1e-9)
+        off = np.linalg.norm(np.array(self.lens[:2]) * poses.positions[:, :2] / depths, axis=1)
+        off[poses.positions[:, 2] <= 0] = np.inf
+        if not np.isfinite(off).any():
+            off = np.abs(np.linspace(-1, 1, len(off)))
+        parts = np.array_split(np.arange(len(off)), FRAMES)
+        return [int(part[off[part].argmin()]) for part in parts if len(part)]
+
+
+def _draw_lines(axes: Axes, poses: OpenPoses, reading: Reading) -> None:
+    """The tool's path and lines along that of its axes whose lines pass nearest to one point."""
+    shaft = shaft_of(poses.positions, reading.quats)
+    chosen = np.unique(np.linspace(0, len(poses.positions) - 1, LINES).round().astype(int))
+    directions = axis_directions(reading.quats, shaft.axis)
+    middle = poses.positions.mean(0)
+    # the plane that shows most of the path and of the lines
+    reach = 2 * float(np.linalg.norm(poses.positions - middle, axis=1).max()) or 1.0
+    spread = np.concatenate([poses.positions - middle, reach * directions])
+    plane = np.linalg.svd(spread, full_matrices=False)[2][:2]
+    path = (poses.positions - middle) @ plane.T
+    along = directions[chosen] @ plane.T
+    for start, direction in zip(path[chosen], along, strict=True):
+        ends = np.stack([start - reach * direction, start + reach * direction])
+        axes.plot(*ends.T, color=COLORS[shaft.axis], linewidth=0.7, alpha=0.6)
+    axes.plot(*path.T, color="black", linewidth=1.2)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_title(
+        f"lines along {AXES[shaft.axis]} pass within {shaft.rms:.3g} of one point\n"
+        f"largest turn from one frame to the next: {math.degrees(largest_step(reading.quats)):.1f} deg",
+        fontsize=8,
+    )
