@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -56,4 +57,9 @@ def write_data_sets(folder: Path, clocks_s: Mapping[str, float]) -> None:
         episodes = [shown(count) for count in lengths]
         LeRobotWriter(path / "set", version, episodes, rate, film.size, {STATE: [names]}).write()
         text = write_template(path / "set").replace("# frame: camera   # or base:", "frame: base   #")
+        given = recording.intrinsics
+        if isinstance(given, Path):
+            shutil.copy(given, path / given.name)
+        lens = given.name if isinstance(given, Path) else list(given or ())
+        text = text.replace("# intrinsics: [290, 290, 160, 128]", f"intrinsics: {lens}")
         write_text(path / "recording.yaml", text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -145,7 +146,8 @@ class _Scan:
             self.time_base = float(stream.time_base) if stream.time_base else None
             first, last = self._bounds(stream)
             if first is not None:
-                container.seek(first, stream=stream)  # to the key frame before it
+                with suppress(av.error.FFmpegError):  # of a damaged index: then from the film's beginning on
+                    container.seek(first, stream=stream)  # to the key frame before it
             packets = container.demux(stream)
             while True:
                 try:

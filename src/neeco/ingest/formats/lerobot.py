@@ -20,7 +20,7 @@ from PIL import Image
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.ingest.choices import find_rotations
-from neeco.ingest.columns import BASE, CAMERA, QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose
+from neeco.ingest.columns import BASE, CAMERA, QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -349,8 +349,8 @@ def _flow(columns: Sequence[str]) -> str:
 
 
 def _joint_name(column: str, body: str) -> str:
-    """`jaw` of `psm1_jaw`."""
-    words = [word for word in re.split(r"[_.\-/]+", column) if word and word != body]
+    """`jaw` of `psm1_jaw`, without the unit."""
+    words = [word for word in re.split(r"[_.\-/]+", split_unit(column, "angle")[0]) if word and word != body]
     return "_".join(words) or column
 
 
