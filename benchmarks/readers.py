@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,44 @@ def write_sequence(compressed: bool) -> Callable[[Contents, Path], Path]:
     return write
 
 
+def write_lerobot(version: str, embedded: bool) -> Callable[[Contents, Path], Path]:
+    """A writer of LeRobot data sets, of which episode 1 of three is read; embedded: images stand in Parquet as PNG."""
+
+    def write(contents: Contents, folder: Path) -> Path:
+        from rendered.lerobotsets import POSE
+        from rendered.lerobotwriter import Episode, LeRobotWriter
+
+        from neeco.ingest.template import write_template
+
+        step = LOG_HZ // RATE_HZ
+        one = [np.array([*place, *turn[1:], turn[0], angle]) for _, place, turn, angle in contents.states()][::step]
+        held = np.tile(np.stack(one), 2)
+        names = [f"{arm.lower()}_{name}" for arm in ARMS for name in (*POSE, "jaw_rad")]
+
+        def episode(count: int) -> Episode:
+            shown = Contents(count, contents.size)
+            return Episode(
+                {"observation.state": held[:count]},
+                {"observation.images.endoscope": lambda: (pixels for _, pixels in shown.images())},
+            )
+
+        episodes = [episode(count) for count in (contents.frames // 4, contents.frames, contents.frames // 4)]
+        path = LeRobotWriter(
+            folder / "set",
+            version,
+            episodes,
+            Fraction(RATE_HZ),
+            contents.size,
+            {"observation.state": [names]},
+            embedded,
+        ).write()
+        text = write_template(path).replace("# frame: camera", "frame: camera").replace("episode 0/", "episode 1/")
+        (folder / "recording.yaml").write_text(text, encoding="utf-8")
+        return folder / "recording.yaml"
+
+    return write
+
+
 RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
     "ros1-jpeg": write_bag("recording.bag", None, jpeg=True),
     "ros1-raw": write_bag("recording.bag", None, jpeg=False),
@@ -118,6 +157,9 @@ RECORDINGS: dict[str, Callable[[Contents, Path], Path]] = {
     "mcap-raw": write_bag("recording-mcap", "zstd", jpeg=False),
     "plus-raw": write_sequence(compressed=False),
     "plus-zlib": write_sequence(compressed=True),
+    "lerobot-2.1": write_lerobot("v2.1", embedded=False),
+    "lerobot-3.0": write_lerobot("v3.0", embedded=False),
+    "lerobot-png": write_lerobot("v3.0", embedded=True),
 }
 
 
