@@ -227,16 +227,24 @@ class _Ingest:
             )
             return None
         given = data.clocks.get(scope.clock)
-        known = given.seconds if given is not None and given.source == "given" else None
-        try:
-            registration = register_with_laparoscope(
-                sfm.world_from_camera, self._times(sfm), scope, known, self.settings
-            )
-        except NeecoError as error:
-            data.note(f"not registered, instrument poses stay in the tracker's frame: {error}")
-            return None
-        data.clocks[scope.clock] = registration.clock
-        return registration
+        # a clock that images and logs share tells when they were written, motion when they were taken
+        offsets: list[float | None] = [] if given is not None and given.source == "given" else [None]
+        offsets += [] if given is None else [given.seconds]
+        why = ""
+        for offset in offsets:
+            try:
+                registration = register_with_laparoscope(
+                    sfm.world_from_camera, self._times(sfm), scope, offset, self.settings
+                )
+            except NeecoError as error:
+                why = why or str(error)
+                continue
+            if why:
+                data.note(f"the clock {scope.clock!r} is taken as {given.source if given else 'given'}: {why}")
+            data.clocks[scope.clock] = given if why and given is not None else registration.clock
+            return registration
+        data.note(f"not registered, instrument poses stay in the tracker's frame: {why}")
+        return None
 
     def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
         def load(row: int) -> np.ndarray:
