@@ -27,6 +27,7 @@ MOST_FEATURES = 2000
 MOST_NUMBERS = 4096  # of one feature in a row
 MOST_ROWS = 2_000_000  # of an episode
 MOST_BYTES = 2**30  # that the columns read of a file may unpack to
+BUFFER = 2**20  # bytes of a column that are read at a time
 MOST_LINE = 2**20  # characters of a line of meta/episodes.jsonl
 
 _FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")
@@ -222,7 +223,8 @@ class ParquetFile:
 
         self.path = path
         with self._reading():
-            self.file = pyarrow.parquet.ParquetFile(path)
+            # a buffer: else all of a column is taken into memory, and images can stand in it
+            self.file = pyarrow.parquet.ParquetFile(path, buffer_size=BUFFER)
             self.names: list[str] = self.file.schema_arrow.names
 
     def read(self, columns: Sequence[str], episode: int | None) -> dict[str, np.ndarray]:
