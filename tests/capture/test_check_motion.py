@@ -89,8 +89,13 @@ def keep(rows: slice) -> Callable[[Document], None]:
 
 def test_a_good_capture_is_silent_whole_or_in_part(sample):
     assert told(sample, lambda document: None) == []
-    for rows in (slice(0, 30), slice(50, 90), slice(None, None, 3)):
-        assert told(sample, keep(rows)) == []
+    assert told(sample, keep(slice(50, 90))) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [slice(0, 30), slice(None, None, 3), slice(20, 60)])
+def test_parts_of_a_good_capture_are_silent(sample, rows):
+    assert told(sample, keep(rows)) == []
 
 
 def test_transposed_rotations_are_told_and_nothing_else(sample):
@@ -98,6 +103,7 @@ def test_transposed_rotations_are_told_and_nothing_else(sample):
     assert line.startswith("frames[*].instruments[*].pose: rotations of 'maryland' are transposed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frames", "words"), [(7, "7 frames later"), (-3, "3 frames earlier"), (15, "15 frames later")]
 )
@@ -106,15 +112,19 @@ def test_states_of_other_frames_are_told_with_their_number(sample, frames, words
     assert line == f"frames[*].instruments[*]: states of 'maryland' fit the images better {words}"
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_off_is_told_in_seconds_where_frames_are_unevenly_spaced(sample):
     (line,) = told(sample, delay(0.48))
     assert line.endswith("states of 'maryland' fit the images better 0.48 s later")
 
 
 def test_a_capture_says_the_mistake_as_a_warning_and_training_does_not_look(sample):
-    told(sample, shift(7))
+    document = json.loads((SAMPLE / "transforms.json").read_text())
+    shift(7)(document)
+    (sample / "transforms.json").write_text(json.dumps(document))
     (problem,) = check_capture(sample)
     assert problem.severity == "warning"
+    assert problem.message == "states of 'maryland' fit the images better 7 frames later"
     assert problem.remedy.startswith("move them 7 frames later")
     assert read_checked(sample).instruments  # not refused
 
@@ -134,6 +144,7 @@ def test_nothing_is_said_where_nothing_can_be_known(sample, field):
     assert not any("fit the images" in problem.message for problem in check_capture(sample))
 
 
+@pytest.mark.slow
 def test_poses_of_a_link_that_turns_against_the_shaft_confuse_nothing(sample):
     """The pose of a wrist that turns by up to 57 degrees: right as it is, transposed when it is transposed."""
     wrist = Link("wrist", "shaft", "revolute", np.eye(4), np.array([1.0, 0, 0]), {"bend": 1.0})

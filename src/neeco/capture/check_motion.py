@@ -12,10 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
-from torch import Tensor
 
 from neeco.capture.documents import Parsed, printable
 from neeco.capture.model import Frame, Instrument, InstrumentState, evenly_spaced
@@ -28,15 +26,15 @@ NEIGHBOURS = 10  # frames that predict one
 NEAR_CAMERAS = 3 * NEIGHBOURS  # at least so many are near enough to choose from, or half of all
 DIFFERENT = (15.0, 50.0)  # of 255, from the prediction: a pixel begins to count as moving, and does wholly
 FEWEST_POINTS = 8  # in view of a camera, to tell depths by
-RAYS = 640  # moving pixels that are asked
-DEPTHS = np.linspace(0.35, 1.0, 14)  # of the tissue's, at which they are
+RAYS = 504  # moving pixels that are asked
+DEPTHS = np.linspace(0.35, 1.0, 12)  # of the tissue's, at which they are
 LONGEST_SHIFT = 16  # steps of time that are tried, at most a fifth of a recording's
 TELLING = 0.4  # share of the rays that are compared: those which some poses explain best
 BLOCKS = 12  # of frames that follow each other, whose answers count as independent
 # An alternative is told when it explains more than the poses given do by these factors, in nearly all blocks. A shift
 # changes much at once; transposed rotations only as much as the instrument turns.
-CLEARLY_TURNED, CLEARLY_SHIFTED = 1.12, 1.3
-SURE = 3.5  # standard errors over the blocks
+CLEARLY_TURNED, CLEARLY_SHIFTED = 1.1, 1.15
+SURELY_TURNED, SURELY_SHIFTED = 3.0, 5.0  # standard errors over the blocks; of many shifts one may fit by chance
 EVIDENT = 0.1  # more evidence than elsewhere at its place, without which no poses explain anything
 BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
 
@@ -47,7 +45,7 @@ class _Alternative:
 
     message: str
     remedy: str
-    needed: float  # factor that makes it clear
+    needed: tuple[float, float]  # factor and certainty that make it clear
     factor: float  # by which they explain more of what moves
     certainty: float  # of that, in standard errors
     explained: float  # evidence beyond the average where they say the instrument is
@@ -55,7 +53,7 @@ class _Alternative:
 
     @property
     def is_clear(self) -> bool:
-        return self.factor > self.needed and self.certainty > SURE and self.explained > EVIDENT
+        return self.factor > self.needed[0] and self.certainty > self.needed[1] and self.explained > EVIDENT
 
 
 class _Timeline:
@@ -207,36 +205,36 @@ class _Rays:
         depths = views.depths[self.frames, row, column][:, None] * DEPTHS
         self.points = slopes[:, None] * depths[..., None]  # [R, D, 3] mm, in the camera's frame
         # what moves everywhere or always tells nothing
-        self._evidence = torch.from_numpy((views.moving - views.moving.mean(0)).astype(np.float32)).flatten()
-        self._others = torch.from_numpy(self.frames[:, None] != np.arange(len(views.rows)))  # [R, F]
+        self._evidence = (views.moving - views.moving.mean(0)).astype(np.float32).ravel()
+        self._others = self.frames[:, None] != np.arange(len(views.rows))  # [R, F]
 
-    def evidence(self, poses: np.ndarray) -> Tensor:
-        """[R, D, F] at the rays' points, carried to every frame by poses [F, 4, 4], world_from_instrument; 0 where they
-        are out of view."""
+    def evidence(self, poses: np.ndarray) -> np.ndarray:
+        """float32 [R, D, F] at the rays' points, carried to every frame by poses [F, 4, 4], world_from_instrument; 0
+        where they are out of view."""
         views, count = self.views, len(self.views.rows)
         camera_from_instrument = np.linalg.inv(views.world_from_camera) @ poses
         back = np.linalg.inv(camera_from_instrument)[self.frames]
         points = np.einsum("rij,rdj->rdi", back[:, :3, :3], self.points) + back[:, None, :3, 3]
+        fixed = points.reshape(-1, 3).astype(np.float32)
         turns, moves = (
-            torch.from_numpy(part.astype(np.float32))
-            for part in (camera_from_instrument[:, :3, :3].reshape(-1, 3), camera_from_instrument[:, :3, 3])
+            part.astype(np.float32) for part in (camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3])
         )
-        fixed = torch.from_numpy(points.reshape(-1, 3).astype(np.float32))
-        local = (fixed @ turns.T).view(-1, count, 3) + moves  # [R D, F, 3]
-        fx, fy, cx, cy = torch.from_numpy(views.intrinsics.astype(np.float32)).T
-        u, v = project(local, fx, fy, cx, cy, BEHIND)
-        inside = (local[..., 2] > BEHIND) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
-        row, column = v.clamp(0, views.height - 1).long(), u.clamp(0, views.width - 1).long()
-        place = (torch.arange(count) * views.height + row) * views.width + column
-        return (self._evidence[place] * inside).view(*self.points.shape[:2], count)
+        x, y, z = (fixed @ turns[:, axis].T + moves[:, axis] for axis in range(3))  # each [R D, F] mm
+        fx, fy, cx, cy = views.intrinsics.astype(np.float32).T
+        depth = z.clip(BEHIND)
+        u, v = x / depth * fx + cx, y / depth * fy + cy
+        inside = (z > BEHIND) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
+        row, column = v.clip(0, views.height - 1).astype(np.int32), u.clip(0, views.width - 1).astype(np.int32)
+        place = (np.arange(count, dtype=np.int32) * views.height + row) * views.width + column
+        return (self._evidence[place] * inside).reshape(*self.points.shape[:2], count)
 
-    def explained(self, evidence: Tensor, counts: np.ndarray) -> np.ndarray:
+    def explained(self, evidence: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """[R] mean evidence at each ray's best depth, over the other frames that count [F]."""
-        weights = self._others & torch.from_numpy(counts)
-        sums = (evidence * weights[:, None]).sum(-1) / weights.sum(-1).clamp_min(1)[:, None]
-        return sums.amax(1).numpy()
+        weights = (self._others & counts).astype(np.float32)
+        means = np.einsum("rdf,rf->rd", evidence, weights) / weights.sum(-1).clip(1)[:, None]
+        return np.asarray(means.max(1))
 
-    def compare(self, given: Tensor, poses: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:
+    def compare(self, given: np.ndarray, poses: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:
         """Factor, certainty and evidence, as `_Alternative` has them, of poses [F, 4, 4] that there are for some frames
         [F]; `given`: `evidence` of those in the capture."""
         counts = inside[self.frames]
@@ -291,7 +289,9 @@ def _likeliest_mistake(
     message = f"rotations of {name} are transposed: so turned back they fit what moves in the images better"
     remedy = "transpose them: their columns are the instrument's axes in the world"
     everywhere = np.ones(len(rows), dtype=bool)
-    tried = [_Alternative(message, remedy, CLEARLY_TURNED, *rays.compare(given, turned[rows], everywhere))]
+    tried = [
+        _Alternative(message, remedy, (CLEARLY_TURNED, SURELY_TURNED), *rays.compare(given, turned[rows], everywhere))
+    ]
     for shift in range(-timeline.longest_shift, timeline.longest_shift + 1):
         if shift == 0:
             continue
@@ -304,9 +304,10 @@ def _likeliest_mistake(
             message = f"states of {name} fit the images better {amount} {direction}"
             remedy = f"move them {amount} {direction} (a clock's offset, frames dropped or counted from another one?)"
             compared = rays.compare(given, moved, inside)
-            tried.append(_Alternative(message, remedy, CLEARLY_SHIFTED, *compared, steps=shift))
-    clear = [one for one in tried if one.is_clear]
-    return max(clear, key=lambda one: one.factor, default=None)
+            tried.append(_Alternative(message, remedy, (CLEARLY_SHIFTED, SURELY_SHIFTED), *compared, steps=shift))
+    best = max((one for one in tried if one.is_clear), key=lambda one: one.factor, default=None)
+    # at the end of what was tried there is no telling whether another shift is the right one
+    return None if best is None or abs(best.steps) == timeline.longest_shift > 0 else best
 
 
 def _of_root(instrument: Instrument, poses: np.ndarray, states: list[InstrumentState]) -> np.ndarray:
