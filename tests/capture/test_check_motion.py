@@ -1,0 +1,163 @@
+"""`neeco check` tells by the images that rotations are transposed or that states belong to other frames."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from neeco.capture import check_capture
+from neeco.capture.check import read_checked
+from neeco.capture.check_motion import check_motion
+from neeco.capture.documents import ProblemReport
+from neeco.capture.kinematics import KinematicTree, Link
+from neeco.capture.reader import parse_capture
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
+Document = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory) -> Path:
+    """A copy of the sample capture, whose transforms.json tests replace."""
+    return Path(shutil.copytree(SAMPLE, tmp_path_factory.mktemp("motion") / "sample"))
+
+
+def told(sample: Path, change: Callable[[Document], object]) -> list[str]:
+    """What the images tell of the sample, changed: place and message."""
+    document = json.loads((SAMPLE / "transforms.json").read_text())
+    change(document)
+    (sample / "transforms.json").write_text(json.dumps(document))
+    report = ProblemReport()
+    parsed = parse_capture(sample, report)
+    assert report.problems == []
+    check_motion(parsed)
+    assert all(problem.severity == "warning" for problem in report.problems)
+    return [f"{problem.field}: {problem.message}" for problem in report.problems]
+
+
+def states(document: Document) -> list[Document]:
+    return [frame["instruments"][0] for frame in document["frames"]]
+
+
+def transpose(document: Document) -> None:
+    for state in states(document):
+        pose = np.array(state["pose"])
+        pose[:3, :3] = pose[:3, :3].T.copy()
+        state["pose"] = pose.tolist()
+
+
+def shift(frames: int) -> Callable[[Document], None]:
+    """Every frame gets the state of so many frames later; at the end the last one stays."""
+
+    def change(document: Document) -> None:
+        given = copy.deepcopy(states(document))
+        last = len(given) - 1
+        for index, frame in enumerate(document["frames"]):
+            frame["instruments"] = [given[min(max(index + frames, 0), last)]]
+
+    return change
+
+
+def delay(seconds: float) -> Callable[[Document], None]:
+    """The states that a clock off by so much would have given, between those recorded."""
+
+    def change(document: Document) -> None:
+        times = np.array([frame["time"] for frame in document["frames"]])
+        poses = np.array([state["pose"] for state in states(document)])
+        wanted = np.clip(times + seconds, times[0], times[-1])
+        turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(wanted).as_matrix()
+        for row, state in enumerate(states(document)):
+            pose = np.eye(4)
+            pose[:3, :3] = turns[row]
+            pose[:3, 3] = [np.interp(wanted[row], times, poses[:, axis, 3]) for axis in range(3)]
+            state["pose"] = pose.tolist()
+
+    return change
+
+
+def keep(rows: slice) -> Callable[[Document], None]:
+    return lambda document: document.update(frames=document["frames"][rows])
+
+
+def test_a_good_capture_is_silent_whole_or_in_part(sample):
+    assert told(sample, lambda document: None) == []
+    assert told(sample, keep(slice(50, 90))) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [slice(0, 30), slice(None, None, 3), slice(20, 60)])
+def test_parts_of_a_good_capture_are_silent(sample, rows):
+    assert told(sample, keep(rows)) == []
+
+
+def test_transposed_rotations_are_told_and_nothing_else(sample):
+    (line,) = told(sample, transpose)
+    assert line.startswith("frames[*].instruments[*].pose: rotations of 'maryland' are transposed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("frames", "words"), [(7, "7 frames later"), (-3, "3 frames earlier"), (15, "15 frames later")]
+)
+def test_states_of_other_frames_are_told_with_their_number(sample, frames, words):
+    (line,) = told(sample, shift(frames))
+    assert line == f"frames[*].instruments[*]: states of 'maryland' fit the images better {words}"
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_off_is_told_in_seconds_where_frames_are_unevenly_spaced(sample):
+    (line,) = told(sample, delay(0.48))
+    assert line.endswith("states of 'maryland' fit the images better 0.48 s later")
+
+
+def test_a_capture_says_the_mistake_as_a_warning_and_training_does_not_look(sample):
+    document = json.loads((SAMPLE / "transforms.json").read_text())
+    shift(7)(document)
+    (sample / "transforms.json").write_text(json.dumps(document))
+    (problem,) = check_capture(sample)
+    assert problem.severity == "warning"
+    assert problem.message == "states of 'maryland' fit the images better 7 frames later"
+    assert problem.remedy.startswith("move them 7 frames later")
+    assert read_checked(sample).instruments  # not refused
+
+
+@pytest.mark.parametrize("field", ["instrument_frame", "ply_file_path"])
+def test_nothing_is_said_where_nothing_can_be_known(sample, field):
+    def change(document: Document) -> None:
+        shift(7)(document)
+        if field == "instrument_frame":
+            document[field] = "unregistered"
+        else:
+            document.pop(field)
+
+    document = json.loads((SAMPLE / "transforms.json").read_text())
+    change(document)
+    (sample / "transforms.json").write_text(json.dumps(document))
+    assert not any("fit the images" in problem.message for problem in check_capture(sample))
+
+
+@pytest.mark.slow
+def test_poses_of_a_link_that_turns_against_the_shaft_confuse_nothing(sample):
+    """The pose of a wrist that turns by up to 57 degrees: right as it is, transposed when it is transposed."""
+    wrist = Link("wrist", "shaft", "revolute", np.eye(4), np.array([1.0, 0, 0]), {"bend": 1.0})
+    tree = KinematicTree((Link("shaft"), wrist), pose_of="wrist")
+
+    def bent(document: Document) -> None:
+        document["instruments"] = [
+            {"name": "maryland", "joints": {"jaw_angle": {}, "bend": {}}, "kinematics": tree.to_json()}
+        ]
+        for row, state in enumerate(states(document)):
+            state["joints"]["bend"] = float(np.sin(0.9 * row))
+            state["pose"] = (np.array(state["pose"]) @ tree.poses(state["joints"])["wrist"]).tolist()
+
+    assert told(sample, bent) == []
+    (line,) = told(sample, lambda document: (bent(document), transpose(document)))
+    assert "are transposed" in line
