@@ -91,8 +91,8 @@ class PlusSequence(RecordingFormat):
         _, stated_in = _ends(name)
         table = Table(path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in)
         notes = [
-            f"{table.title}: {len(lost)} frame{'' if len(lost) == 1 else 's'} dropped: {why} ({table.list_rows(lost)})"
-            for why, lost in dropped.items()
+            f"{table.title}: {len(left)} frame{'' if len(left) == 1 else 's'} dropped: {why} ({table.list_rows(left)})"
+            for why, left in dropped.items()
         ]
         if not rows:
             why = next(iter(dropped))
