@@ -84,7 +84,7 @@ def test_the_page_is_whole_and_fetches_nothing(text):
     page = Page(VOID)
     page.feed(text)
     assert page.open == []
-    assert len(page.references) == 8
+    assert len(page.references) == 12
     assert all(reference.startswith("data:image/jpeg") for reference in page.references)
     assert "http" not in text
     assert page.tags.count("svg") == 2 + 2 + 7  # residuals, views, degrees of freedom

@@ -53,6 +53,8 @@ class Ingest:
     recording.yaml into it, or beside it."""
     formats: bool = False
     """List the formats that recordings are read from."""
+    rrd: Path | None = None
+    """Write images, poses, joints, what moves and clocks into this file, too, for the rerun viewer."""
     json: bool = False
     """Print the numbers as JSON."""
 
@@ -81,7 +83,7 @@ def run(args: Ingest) -> int:
             raise NeecoError(f"{args.source}: holds a recording; give the file: {args.source / RECORDING}")
         _refuse_beside(args, f"{args.source}: a folder in another format", keep=("output",))
         return _convert(args.source, output)
-    return _ingest(_recording(args), output, args.json)
+    return _ingest(_recording(args), output, args.rrd, args.json)
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
@@ -136,7 +138,7 @@ def _recording(args: Ingest) -> Recording:
     from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
 
     if args.source is not None:
-        _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "json"))
+        _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "rrd", "json"))
         check_frames(args.frames)
         recording = read_recording(args.source)
         return recording if args.frames is None else replace(recording, frames=args.frames)
@@ -156,12 +158,15 @@ def _recording(args: Ingest) -> Recording:
     )
 
 
-def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
+def _ingest(recording: Recording, output: Path, rrd: Path | None, as_json: bool) -> int:
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
     from neeco.ingest.pipeline import ingest
     from neeco.report.ingest_page import write_ingest_page
+    from neeco.report.rerun_log import require_rerun, write_rrd
 
+    if rrd is not None:
+        require_rerun()
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -180,7 +185,11 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
             report("writing the page", 0, 0)
             checked = inspect_capture(folder)
             problems.extend(checked.problems)
-            write_ingest_page(result, folder / PAGE, checked.capture or read_capture(folder))
+            capture = checked.capture or read_capture(folder)
+            write_ingest_page(result, folder / PAGE, capture)
+            if rrd is not None:
+                report("writing for rerun", 0, 0)
+                write_rrd(result, capture, rrd)
 
         try:
             result = ingest(recording, output, report, complete)
@@ -194,6 +203,8 @@ def _ingest(recording: Recording, output: Path, as_json: bool) -> int:
         print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
     print(f"how good it is: {output / PAGE}")
+    if rrd is not None:
+        print(f"to scrub through: rerun {rrd}")
     return 0
 
 

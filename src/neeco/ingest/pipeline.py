@@ -48,6 +48,11 @@ class IngestResult:
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
     search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
+    # camera_from_instrument [K, 4, 4] mm of each instrument before registration: the laparoscope's sensor taken for its
+    # camera. NaN where a log has a gap; empty where there was no registration
+    unregistered: dict[str, np.ndarray] = field(default_factory=dict)
+    # video frame -> [h, w] how often pixels were seen to move
+    moving: dict[int, np.ndarray] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""
@@ -108,6 +113,7 @@ class _Ingest:
         self.size = self.data.video.size
         self.lens = self._read_lens()
         self.dropped: dict[int, str] = {}  # video frame -> why
+        self.moving: dict[int, np.ndarray] = {}  # video frame -> [h, w] what moves in it
         self.selected = self._choose()  # [K] video frames
         self.names = [f"{frame:06d}.png" for frame in self.selected]
         self._write_images()
@@ -276,6 +282,7 @@ class _Ingest:
         rows = np.unique(np.linspace(0, len(sfm.indices) - 1, self.settings.shape_frames).astype(int))
         flow = self._residual_flow(sfm, pinhole)
         evidence = flow.moving_pixels(rows, self.settings.moving_px)
+        self.moving = dict(zip(self.selected[sfm.indices[rows]].tolist(), evidence, strict=True))
         cameras, points = registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         shapes = {}
         for name, log in self.data.poses.items():
@@ -361,7 +368,15 @@ class _Ingest:
             rule,
             tuple(data.notes),
             self.motion.search,
+            self._unregistered(states, times, chosen) if registration is not None else {},
+            self.moving,
         )
+
+    def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:
+        """`IngestResult.unregistered`, of the `chosen` of frames at times [M] s."""
+        assert self.data.scope is not None
+        sensors, _ = self.data.instrument_poses(self.data.scope, times[chosen])
+        return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in states.items()}
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:
         """Cameras [M, 4, 4] and points [P, 3] in mm: the tracker's, or SfM's frame at a plausible size."""

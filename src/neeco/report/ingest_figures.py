@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from PIL import Image, ImageDraw, ImageFilter
 from torch import Tensor
 
-from neeco.capture.model import Capture, Frame
+from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.evaluation.image_metrics import outline
 from neeco.ingest.motion import RoughShape
 from neeco.raster.pinhole import project_world
@@ -19,7 +19,7 @@ from neeco.raster.types import Camera
 from neeco.report.charts import PALETTE, draw_dots, inline_svg, new_axes, page_style
 from neeco.report.page import MAX_WIDTH, jpeg, to_bytes
 
-SAMPLES = 8  # frames shown
+SAMPLES = 12  # frames shown
 AXIS_COLORS = ("#ff5252", "#4cd964", "#4aa8ff")  # x, y, z
 MAIN_AXIS_COLOR = "#ff6bff"
 OUTLINE_COLOR = "#ffe14a"
@@ -70,14 +70,10 @@ def main_axes(capture: Capture, shapes: Mapping[str, RoughShape]) -> dict[str, M
     return axes
 
 
-def sample_figures(
-    capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
-) -> list[tuple[str, Frame]]:
-    """(data URI, frame) of up to SAMPLES frames, evenly spread over time. Frame axes are `length` mm long; unregistered
-    poses are not drawn. Raises NeecoError when an image cannot be read."""
+def sample_frames(capture: Capture) -> list[Frame]:
+    """Up to SAMPLES frames, evenly spread over time."""
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))
-    return [(_draw(frames[index], capture, shapes, axes, length), frames[index]) for index in chosen]
+    return [frames[index] for index in evenly_spaced(len(frames), SAMPLES)]
 
 
 def axis_length(capture: Capture) -> float:
@@ -94,11 +90,13 @@ def axis_length(capture: Capture) -> float:
 def in_view(capture: Capture, name: str) -> float:
     """Share of an instrument's frames in which its tracked origin lies inside the image."""
     frames = [frame for frame in capture.frames if name in frame.state.instruments]
-    inside = 0
-    for frame in frames:
-        ((x, y),), (depth,) = _project(ORIGIN, frame.state.instruments[name].pose, frame.camera)
-        inside += bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
-    return inside / max(len(frames), 1)
+    return sum(shows(frame, frame.state.instruments[name].pose) for frame in frames) / max(len(frames), 1)
+
+
+def shows(frame: Frame, pose: Tensor) -> bool:
+    """Whether the origin of an instrument at `pose`, world_from_instrument [4, 4], lies inside the image."""
+    ((x, y),), (depth,) = _project(ORIGIN, pose, frame.camera)
+    return bool(depth > NEAR and 0 <= x < frame.camera.width and 0 <= y < frame.camera.height)
 
 
 def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
@@ -111,23 +109,28 @@ def _visibility(point: np.ndarray, name: str, frames: list[Frame]) -> float:
     return score
 
 
-def _draw(
-    frame: Frame, capture: Capture, shapes: Mapping[str, RoughShape], axes: Mapping[str, MainAxis], length: float
+def posed_picture(
+    frame: Frame,
+    poses: Mapping[str, Tensor],
+    shapes: Mapping[str, RoughShape],
+    axes: Mapping[str, MainAxis],
+    length: float,
 ) -> str:
+    """A frame as a data URI, with what is known of instruments at poses, world_from_instrument [4, 4], drawn over it;
+    their axes are `length` mm long. Raises NeecoError when the image cannot be read."""
     # drawn at twice the size shown, then shrunk: smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
     size = (2 * MAX_WIDTH, round(frame.camera.height * scale))
     camera = Camera(frame.camera.world_from_camera, fx, fy, cx, cy, *size)
     image = Image.fromarray(to_bytes(frame.load_image().numpy())).resize(size, Image.Resampling.BICUBIC)
-    if capture.registered:
-        for name, state in frame.state.instruments.items():
-            if name in shapes:
-                _draw_outline(image, shapes[name], state.pose, camera)
-            painter = ImageDraw.Draw(image)
-            if name in axes:
-                _draw_main_axis(painter, axes[name], state.pose, camera)
-            _draw_frame(painter, state.pose, camera, length)
+    for name, pose in poses.items():
+        if name in shapes:
+            _draw_outline(image, shapes[name], pose, camera)
+        painter = ImageDraw.Draw(image)
+        if name in axes:
+            _draw_main_axis(painter, axes[name], pose, camera)
+        _draw_frame(painter, pose, camera, length)
     return jpeg(np.asarray(image))
 
 

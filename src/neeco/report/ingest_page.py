@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from neeco.capture import read_capture
-from neeco.capture.model import Capture
+from neeco.capture.model import Capture, Frame
 from neeco.ingest.pipeline import IngestResult
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
@@ -81,21 +83,42 @@ def _clocks(result: IngestResult, capture: Capture) -> list[list[str]]:
 
 
 def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.MainAxis]) -> dict[str, Any]:
-    """Sample frames as (picture, which frame, its second, its split), and the key to what is drawn over them."""
+    """Sample frames as (picture, picture before registration, which frame, its second, its split), and the key to what
+    is drawn over them. The second is empty where nobody knows."""
     length = figures.axis_length(capture)
-    numbers = dict(zip(np.round(result.selected_times, 6).tolist(), result.selected.tolist(), strict=True))
+    rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
-    samples = []
-    for picture, frame in figures.sample_figures(capture, result.shapes, axes, length):
-        number = numbers.get(round(frame.state.time, 6))
-        place = frame.name if number is None else f"video frame {number}"
-        samples.append((picture, place, f"{frame.state.time - start:.2f}", frame.split))
+    samples, shown_before = [], 0
+    for frame in figures.sample_frames(capture):
+        row = rows.get(round(frame.state.time, 6))
+        poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
+        before = {} if row is None else _unregistered(result, frame, row)
+        shown_before += any(figures.shows(frame, pose) for pose in before.values())
+        samples.append(
+            (
+                figures.posed_picture(frame, poses, result.shapes, axes, length),
+                figures.posed_picture(frame, before, result.shapes, axes, length) if before else "",
+                frame.name if row is None else f"video frame {result.selected[row]}",
+                f"{frame.state.time - start:.2f}",
+                frame.split,
+            )
+        )
     return {
         "samples": samples,
+        "compared": any(before for _, before, *_ in samples),
+        "shown_before": shown_before,
         "axis_mm": f"{length:g}",
         "axis_colors": list(zip("xyz", figures.AXIS_COLORS, strict=True)),
         "shaped": any(name in result.shapes for name in axes),
         "shape_colors": (figures.OUTLINE_COLOR, figures.MAIN_AXIS_COLOR),
+    }
+
+
+def _unregistered(result: IngestResult, frame: Frame, row: int) -> dict[str, Tensor]:
+    """world_from_instrument [4, 4] of every instrument before registration, in the frame of a row of `selected`."""
+    poses = {name: torch.from_numpy(poses[row]) for name, poses in result.unregistered.items()}
+    return {
+        name: frame.camera.world_from_camera.double() @ pose for name, pose in poses.items() if pose.isfinite().all()
     }
 
 
