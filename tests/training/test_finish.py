@@ -20,7 +20,7 @@ from neeco.scene.methods import make_deformation
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import SearchConfig, TrainConfig
-from neeco.training.instruments.finish import conclude, extend_shaft, shaft_coverage
+from neeco.training.instruments.finish import conclude, extend_shaft, settle_links, shaft_coverage
 from neeco.training.instruments.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
 
@@ -245,3 +245,41 @@ def test_a_shaft_whose_end_was_seen_stays_as_it_is(session: GaussianSession) -> 
     canonical, hinges = shaft_of(40)
     same = extend_shaft(canonical, 1, "tool", hinges, recorded_at(session, -60.0), 60.0)
     assert same is canonical
+
+
+def links_near_the_hinge(session: GaussianSession, share: float) -> list[int]:
+    """The link that holds the most of a Gaussian beside the hinge, of one between the prongs and of one far beyond,
+    once learned: the first two were learned as jaw 1, the last one as the shaft that might be jaw 2."""
+    hinges = hinges_of(session)
+    hinges.hinge_angle.fill_(0.3)
+    hinges.share.fill_(share)
+    hinges.radius.fill_(3.0)
+    pivot, axis = hinges.hinge(0)
+    _, direction = hinges.shaft()
+    places = torch.stack([pivot + 2.5 * axis, pivot + 0.5 * axis, pivot + 6.0 * direction])
+    logits = torch.tensor([[0.0, 25.0, 0.0, 7.0], [0.0, 25.0, 0.0, 7.0], [25.0, 0.0, 1.0, 7.0]])
+    settled = hinges.settled(places, logits)
+    assert torch.equal(settled[:, 3], logits[:, 3])  # of another instrument's further links
+    return hinges.link_weights(places, settled).argmax(1).tolist()
+
+
+def test_only_what_holds_the_jaws_is_beside_the_hinge_and_only_jaws_are_beyond(session: GaussianSession) -> None:
+    assert links_near_the_hinge(session, share=0.6) == [0, 1, 2]
+
+
+def test_beyond_the_hinge_a_jaw_that_stands_still_is_left_as_it_was_learned(session: GaussianSession) -> None:
+    assert links_near_the_hinge(session, share=1.0) == [0, 1, 0]
+
+
+def test_a_scene_is_stored_with_its_links_settled(session: GaussianSession) -> None:
+    scene, hinges = session.scene, hinges_of(session)
+    rows = scene.canonical.body(1)
+    logits = scene.canonical.extras[LINK_LOGITS].clone()
+    logits[rows.stop - 15 : rows.stop] = torch.tensor([30.0, 0.0, 1.0])  # the second jaw, learned as the shaft
+    scene.canonical = scene.canonical.with_extras(**{LINK_LOGITS: logits})
+    settled = settle_links(scene.canonical, scene.deformation)
+    places, links = settled.means[rows], settled.extras[LINK_LOGITS][rows].argmax(1)
+    beyond = hinges.along_shaft(places) > PIVOT_MM + 0.9 * 3.0
+    assert bool(beyond.any())
+    assert not bool((links[beyond] == 0).any())
+    assert torch.equal(settled.extras[LINK_LOGITS][: rows.start], logits[: rows.start])

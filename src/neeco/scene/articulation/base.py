@@ -139,6 +139,11 @@ class Articulation(nn.Module):
         their places speak against; None where places say nothing."""
         return None
 
+    def settled(self, points: Tensor, logits: Tensor) -> Tensor:
+        """Logits [M, link_count or more] of Gaussians at points [M, 3] mm once all is learned, without links that their
+        places rule out."""
+        return logits
+
     def shaft_like(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """([M] shares of Gaussians that look like the shaft's surface, by their link weights; [] mm along the shaft as
         far as they do)."""

@@ -13,6 +13,11 @@ from neeco.raster.rotations import rotate_about
 from neeco.scene.articulation.base import Articulation, JointMotion, Skeleton
 
 JAWS_BEYOND = 0.75  # radii beyond the hinge, where nothing but jaws is
+PRONGS_FROM = (
+    0.55  # radii from the middle of the hinge's axis: short of that place are only the prongs that hold the jaws
+)
+PLACE_SOFTNESS = 0.2  # radii, of either border
+RULED_OUT = 10.0  # by which the logit of a link that places rule out is below all others
 FIXED_JAW_GAIN = 0.25  # rad per rad of reading: a part that turns less is a jaw that stands still
 MIN_PART_SHARE = 0.5  # of a Gaussian that counts as belonging to a part
 MIN_AT_TIP = 10  # Gaussians of a part, with fewer its tip stays unknown
@@ -130,15 +135,42 @@ class Hinges(Articulation):
         along, body = self.along_shaft(points), weights[:, 0]
         jaws: list[Tensor] = []
         for joint in range(len(self.reading_names)):
-            gains = self.gains[joint].detach().abs()
-            fixed = (gains < FIXED_JAW_GAIN) & (gains == gains.min())  # [2]
             beyond = along > self.hinge_depth[joint] + JAWS_BEYOND * self.radius  # [M]
-            fixed_jaw = body[:, None] * (beyond[:, None] & fixed)
+            fixed_jaw = body[:, None] * (beyond[:, None] & self._fixed(joint))
             pair = weights[:, 1 + 2 * joint : 3 + 2 * joint] + fixed_jaw
             body = body - fixed_jaw.sum(1)
             jaws += pair.index_select(1, self.left_right_order(joint)).unbind(1)
         wrist = (along >= self.wrist_start).to(weights.dtype)
         return torch.stack([body * (1 - wrist), body * wrist, *jaws], -1)
+
+    def settled(self, points: Tensor, logits: Tensor) -> Tensor:
+        if not self.jointed:
+            return logits
+        own, ruled_out = logits[:, : self.link_count], self._ruled_out(points) > 0.5
+        lowest = own.masked_fill(ruled_out, torch.inf).amin(1, keepdim=True)
+        settled = torch.where(ruled_out, torch.minimum(own, lowest - RULED_OUT), own)
+        return torch.cat([settled, logits[:, self.link_count :]], 1)
+
+    @torch.no_grad()
+    def _ruled_out(self, points: Tensor) -> Tensor:
+        """[M, link_count] in [0, 1]: how surely links cannot be at points [M, 3] mm. Near a hinge all move alike, and
+        images hardly tell: but jaws turn between the prongs of what holds them, and beyond those there is nothing else,
+        unless a jaw stands still."""
+        along, beyond, columns = self.along_shaft(points), points.new_ones(len(points)), []
+        for joint in range(len(self.reading_names)):
+            pivot, axis = self.hinge(joint)
+            aside = ((points - pivot) @ axis).abs() / self.radius
+            past = (along - self.hinge_depth[joint]) / self.radius - JAWS_BEYOND
+            past = (0.5 + past / PLACE_SOFTNESS).clamp(0, 1)
+            prongs = (0.5 + (aside - PRONGS_FROM) / PLACE_SOFTNESS).clamp(0, 1) * (1 - past)
+            columns += [prongs, prongs]
+            beyond = beyond * past * ~self._fixed(joint).any()
+        return torch.stack([beyond, *columns], 1)
+
+    def _fixed(self, joint: int) -> Tensor:
+        """[2] bool: which of a joint's jaws stands still, if any."""
+        gains = self.gains[joint].detach().abs()
+        return (gains < FIXED_JAW_GAIN) & (gains == gains.min())
 
     def left_right_order(self, joint: int) -> Tensor:
         """A joint's two jaws (0 and 1) as indices [2], the left one first.

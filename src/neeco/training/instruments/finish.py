@@ -11,7 +11,7 @@ from torch import Tensor
 from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
 from neeco.raster import rasterize
 from neeco.raster.pinhole import in_image
-from neeco.scene.articulation import ArticulatedInstruments, Articulation
+from neeco.scene.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
@@ -35,7 +35,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     Reports an instrument of which hardly anything was learned: its labels would stay empty without a message.
     """
     session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
-    session.scene.canonical = drop_occluded(session.scene)
+    session.scene.canonical = settle_links(drop_occluded(session.scene), articulated)
     verdicts: dict[str, Any] = {}
     for index, instrument in enumerate(session.scene.instruments):
         articulation = articulated.articulations[index]
@@ -64,6 +64,15 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
     session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
+
+
+def settle_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
+    """The canonical Gaussians without links that their places rule out."""
+    logits = canonical.extras[LINK_LOGITS].clone()
+    for index, articulation in enumerate(articulated.articulations):
+        rows = canonical.body(index + 1)
+        logits[rows] = articulation.settled(canonical.means[rows], logits[rows])
+    return canonical.with_extras(**{LINK_LOGITS: logits})
 
 
 def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:
