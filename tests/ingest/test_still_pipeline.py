@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,6 +138,18 @@ def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatr
     assert not read_capture(result.capture).registered
     assert any("poses of bar" in note for note in result.notes)
     assert "100 mm" in str(result.tissue)
+
+
+def test_a_still_capture_has_few_cameras_and_check_says_so(theatre: Theatre) -> None:
+    root = theatre.ingest().capture
+    assert inspect_capture(root).summary.still
+    document = json.loads((root / "transforms.json").read_text())
+    for number, frame in enumerate(document["frames"]):
+        frame["transform_matrix"][0][3] = 0.1 * number
+    (root / "transforms.json").write_text(json.dumps(document))
+    wrong = [str(problem) for problem in inspect_capture(root).problems if problem.severity == "error"]
+    assert len(wrong) == 1
+    assert "camera_motion: is 'still', but the frames have" in wrong[0]
 
 
 def test_a_still_capture_stays_one_when_it_is_written_again(theatre: Theatre) -> None:
