@@ -22,7 +22,9 @@ from neeco.raster.pinhole import project
 SPACING = 3  # px, of a reduced image, between points of the tissue
 CELL = 4  # px, of a reduced image, of the grid on which surfaces are smoothed
 STIFFNESS = 30.0  # weight of bending against that of what was measured in a cell
-BEHIND = 1.15  # times the depth of the deepest place of an instrument: what it touches, its rough shape does not reach
+# times the depth of the deepest place of an instrument: its rough shape lacks what opens and closes, which tissue right
+# behind it would hide
+BEHIND = 1.5
 FARTHEST = 0.75  # of the least inverse depth at which an instrument was
 PULL = 1e-3  # weight by which the tissue is drawn towards the instruments before it, where they may be nearer
 ROUNDS = 30  # in which places are found where it would be before one
@@ -72,13 +74,13 @@ def surface_behind(
         how = (
             f"not known and taken to be {otherwise:.0f} mm, as nothing says where an instrument was"
             if deepest is None
-            else f"not known; a plane right behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
+            else f"not known; a plane well behind the deepest recorded pose ({deepest:.0f} mm) stands for it"
         )
         return TissueSurface(flat, how)
     inverse = _smoothest_behind(1 / (BEHIND * np.where(bound > 0, bound, np.inf)))
     depth = 1 / cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     low, high = np.quantile(depth, (0.05, 0.95))
-    how = f"not measured: a smooth surface right behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
+    how = f"not measured: a smooth surface well behind all places of the instruments ({low:.0f} to {high:.0f} mm)"
     return TissueSurface(depth, how)
 
 
