@@ -31,6 +31,10 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      `neeco ingest OUT/recording/plus/recording.yaml`; brings --video
     --lerobot        also recording/lerobot/: the recording as LeRobot data sets v2.1 and v3.0 (needs pyarrow, too),
                      each with a recording.yaml; brings --video
+    --still          the scope stands still at the middle of its path; the world is its camera's frame, in which poses
+                     are logged, and cameras have no errors
+    --stereo         --still with a second camera beside it: recording/ also has right.mp4 and stereo.yaml, as OpenCV's
+                     stereoCalibrate finds it; brings --video
 
 CPU seconds a frame, written, on one core of an EPYC: 0.6 at 320x256 (0.7 with detail), 1.3 at 640x512, 2.3 at 1280x720,
 4.1 at 1920x1080; two to three times that with `--lens`.
@@ -108,12 +112,19 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--bag", action="store_true", help="also recording/bags/: the recording as ROS bags")
     parser.add_argument("--plus", action="store_true", help="also recording/plus/: the recording as PLUS has it")
     parser.add_argument("--lerobot", action="store_true", help="also recording/lerobot/: the recording as data sets")
+    parser.add_argument("--still", action="store_true", help="the scope stands still")
+    parser.add_argument("--stereo", action="store_true", help="a still scope with two cameras")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
     arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
-    arguments.video |= arguments.bag or arguments.plus or arguments.lerobot
+    arguments.video |= arguments.bag or arguments.plus or arguments.lerobot or arguments.stereo
     if arguments.video and spec.encoders is not None:
         parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
+    if arguments.stereo and arguments.lens:
+        parser.error("--stereo: both cameras are pinholes; leave out --lens")
+    still = arguments.still or arguments.stereo
+    if still and (arguments.bag or arguments.plus or arguments.lerobot):
+        parser.error("--still: bags, PLUS and LeRobot files are of a scope that moves; leave out one of the two")
     settings = Settings(
         arguments.size,
         every=arguments.every,
@@ -126,9 +137,13 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         bags=arguments.bag,
         plus=arguments.plus,
         lerobot=arguments.lerobot,
+        still=still,
+        stereo=arguments.stereo,
         workers=arguments.workers,
     )
-    if arguments.video:
+    if still:
+        spec = spec.with_still_camera()
+    elif arguments.video:
         spec = spec.with_rolling_camera()
     return without_sign(spec) if arguments.positive else spec, arguments.output, settings
 

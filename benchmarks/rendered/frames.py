@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neeco.capture.images import write_labels
@@ -21,13 +22,15 @@ from rendered.adaptive import draw_detailed
 from rendered.breathing import Mode, breathing_modes, displacement_at
 from rendered.detail import Detail, make_detail
 from rendered.hinge import truth_ids
-from rendered.motion import Array, Moment, Trajectory, is_unseen
+from rendered.motion import Array, Moment, Trajectory, is_unseen, rigid
 from rendered.optics import Optics
 from rendered.render import Drawing, Lens, Place, draw, view_of
 from rendered.scenes import SceneSpec
 from rendered.tissue import ORGANS
 
 DEPTH_UNIT_MM, DEPTH_STRIDE, DEPTH_EVERY = 0.05, 2, 4
+# the right camera of a stereo scope: 4.6 mm beside the left one, turned towards what it looks at
+RIGHT_FROM_LEFT = rigid(Rotation.from_rotvec([0.003, -0.035, 0.004]).as_matrix(), np.array([-4.6, 0.05, 0.08]))
 Gains = dict[int, tuple[float, float, float]]
 
 
@@ -47,6 +50,8 @@ class Settings:
     bags: bool = False  # recording/bags/: the same as ROS bags
     plus: bool = False  # recording/plus/: the same as a PLUS sequence
     lerobot: bool = False  # recording/lerobot/: the same as LeRobot data sets
+    still: bool = False  # the scope stands still
+    stereo: bool = False  # right/: the images of a second camera beside it
     workers: int = 1
 
     @property
@@ -63,6 +68,8 @@ class Settings:
             (self.bags, " --bag"),
             (self.plus, " --plus"),
             (self.lerobot, " --lerobot"),
+            (self.still and not self.stereo, " --still"),
+            (self.stereo, " --stereo"),
             (self.every > 1, f" --every {self.every}"),
         ]
         return size + "".join(option for wanted, option in given if wanted)
@@ -136,6 +143,10 @@ class Renderer:
             color = optics.add_border(self._draw(replace(place, lens=optics), shot).color)
             raw = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 1)))
             _write_jpeg(self.path / "raw" / Path(image_name(shot)).name, raw)
+        if self.settings.stereo:
+            color = self._draw(seen_from_right(place), beside(shot)).color
+            right = _add_noise(color, np.random.default_rng((self.spec.seed, shot.number, 2)))
+            _write_jpeg(self.path / right_name(shot), right)
         return Rendered(pixels, drawing)
 
     def _draw(self, place: Place, shot: Shot) -> Drawing:
@@ -150,6 +161,18 @@ class Renderer:
             counts = (drawing.depth[::DEPTH_STRIDE, ::DEPTH_STRIDE] / DEPTH_UNIT_MM).round().clamp(0, 65535)
             depth = Image.fromarray(counts.numpy().astype(np.uint16))
             write_atomically(truth / "depth" / name, lambda target: depth.save(target, "PNG"))
+
+
+def seen_from_right(place: Place) -> Place:
+    """A place whose lamps stay where they are, in the right camera's frame."""
+    lamps = np.array(place.lamps.positions) @ RIGHT_FROM_LEFT[:3, :3].T + RIGHT_FROM_LEFT[:3, 3]
+    return replace(place, lamps=replace(place.lamps, positions=tuple(map(tuple, lamps.tolist()))))
+
+
+def beside(shot: Shot) -> Shot:
+    """A shot as the right camera takes it."""
+    camera = shot.moment.scene_from_camera @ np.linalg.inv(RIGHT_FROM_LEFT)
+    return replace(shot, moment=replace(shot.moment, scene_from_camera=camera))
 
 
 def moved(place: Place, modes: tuple[Mode, ...], time: float) -> Place:
@@ -198,6 +221,11 @@ def _write_jpeg(path: Path, pixels: Array) -> None:
 def image_name(shot: Shot) -> str:
     """An image's path in the capture."""
     return f"images/{shot.number:06d}.jpg"
+
+
+def right_name(shot: Shot) -> str:
+    """The path of the right camera's image."""
+    return f"right/{shot.number:06d}.jpg"
 
 
 def has_depth(shot: Shot) -> bool:

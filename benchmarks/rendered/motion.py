@@ -95,7 +95,7 @@ class Trajectory:
         hinge = np.asarray(self._hinge(time))
         opening, roll = float(self._opening(time)), float(self._roll(time))
         return Moment(
-            _look(center, target, self.path.camera_roll + self.path.camera_rolling * math.sin(time)),
+            look(center, target, self.path.camera_roll + self.path.camera_rolling * math.sin(time)),
             _aim(np.array(self.path.trocar), hinge, self.path.roll_middle + roll, self.hinge_mm),
             opening,
             roll,
@@ -186,7 +186,7 @@ def _spread(count: int, width: int, generator: np.random.Generator) -> Array:
     return np.stack([generator.permutation(base) for _ in range(width)], -1)
 
 
-def _look(center: Array, target: Array, roll: float) -> Array:
+def look(center: Array, target: Array, roll: float) -> Array:
     """Camera pose [4, 4] (OpenCV axes) whose image x is about the scene's x, rolled about the view's axis."""
     forward = _unit(target - center)
     about = np.array([math.sin(roll), -math.cos(roll), 0.0])

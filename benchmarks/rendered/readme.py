@@ -77,11 +77,18 @@ def _switched_on(settings: Settings) -> str:
         said.append("`raw/`: the images as the endoscope distorts them, in a round border (optics/calibration.yaml);")
         said.append("`images/` are pinhole, what the border hides is masked.")
     if settings.video:
-        said.append("`recording/`: the same as a recording, for `neeco ingest`; the camera rolls.")
+        said.append(
+            "`recording/`: the same as a recording, for `neeco ingest`"
+            f"{'.' if settings.still else '; the camera rolls.'}"
+        )
     if settings.bags:
         said.append("`recording/bags/`: the recording as bags of ROS 1, ROS 2 and MCAP, all on one clock.")
     if settings.plus:
         said.append("`recording/plus/`: images and poses as a sequence of the PLUS toolkit, on one clock.")
     if settings.lerobot:
         said.append("`recording/lerobot/`: the recording as LeRobot data sets v2.1 and v3.0, states at the images.")
+    if settings.still:
+        said.append("The scope stands still; the world is its camera's frame, which has no errors.")
+    if settings.stereo:
+        said.append("`right/`: what a second camera beside it sees (recording/stereo.yaml).")
     return "".join(f"{line}\n" for line in said)

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from neeco.files import write_atomically, write_json, write_text
 from rendered import errors
-from rendered.frames import Settings, Shot, image_name
+from rendered.frames import RIGHT_FROM_LEFT, Settings, Shot, image_name, right_name
 from rendered.motion import FRAME_RATE, Array, Trajectory, rigid
 from rendered.optics import Optics
 from rendered.plus import write_plus
+from rendered.render import Lens
 from rendered.truth import JOINT, World
 
 EM_HZ, JAW_HZ = 40.0, 50.0
@@ -37,6 +38,9 @@ def write_raw_recording(
     folder, spec = path / "recording", world.spec
     rate = Fraction(round(FRAME_RATE), settings.every)
     _write_video(folder / "video.mp4", [path / _recorded(shot, settings) for shot in world.shots], rate)
+    if settings.stereo:
+        _write_video(folder / "right.mp4", [path / right_name(shot) for shot in world.shots], rate)
+        write_text(folder / "stereo.yaml", _stereo_calibration(settings.lens))
     times, readings = _sensor_times(world, JAW_HZ, generator), spec.joint
     opening = np.array([trajectory.at(float(time)).opening for time in times])
     noisy = errors.disturb_readings(
@@ -51,7 +55,7 @@ def write_raw_recording(
     angles = np.linspace(*readings.limits, TABLE)
     table = [(int(c), f"{a:.5f}") for c, a in zip(np.rint(_counts(angles, readings.limits)), angles, strict=True)]
     _write_csv(folder / "logs" / "jaw_calibration.csv", "hall_raw,angle_rad", table)
-    for name in ("instrument", "camera"):
+    for name in ("instrument",) if settings.still else ("instrument", "camera"):
         times = _sensor_times(world, EM_HZ, generator)
         moments = [trajectory.at(float(time)) for time in times]
         exact = [world.sensor(m) if name == "instrument" else world.camera(m) @ CAMERA_FROM_SENSOR for m in moments]
@@ -93,16 +97,36 @@ def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[
     joint: dict[str, object] = {"file": "logs/jaw.csv", "columns": {"time": "t_s", "value": "hall_raw"}}
     joint |= {"calibration": "logs/jaw_calibration.csv", "limits": list(spec.joint.limits)}
     of = {split: [k for k, shot in enumerate(world.shots) if shot.split == split] for split in ("test", "unseen")}
-    return {
-        "video": "video.mp4",
+    document: dict[str, object] = {"video": "video.mp4"}
+    poses: object = "logs/instrument.csv"
+    if settings.still:
+        document |= {"camera": "still"}
+        poses = {"file": poses, "frame": "camera"}
+    if settings.stereo:
+        document |= {"stereo": {"video": "right.mp4", "calibration": "stereo.yaml"}}
+    return document | {
         "intrinsics": "calibration.yaml"
         if settings.optics
         else [lens.focal, lens.focal, lens.width / 2, lens.height / 2],
-        "instruments": [{"name": spec.design.name, "poses": "logs/instrument.csv", "joints": {JOINT: joint}}],
-        "laparoscope": "logs/camera.csv",
+        "instruments": [{"name": spec.design.name, "poses": poses, "joints": {JOINT: joint}}],
+        **({} if settings.still else {"laparoscope": "logs/camera.csv"}),
         "sync": sync,
         "splits": {split: frames for split, frames in of.items() if frames},
     }
+
+
+def _stereo_calibration(lens: Lens) -> str:
+    """The calibration of two pinholes as OpenCV's stereoCalibrate finds it, mm; principal points count from the first
+    pixel's centre."""
+    matrix = [lens.focal, 0.0, lens.width / 2 - 0.5, 0.0, lens.focal, lens.height / 2 - 0.5, 0.0, 0.0, 1.0]
+    matrices = {"M1": (3, 3, matrix), "D1": (1, 5, [0.0] * 5), "M2": (3, 3, matrix), "D2": (1, 5, [0.0] * 5)}
+    matrices |= {"R": (3, 3, RIGHT_FROM_LEFT[:3, :3].ravel().tolist()), "T": (3, 1, RIGHT_FROM_LEFT[:3, 3].tolist())}
+    lines = ["%YAML:1.0", "---", f"image_width: {lens.width}", f"image_height: {lens.height}"]
+    for name, (rows, columns, data) in matrices.items():
+        numbers = ", ".join(f"{value:.9g}" for value in data)
+        lines += [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d"]
+        lines += [f"   data: [ {numbers} ]"]
+    return "\n".join(lines) + "\n"
 
 
 def _recorded(shot: Shot, settings: Settings) -> str:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rendered.errors import ErrorModel
 from rendered.instrument import Blade, Design, Material
-from rendered.motion import Array, Path, rigid
+from rendered.motion import Array, Path, look, rigid
 from rendered.render import Lamps
 from rendered.wristed import Encoders, SlidingDesign, WristedDesign
 
@@ -65,6 +65,19 @@ class SceneSpec:
     def with_rolling_camera(self) -> SceneSpec:
         """The same scene, filmed as a recording should be: turns about two axes calibrate the tracker on the scope."""
         return replace(self, path=replace(self.path, camera_rolling=0.3))
+
+    def with_still_camera(self) -> SceneSpec:
+        """The same scene before a scope that stands still in the middle of its path: the world is its frame, and
+        nothing about it is off."""
+        still = replace(self.path, camera_sway=(0.0, 0.0, 0.0), look_sway=(0.0, 0.0))
+        pose = look(np.array(still.camera_center), np.array(still.look_at), still.camera_roll)
+        exact = replace(self.errors, scale=1.0, back_mm=0.0, aside_mm=0.0, turn_rad=0.0)
+        exact = replace(exact, camera_jitter_mm=0.0, camera_jitter_rad=0.0)
+        turn = Rotation.from_matrix(pose[:3, :3].T).as_rotvec()
+        shift = -pose[:3, :3].T @ pose[:3, 3]
+        return replace(
+            self, path=still, errors=exact, world_turn=tuple(turn.tolist()), world_shift=tuple(shift.tolist())
+        )
 
     @property
     def reading_names(self) -> tuple[str, ...]:

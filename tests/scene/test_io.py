@@ -221,3 +221,9 @@ def test_an_unpaired_surrogate_is_refused(kinematic: Scene, tmp_path: Path) -> N
     save_tensors(tensors, {"neeco": json.dumps(header)}, tmp_path / "scene.safetensors")
     with pytest.raises(NeecoError, match=r"damaged scene .*unpaired surrogate"):
         load_scene(tmp_path / "scene.safetensors")
+
+
+def test_a_scene_remembers_that_its_scope_stood_still(any_scene: Scene, tmp_path: Path) -> None:
+    any_scene.recorded = dataclasses.replace(any_scene.recorded, still=True)
+    save_scene(any_scene, tmp_path / "scene.safetensors")
+    assert load_scene(tmp_path / "scene.safetensors").recorded.still

@@ -30,6 +30,7 @@ from neeco.errors import NeecoError
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
+STILL_CAMERAS = 2  # of a scope that stands still
 FULL_TURN = 2 * math.pi
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
@@ -44,6 +45,7 @@ class CaptureSummary:
     registered: bool
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
+    still: bool = False  # the scope stood still
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -117,6 +119,7 @@ def _summary(parsed: Parsed) -> CaptureSummary:
         registered=parsed.registered,
         joints=joints,
         travel_mm=travel,
+        still=parsed.still,
     )
 
 
@@ -133,6 +136,7 @@ def _check_frames(parsed: Parsed) -> None:
     elif counts["train"] < FEW_TRAIN_FRAMES:
         message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
         frames.warning(message, "record more if you can")
+    _check_still(parsed)
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
     latest: dict[str, float] = {}
@@ -326,6 +330,15 @@ def _check_coupling(parsed: Parsed, name: str, known: Sequence[str], states: Seq
         if explained > COUPLED:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             parsed.header("instruments").warning(message, "move joints one by one, too, or their axes mix")
+
+
+def _check_still(parsed: Parsed) -> None:
+    """A scope that is said to stand still has few cameras: one, or the two of a stereo scope."""
+    placed = parsed.with_cameras().frames
+    poses = {tuple(frame.camera.world_from_camera.double().numpy().round(6).ravel().tolist()) for frame in placed}
+    if parsed.still and len(poses) > STILL_CAMERAS:
+        message = f"is 'still', but the frames have {len(poses)} different cameras"
+        parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
 
 
 def _check_changes(parsed: Parsed) -> None:

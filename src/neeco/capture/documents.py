@@ -245,6 +245,7 @@ class Parsed:
     timed: bool = True  # the recording says when each frame was taken
     says_units: bool = False  # the file names its unit of length
     lens: Lens | None = None  # through which it was recorded
+    still: bool = False  # its cameras stood still
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
 

@@ -142,6 +142,7 @@ class Capture:
     registered: bool = True  # instrument poses are in the cameras' world frame
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
+    still: bool = False  # the cameras stood still: nothing shows the tissue's depth from elsewhere
 
     def __post_init__(self) -> None:
         for name, kind in {"root": Path, "frames": tuple, "instruments": tuple}.items():

@@ -52,7 +52,7 @@ def capture_of(parsed: Parsed) -> Capture:
             item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
             for item in instruments
         )
-    return Capture(parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens)
+    return Capture(parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still)
 
 
 def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:

@@ -89,7 +89,8 @@ def _frame_objects(document: Node) -> list[dict[str, Any]]:
 
 
 def _parse_header(document: Node, parsed: Parsed) -> None:
-    """Check what holds for the whole file: schema and units, and read `instrument_frame` and `lens`."""
+    """Check what holds for the whole file: schema and units, and read `instrument_frame`, `camera_motion` and
+    `lens`."""
     value = document.value
     schema = value.get("schema", SCHEMA)
     if schema != SCHEMA:
@@ -103,6 +104,10 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
     if registration not in ("world", "unregistered"):
         document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
     parsed.registered = registration != "unregistered"
+    motion = value.get("camera_motion", "moving")
+    if motion not in ("moving", "still"):
+        document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
+    parsed.still = motion == "still"
     if document.has("lens"):
         parsed.lens = parse_lens(document.child("lens"))
     parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA

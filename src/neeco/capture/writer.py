@@ -58,6 +58,8 @@ def write_capture(
     names = _names(capture)
     header: dict[str, Any] = {"schema": SCHEMA, "camera_model": "PINHOLE", "units": "mm"}
     header["instrument_frame"] = "world" if capture.registered else "unregistered"
+    if capture.still:
+        header["camera_motion"] = "still"
     header["instruments"] = [_instrument_to_json(instrument) for instrument in capture.instruments]
     if capture.lens is not None:
         header["lens"] = capture.lens.to_json()
@@ -96,6 +98,8 @@ def fingerprint(capture: Capture) -> str:
             digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
     if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
+    if capture.still:
+        digest.update(b"still")
     for numbers in (capture.points.positions, capture.points.colors):
         digest.update(numbers.tobytes())
     return digest.hexdigest()

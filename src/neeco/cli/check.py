@@ -60,6 +60,10 @@ def _print(problems: list[Problem], errors: int, summary: CaptureSummary) -> Non
 def _summary_lines(summary: CaptureSummary) -> list[str]:
     frames = ", ".join(f"{count} {name!r}" for name, count in summary.splits.items()) or "none"
     lines = [f"frames: {frames}", f"sparse points: {summary.points}"]
+    if summary.still:
+        lines.append(
+            "scope: stands still; nothing shows the scene from elsewhere, so draw views near the recorded ones"
+        )
     for name, travel in summary.travel_mm.items():
         joints = [
             f"{joint.removeprefix(name + '.')} {low:.3g} .. {high:.3g}"

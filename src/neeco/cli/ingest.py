@@ -211,9 +211,11 @@ def _ingest(recording: Recording, output: Path, rrd: Path | None, as_json: bool)
 def _print(result: IngestResult) -> None:
     numbers = result.as_json()
     print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
-    if result.registration is None:
+    if result.still:
+        print(f"still scope: the world is its camera's frame; the tissue's depth is {result.tissue}")
+    if not result.registered:
         print("not registered: instrument poses stay in their tracker's frame")
-    else:
+    elif result.registration is not None:
         fit = numbers["registration"]
         print(f"registered to {fit['position_rms_mm']:.2f} mm, {fit['rotation_rms_deg']:.2f} deg rms")
     for name, clock in result.clocks.items():

@@ -12,6 +12,12 @@ from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import Format, Settings
 
+# what is drawn of a scene that was seen from one place
+VIEWS_OF_STILL = {
+    "recorded": "the recorded ones",
+    "perturbed": "within about a degree and a millimetre of the recorded ones",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
@@ -48,6 +54,8 @@ def run(arguments: Arguments) -> int:
     run_path, instrument_runs = _runs(arguments)
     device = device_of(arguments.device)
     with open_run(run_path, device) as trained, counting("synthesize", settings.count) as advance:
+        if trained.scene.recorded.still and settings.views in VIEWS_OF_STILL:
+            print(f"the scope stood still: views are {VIEWS_OF_STILL[settings.views]}")
         others = [load_run(path, device) for path in instrument_runs]
         with resumable("what was drawn is kept; run the same command again with --resume"):
             summary = synthesize(

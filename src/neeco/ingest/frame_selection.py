@@ -13,6 +13,7 @@ from neeco.ingest.recording import Splits
 
 NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
 STILL = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
+STILL_PLACE = 0.06  # the same at one place of a thumbnail
 STILL_MM, STILL_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
 THUMBNAIL = 64  # px, width
 UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
@@ -73,8 +74,10 @@ def choose_frames(
 
 def _same(features: FrameFeatures, states: np.ndarray, a: int, b: int) -> bool:
     moved, turned = np.linalg.norm(states[a, :3] - states[b, :3]), np.linalg.norm(states[a, 3:] - states[b, 3:])
-    change = np.abs(features.thumbnails[a] - features.thumbnails[b]).mean()
-    return bool(change < STILL and moved < STILL_MM and turned < STILL_RAD)
+    changes = np.abs(features.thumbnails[a] - features.thumbnails[b])
+    if not states.any() and changes.max() > STILL_PLACE:  # no state is known yet, and something small moved
+        return False
+    return bool(changes.mean() < STILL and moved < STILL_MM and turned < STILL_RAD)
 
 
 def _embedding(features: FrameFeatures, states: np.ndarray) -> np.ndarray:

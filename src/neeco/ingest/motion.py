@@ -110,6 +110,9 @@ class ResidualFlow:
         points = rays * self._still_depth(row)[..., None]
         for other in others:
             flow = self.estimator.calc(self.grey(row), self.grey(other), None)[self.v, self.u]  # [h, w, 2]
+            if np.array_equal(cameras[other], cameras[row]):  # at whatever depth the scene lies
+                yield np.linalg.norm(flow, axis=-1)
+                continue
             relative = np.linalg.inv(cameras[other]) @ cameras[row]
             moved = points @ relative[:3, :3].T + relative[:3, 3]
             x, y = project(moved, *lens.intrinsics, nearest=TINY)

@@ -17,13 +17,16 @@ from neeco.capture.lens import Border, Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
+from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
-from neeco.ingest.recording import MIN_FRAMES, Recording, Splits
+from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
 from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
+from neeco.ingest.still import stands_still
+from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
 from neeco.ingest.synchronized import States, SynchronizedRecording
 
 
@@ -45,6 +48,7 @@ class IngestResult:
     reprojection_px: float | None  # None: cameras were not found by SfM
     points: int
     shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
+    tissue: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
     split_rule: str = ""
     notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
     search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
@@ -53,6 +57,12 @@ class IngestResult:
     unregistered: dict[str, np.ndarray] = field(default_factory=dict)
     # video frame -> [h, w] how often pixels were seen to move
     moving: dict[int, np.ndarray] = field(default_factory=dict)
+    registered: bool = True  # instrument poses are in the cameras' world
+
+    @property
+    def still(self) -> bool:
+        """Whether the scope stood still, so that cameras were not looked for."""
+        return self.tissue is not None
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""
@@ -80,6 +90,9 @@ class IngestResult:
             "registration": registration,
             "reprojection_px": self.reprojection_px,
             "points": self.points,
+            "still": self.still,
+            "registered": self.registered,
+            "tissue_depth": self.tissue,
             "split_rule": self.split_rule,
             "notes": list(self.notes),
             "search": list(self.search),
@@ -121,13 +134,16 @@ class _Ingest:
         self.border = self._find_border()
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
-        self.motion = StructureFromMotion(
-            folder / "sfm", self.data.video.path, folder / "raw", self.names, self.size, self.pinhole, self.visible,
-            self.settings,
-        )  # fmt: skip
 
     def run(self, output: Path) -> IngestResult:
         """Find cameras, registration and states, and write the capture."""
+        if self._is_still():
+            return self._run_still(output)
+        self._refuse_camera_frames()
+        self.motion = StructureFromMotion(
+            self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
+            self.visible, self.settings,
+        )  # fmt: skip
         sfm = self.motion.reconstruct(self.progress)
         if self.pinhole is None:
             assert sfm.lens is not None
@@ -143,6 +159,71 @@ class _Ingest:
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
         return self._finish(output, sfm, self.pinhole, self._register(sfm), shapes)
+
+    def _is_still(self) -> bool:
+        """Whether the scope stood still: as the recording says, else as its images do."""
+        if self.recording.camera is not None:
+            return self.recording.camera == STILL
+        if self.recording.stereo is not None:
+            return True
+        self.progress("looking whether the scope moves", 0, 0)
+        still = stands_still(self._load, len(self.names))
+        if still:
+            self.data.note("the scope stands still: nothing but what passes before it moves in the images")
+        return still
+
+    def _load(self, row: int) -> np.ndarray:
+        """uint8 [H, W, 3], one of the chosen frames."""
+        return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
+
+    def _refuse_camera_frames(self) -> None:
+        """Raise NeecoError for poses in the frame of a camera that moves."""
+        for item in self.recording.instruments:
+            if item.poses is not None and item.poses.frame == CAMERA:
+                raise NeecoError(
+                    f"{self.recording.path}: instruments: {item.name}: poses in the camera's frame need a scope that "
+                    "stands still, and this one moves; give poses in a frame that stays, and the scope's own "
+                    "(laparoscope)"
+                )
+
+    def _run_still(self, output: Path) -> IngestResult:
+        """The same for a scope that stands still: its frame is the world."""
+        data, pinhole = self.data, self.pinhole
+        if pinhole is None:
+            raise NeecoError(
+                f"{self.recording.path}: intrinsics: missing; images of a scope that stands still do not tell its "
+                "lens; give fl_x, fl_y, cx, cy or a calibration"
+            )
+        if data.scope is not None:
+            data.note(
+                "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
+            )
+        right = self._right_camera()
+        cameras = still_cameras(len(self.names))
+        self._find_instrument_clocks(cameras, pinhole)
+        for item in self.recording.instruments:
+            if item.poses is not None and item.poses.frame == CAMERA:
+                data.world_from_base[item.name] = np.eye(4)
+        unplaced = [name for name in data.poses if name not in data.world_from_base]
+        if unplaced:
+            data.note(
+                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}): "
+                "they stay in their own frame (unregistered)"
+            )
+        tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in data.world_from_base}
+        visible = self._field_of_view()
+        found = look_behind(self._load, len(self.names), pinhole, visible, tracked, self.settings, right, self.progress)
+        for note in found.notes:
+            data.note(note)
+        placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
+        placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
+        return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
+
+    def _right_camera(self) -> RightCamera | None:
+        partner = self.recording.stereo
+        if partner is None:
+            return None
+        return read_right_camera(partner, self.selected, self.data.times, self.folder / "right", self.progress)
 
     def _read_lens(self) -> Lens | None:
         """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
@@ -285,8 +366,8 @@ class _Ingest:
         self.moving = dict(zip(self.selected[sfm.indices[rows]].tolist(), evidence, strict=True))
         cameras, points = registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         shapes = {}
-        for name, log in self.data.poses.items():
-            poses, valid = self.data.instrument_poses(log, self._times(sfm))
+        for name in self.data.poses:
+            poses, valid = self.data.instrument_poses(name, self._times(sfm))
             camera_from_instrument = np.linalg.inv(cameras) @ np.where(valid[:, None, None], poses, np.eye(4))
             usable = valid[rows]
             shape = carve_shape(evidence[usable], camera_from_instrument[rows[usable]], flow.pinhole)
@@ -309,6 +390,8 @@ class _Ingest:
         pinhole: Lens,
         registration: Registration | None,
         shapes: dict[str, RoughShape],
+        right: RightCamera | None = None,
+        tissue: str | None = None,
     ) -> IngestResult:
         """States at every frame's time, splits, and the capture on disk."""
         data = self.data
@@ -333,6 +416,8 @@ class _Ingest:
             )
             for i in chosen.tolist()
         )
+        if right is not None:  # one camera more to learn from; what is tested stays one
+            capture_frames += _seen_by(right, capture_frames, sfm.indices[chosen].tolist())
         reliable = sfm.reliable_points()
         if not reliable.any():
             reliable = np.ones(len(sfm.points), dtype=bool)
@@ -343,10 +428,12 @@ class _Ingest:
             for item in self.recording.instruments
             if item.poses is not None
         )
-        registered = registration is not None or not data.poses
+        registered = registration is not None or set(data.poses) <= set(data.world_from_base)
         assert self.lens is not None
         lens = replace(self.lens, size=self.size, border=self.border)
-        capture = Capture(self.folder, capture_frames, instruments, cloud, registered, lens=lens)
+        capture = Capture(
+            self.folder, capture_frames, instruments, cloud, registered, lens=lens, still=tissue is not None
+        )
         write_capture(capture, self.folder / "capture")
         position = {row: index for index, row in enumerate(chosen.tolist())}
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []
@@ -362,24 +449,28 @@ class _Ingest:
             data.clocks,
             registration,
             np.array(registered_rows),
-            sfm.reprojection_px,
+            None if tissue is not None else sfm.reprojection_px,
             int(reliable.sum()),
             shapes,
+            tissue,
             rule,
             tuple(data.notes),
-            self.motion.search,
+            () if tissue is not None else self.motion.search,
             self._unregistered(states, times, chosen) if registration is not None else {},
             self.moving,
+            registered,
         )
 
     def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """`IngestResult.unregistered`, of the `chosen` of frames at times [M] s."""
         assert self.data.scope is not None
-        sensors, _ = self.data.instrument_poses(self.data.scope, times[chosen])
+        sensors, _ = self.data.logged_poses(self.data.scope, times[chosen])
         return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in states.items()}
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:
         """Cameras [M, 4, 4] and points [P, 3] in mm: the tracker's, or SfM's frame at a plausible size."""
+        if self.pinhole is not None and len(sfm.observations) == 0:  # a still scope's
+            return sfm.world_from_camera, sfm.points
         if registration is not None:
             return registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         distances = np.linalg.norm(sfm.points[:, None] - sfm.world_from_camera[None, ::10, :3, 3], axis=-1)
@@ -414,6 +505,16 @@ class _Ingest:
         splits = np.full(len(frames), LEFT_OUT, dtype=object)
         splits[usable] = assigned
         return splits, words
+
+
+def _seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
+    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
+    camera = right.pinhole.camera(right.world_from_camera)
+    return tuple(
+        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
+        for frame, row in zip(frames, rows, strict=True)
+        if frame.split == "train" and row in right.names
+    )
 
 
 def _state(states: States, row: int, time: float) -> State:

@@ -12,8 +12,10 @@ from neeco.errors import NeecoError
 from neeco.ingest.columns import JointColumns, PoseColumns
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.lens import read_lens
+from neeco.ingest.stereofile import read_stereo
 from neeco.ingest.video import open_images, open_video
 
+STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
 MIN_FRAMES = 10  # that cameras can be found from
 
 
@@ -58,11 +60,27 @@ class IngestSettings:
 
 
 @dataclass(frozen=True)
+class StereoPartner:
+    """The right camera of a stereo scope: its video or images, and the file that says how it stands beside the left."""
+
+    calibration: Path
+    video: Path | None = None
+    images: Path | None = None
+    fps: float | None = None
+    times: Path | None = None
+    stream: str | None = None
+
+    def open(self) -> VideoSource:
+        """The frames. Raises NeecoError."""
+        return _open(self)
+
+
+@dataclass(frozen=True)
 class Recording:
     """What was recorded. path: the file that said so (for messages). One of video and images is given; stream: which,
     where `video` holds several; fps: overrides a video's own times; times: a CSV of the images' times; intrinsics: a
     calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s
-    of each clock that is known; frames: how many to keep."""
+    of each clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be noticed)."""
 
     path: Path
     video: Path | None = None
@@ -78,6 +96,8 @@ class Recording:
     notes: tuple[str, ...] = ()
     settings: IngestSettings = field(default_factory=IngestSettings)
     stream: str | None = None
+    camera: str | None = None
+    stereo: StereoPartner | None = None
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -86,18 +106,13 @@ class Recording:
 
     def open(self) -> VideoSource:
         """The frames. Raises NeecoError."""
-        if self.video is not None:
-            known = format_of(self.video)
-            if known is not None:
-                known.require_package(self.video)
-                return known.open_images(self.video, self.stream)
-            return open_video(self.video, self.fps)
-        assert self.images is not None
-        return open_images(self.images, self.fps, self.times)
+        return _open(self)
 
     def read_lens(self) -> tuple[Lens | None, str]:
         """The lens given, else that which the images' file states (None: to be estimated), and what says so. Raises
         NeecoError."""
+        if self.intrinsics is None and self.stereo is not None:
+            return read_stereo(self.stereo.calibration)[0], str(self.stereo.calibration)
         if self.intrinsics is None and self.video is not None and (known := format_of(self.video)) is not None:
             return known.lens(self.video, self.stream), str(self.video)
         where = str(self.intrinsics) if isinstance(self.intrinsics, Path) else f"{self.path}: intrinsics"
@@ -106,6 +121,18 @@ class Recording:
         except NeecoError as error:
             # numbers know nothing of where they came from
             raise NeecoError(f"{where}: {str(error).removeprefix('intrinsics: ')}") from error
+
+
+def _open(source: Recording | StereoPartner) -> VideoSource:
+    """The frames of a recording or of its stereo partner. Raises NeecoError."""
+    if source.video is not None:
+        known = format_of(source.video)
+        if known is not None:
+            known.require_package(source.video)
+            return known.open_images(source.video, source.stream)
+        return open_video(source.video, source.fps)
+    assert source.images is not None
+    return open_images(source.images, source.fps, source.times)
 
 
 def clocks_of(instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | None) -> tuple[str, ...]:

@@ -22,7 +22,17 @@ from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest import columns as named
 from neeco.ingest.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.formats import format_of
-from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording, Splits, clocks_of
+from neeco.ingest.recording import (
+    MIN_FRAMES,
+    MOVING,
+    STILL,
+    IngestSettings,
+    InstrumentLogs,
+    Recording,
+    Splits,
+    StereoPartner,
+    clocks_of,
+)
 
 LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
@@ -32,7 +42,19 @@ _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a r
 def read_recording(path: Path) -> Recording:
     """Read recording.yaml; paths in it are relative to it. Raises NeecoError naming file, key and remedy."""
     path = Path(path)
-    keys = ("video", "images", "intrinsics", "instruments", "laparoscope", "sync", "frames", "splits", "settings")
+    keys = (
+        "video",
+        "images",
+        "camera",
+        "stereo",
+        "intrinsics",
+        "instruments",
+        "laparoscope",
+        "sync",
+        "frames",
+        "splits",
+        "settings",
+    )
     top = Section(path, "", _load(path), keys)
     video, images, fps, times, stream = _frames_from(top)
     instruments = _instruments(top, video)
@@ -40,9 +62,13 @@ def read_recording(path: Path) -> Recording:
     scope = None if laparoscope is None else _pose_columns(top, "laparoscope", laparoscope, video)
     sync, notes = _sync(top, clocks_of(instruments, scope))
     _check_one_clock(path, video, stream, instruments, scope)
+    camera = top.text("camera")
+    if camera not in (None, STILL, MOVING):
+        raise top.error("camera", f"{printable(camera)} says nothing of a scope; write {STILL} or {MOVING}")
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
         top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
+        camera, _stereo(top),
     )  # fmt: skip
 
 
@@ -224,7 +250,7 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
         raise top.error("video", "missing or twice; give either `video: FILE` or `images: {folder: FOLDER, fps: 25}`")
     key, keys = ("video", ("file", "fps", "stream")) if images is None else ("images", ("folder", "fps", "times"))
     value = top.value[key]
-    section = Section(top.file, key, value if isinstance(value, dict) else {keys[0]: value}, keys)
+    section = Section(top.file, top.at(key), value if isinstance(value, dict) else {keys[0]: value}, keys)
     source = section.path(keys[0], required=True)
     fps = section.number("fps", above=0.0)
     if images is None:
@@ -238,6 +264,13 @@ def _frames_from(top: Section) -> tuple[Path | None, Path | None, float | None, 
     if fps is None and times is None:
         raise section.error("fps", "when were the images taken? Give fps or times (a CSV file)")
     return None, source, fps, times, None
+
+
+def _stereo(top: Section) -> StereoPartner | None:
+    if top.value.get("stereo") is None:
+        return None
+    section = top.section("stereo", ("video", "images", "calibration"))
+    return StereoPartner(section.path("calibration", required=True), *_frames_from(section))
 
 
 def _intrinsics(top: Section) -> Path | tuple[float, ...] | None:

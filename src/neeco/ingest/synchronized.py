@@ -52,15 +52,23 @@ class SynchronizedRecording:
         if VIDEO_CLOCK in recording.clocks:
             self.clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
         self._assume_joint_clocks()
+        # by instrument, where its log is not in the world's frame: [4, 4] mm
+        self.world_from_base: dict[str, np.ndarray] = {}
 
     def note(self, note: str) -> None:
         """Add a note, once."""
         if note not in self.notes:
             self.notes.append(note)
 
-    def instrument_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def logged_poses(self, log: PoseLog, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses [N, 4, 4] in the tracker's frame at video times, and where known."""
         return poses_at(log, times + self._offset(log))
+
+    def instrument_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses [N, 4, 4] of an instrument at video times, in the world's frame as far as that is known (else in its
+        tracker's), and where known."""
+        poses, known = self.logged_poses(self.poses[name], times)
+        return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
         """Every tracked instrument's states at video times [N], and where all of them are known."""
@@ -70,8 +78,8 @@ class SynchronizedRecording:
             item.name: {joint: source.limits for joint, source in item.joints.items()}
             for item in self.recording.instruments
         }
-        for name, log in self.poses.items():
-            poses, valid = self.instrument_poses(log, times)
+        for name in self.poses:
+            poses, valid = self.instrument_poses(name, times)
             usable &= valid
             readings = {}
             for joint, reading in self.joints[name].items():

@@ -31,6 +31,7 @@ class Recorded:
     cameras: tuple[Camera, ...] = ()
     lens: Lens | None = None  # whose distortion is gone from the images; None: not known
     scale: float = 1.0  # of the cameras' images, at which the scene was learned
+    still: bool = False  # the cameras stood still
 
     @classmethod
     def of(
@@ -39,6 +40,7 @@ class Recorded:
         instruments: tuple[Instrument, ...],
         lens: Lens | None = None,
         scale: float = 1.0,
+        still: bool = False,
     ) -> Recorded:
         """What `frames` record of `instruments`: only these, and of each only the joints named."""
         states = []
@@ -50,7 +52,7 @@ class Recorded:
                 chosen[instrument.name] = InstrumentState(given.pose, joints)
             states.append(State(chosen, frame.state.time))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
-        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens, scale)
+        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens, scale, still)
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
         """A state of the recording with joints that nobody recorded as they were found at the training frames beside

@@ -121,6 +121,8 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
         header["lens"] = recorded.lens.to_json()
     if recorded.scale != 1:
         header["scale"] = recorded.scale
+    if recorded.still:
+        header["still"] = True
     header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
     tensors, header = tensors | own_tensors, header | own_fields
@@ -172,7 +174,8 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     scale = _number(header.get("scale", 1.0))
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
-    return instruments, Recorded(names, splits, tuple(states), tuple(cameras), lens, scale)
+    still = header.get("still") is True
+    return instruments, Recorded(names, splits, tuple(states), tuple(cameras), lens, scale, still)
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:

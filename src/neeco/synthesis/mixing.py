@@ -134,8 +134,8 @@ class Mixture:
                 placed |= self.place(scene, own.states[frame], own.cameras[frame], camera)
             chosen.append(camera)
             states.append(State(placed, 0.0))
-        names = tuple(f"{k:06d}" for k in range(count))
-        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen), self.tissue.recorded.lens)
+        names, still = tuple(f"{k:06d}" for k in range(count)), self.tissue.recorded.still
+        return Recorded(names, ("train",) * count, tuple(states), tuple(chosen), self.tissue.recorded.lens, still=still)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 SIMILAR = 10  # recorded frames whose cameras may see a drawn state
 VIEW_ATTEMPTS = 50  # views drawn until one has the instrument in the image
+STILL_DEGREES, STILL_MM = 1.0, 1.0  # by which perturbed views differ from those of a still scope: it saw one side
 SURFACE_VIEWS = 5  # recorded views that decide where the surface's middle is
 
 # Draws a camera for a state; intrinsics and image size are always those of a recorded camera.
@@ -168,8 +169,13 @@ def make_sampler(scene: Scene, states: str, margin: float, views: Views, count: 
     NeecoError."""
     recorded = RecordedViews(scene.recorded.cameras, scene.recorded.states)
     view_sampler: ViewSampler = recorded
+    still = scene.recorded.still
     if views == "perturbed":
-        view_sampler = PerturbedViews(recorded)
+        view_sampler = PerturbedViews(recorded, *((STILL_DEGREES, STILL_MM) if still else ()))
+    elif views == "orbit" and still:
+        raise NeecoError(
+            "--views orbit: the scope stood still, and nothing shows the scene from the side; use recorded or perturbed"
+        )
     elif views == "orbit":
         view_sampler = OrbitViews(recorded, surface_centre(scene))
     if states == "interpolate":

@@ -74,7 +74,7 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
     # at their recorded size, whatever is learned from
-    recorded = Recorded.of(capture.split("train"), instruments, capture.lens, config.scale)
+    recorded = Recorded.of(capture.split("train"), instruments, capture.lens, config.scale, capture.still)
     positions, colors = _thinned_points(capture, frames, config)
     tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
     deformation = make_deformation(config.method, instruments, config.deformation)

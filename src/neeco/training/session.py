@@ -299,6 +299,10 @@ class GaussianSession(GaussianTraining):
         for tensor in scene.canonical.tensors().values():
             tensor.requires_grad_(False)
         scene.diagnostics["iterations"] = self.iteration
+        if scene.recorded.still:
+            places = {tuple(camera.world_from_camera.flatten().tolist()) for camera in scene.recorded.cameras}
+            known = "measured with a second camera" if len(places) > 1 else "not measured: no view shows it"
+            scene.diagnostics["still_scope"] = f"the tissue's depth is {known}; draw views near the recorded ones"
         scene.diagnostics["phase_2_began"] = self.schedule.phase_started
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         scene.deformation.finish(self)

@@ -352,6 +352,8 @@ def status_html(parts: Sequence[RunPicture], seconds: float, size: tuple[int, in
         if part.score is not None:
             overlap = "" if part.score.iou is None else f" · IoU {part.score.iou:.3f}"
             lines.append(f"PSNR {part.score.psnr:.2f} dB{overlap}")
+        if loaded.recorded.still:
+            lines.append("still scope: views far from the recorded one show what no frame saw")
         if part.trouble:
             lines.append(_text(part.trouble, 3 * LINE))
     lines.append(f"{seconds * 1e3:.0f} ms at {size[0]} × {size[1]}")

@@ -150,7 +150,7 @@ class WatchedRun:
             name=self.path.resolve().name,
             world=str(config["capture"]),
             scene=scene,
-            recorded=Recorded(names, splits, states, cameras),
+            recorded=Recorded(names, splits, states, cameras, still=scene.recorded.still),
             frames=tuple(frames[k] for k in order) if frames else (),
             capture=capture,
             shafts=shafts_of(scene),

@@ -1,0 +1,178 @@
+"""A recording of a still scope becomes a capture: its frame is the world, and the tissue lies behind what hides it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from neeco.capture import read_capture, write_capture
+from neeco.capture.check import inspect_capture
+from neeco.capture.images import write_image
+from neeco.errors import NeecoError
+from neeco.ingest.pipeline import IngestResult, ingest
+from neeco.ingest.recordingfile import read_recording
+
+WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 128, 150.0, 40, 25.0
+BAR, TISSUE, BASELINE = 60.0, 100.0, 8.0  # mm: depths of a bar and of the tissue behind it, between two cameras
+
+
+@dataclass
+class Theatre:
+    """A bar that moves in a plane before flat tissue, as two still cameras see it, and a tracker on the bar."""
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        generator = np.random.default_rng(1)
+        noise = generator.normal(0, 1, (HEIGHT, 2 * WIDTH)).astype(np.float32)
+        texture = 2 * cv2.GaussianBlur(noise, (0, 0), 2.0) + 5 * cv2.GaussianBlur(noise, (0, 0), 5.0)
+        self.tissue = np.clip((125 + 22 * texture)[..., None] * [1.2, 0.65, 0.6], 15, 225)
+
+    def place(self, time: float) -> np.ndarray:
+        """[3] mm: the bar's middle in the left camera's frame."""
+        return np.array([12 * np.sin(2.9 * time), 8 * np.sin(4.7 * time + 1), BAR])
+
+    def image(self, number: int, right: bool) -> np.ndarray:
+        shift = BASELINE if right else 0.0
+        column = 40 + round(FOCAL * shift / TISSUE * 2) / 2
+        matrix = np.array([[1, 0, -column], [0, 1, 0]], np.float32)
+        image = cv2.warpAffine(self.tissue.astype(np.float32), matrix, (WIDTH, HEIGHT)).astype(np.float64)
+        x, y, z = self.place(number / RATE) - [shift, 0, 0]
+        u, v = FOCAL * x / z + WIDTH / 2, FOCAL * y / z + HEIGHT / 2
+        image[max(0, round(v - 16)) : round(v + 16), max(0, round(u - 9)) : round(u + 9)] = (90, 105, 120)
+        noise = np.random.default_rng((number, right)).normal(0, 1.0, image.shape)
+        return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+    def write(self, **changes: object) -> Path:
+        """recording.yaml with everything it names; `changes` to its keys (None: left out)."""
+        for name, right in (("left", False), ("right", True)):
+            for number in range(FRAMES):
+                pixels = torch.from_numpy(self.image(number, right).astype(np.float32) / 255)
+                write_image(self.folder / name / f"{number:03d}.png", pixels)
+        rows = [(time, *self.place(time), 1, 0, 0, 0) for time in np.arange(-0.1, FRAMES / RATE + 0.1, 0.02)]
+        lines = ["t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", *(",".join(f"{value:.5f}" for value in row) for row in rows)]
+        (self.folder / "bar.csv").write_text("\n".join(lines) + "\n")
+        self.write_calibration()
+        document: dict[str, object] = {
+            "images": {"folder": "left", "fps": RATE},
+            "intrinsics": [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2],
+            "camera": "still",
+            "instruments": [{"name": "bar", "poses": {"file": "bar.csv", "frame": "camera"}}],
+            "sync": {"em": 0.0},
+        } | changes
+        path = self.folder / "recording.yaml"
+        path.write_text(yaml.safe_dump({key: value for key, value in document.items() if value is not None}))
+        return path
+
+    def write_calibration(self) -> None:
+        matrix = [[FOCAL, 0, WIDTH / 2 - 0.5], [0, FOCAL, HEIGHT / 2 - 0.5], [0, 0, 1]]
+        document = {"image_width": WIDTH, "image_height": HEIGHT, "M1": matrix, "D1": [0] * 5, "M2": matrix}
+        document |= {"D2": [0] * 5, "R": np.eye(3).tolist(), "T": [-BASELINE, 0, 0]}
+        (self.folder / "stereo.yaml").write_text(yaml.safe_dump(document))
+
+    def ingest(self, **changes: object) -> IngestResult:
+        return ingest(read_recording(self.write(**changes)), self.folder / "capture", lambda what, done, total: None)
+
+
+@pytest.fixture
+def theatre(tmp_path: Path) -> Theatre:
+    return Theatre(tmp_path)
+
+
+STEREO = {"images": {"folder": "right", "fps": RATE}, "calibration": "stereo.yaml"}
+
+
+def test_a_still_scopes_frame_is_the_world_and_poses_in_it_stay_as_they_are(theatre: Theatre) -> None:
+    result = theatre.ingest()
+    capture = read_capture(result.capture)
+    assert capture.still
+    assert capture.registered
+    assert all(torch.equal(frame.camera.world_from_camera, torch.eye(4)) for frame in capture.frames)
+    for frame in capture.frames:
+        place = frame.state.instruments["bar"].pose[:3, 3].numpy()
+        assert np.abs(place - theatre.place(frame.state.time)).max() < 0.05
+    assert {frame.split for frame in capture.frames} == {"train", "test"}  # it never turns: nothing is unseen
+    assert not [problem for problem in inspect_capture(result.capture).problems if problem.severity == "error"]
+
+
+def test_the_tissue_lies_behind_every_place_of_the_instrument_and_shows_none_of_it(theatre: Theatre) -> None:
+    result = theatre.ingest()
+    points = read_capture(result.capture).points
+    assert points.positions[:, 2].min() > BAR
+    assert len(points.positions) > 1000
+    columns = FOCAL * points.positions[:, 0] / points.positions[:, 2] + WIDTH / 2 + 40
+    rows = FOCAL * points.positions[:, 1] / points.positions[:, 2] + HEIGHT / 2
+    truth = theatre.tissue[rows.astype(int).clip(0, HEIGHT - 1), columns.astype(int)] / 255
+    assert np.abs(points.colors - truth).mean() < 0.02
+    assert result.still
+    assert "not measured" in str(result.tissue)
+
+
+def test_a_stereo_partner_measures_the_tissue_and_is_one_view_more_to_learn_from(theatre: Theatre) -> None:
+    result = theatre.ingest(stereo=STEREO, camera=None)
+    capture = read_capture(result.capture)
+    depth = capture.points.positions[:, 2]
+    assert np.quantile(np.abs(depth - TISSUE), 0.9) < 0.03 * TISSUE
+    right = [frame for frame in capture.frames if frame.name.endswith("_right")]
+    assert {frame.split for frame in right} == {"train"}
+    assert len(right) == len(capture.split("train")) / 2
+    assert right[0].camera.world_from_camera[:3, 3].tolist() == pytest.approx([BASELINE, 0, 0])
+    assert capture.still
+
+
+def test_a_still_scope_is_noticed_and_the_instruments_clock_found_from_its_motion(theatre: Theatre) -> None:
+    result = theatre.ingest(camera=None, sync=None)
+    assert result.still
+    assert any("stands still" in note for note in result.notes)
+
+
+def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatre: Theatre) -> None:
+    result = theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}])
+    assert not read_capture(result.capture).registered
+    assert any("poses of bar" in note for note in result.notes)
+    assert "100 mm" in str(result.tissue)
+
+
+def test_a_still_capture_has_few_cameras_and_check_says_so(theatre: Theatre) -> None:
+    root = theatre.ingest().capture
+    assert inspect_capture(root).summary.still
+    document = json.loads((root / "transforms.json").read_text())
+    for number, frame in enumerate(document["frames"]):
+        frame["transform_matrix"][0][3] = 0.1 * number
+    (root / "transforms.json").write_text(json.dumps(document))
+    wrong = [str(problem) for problem in inspect_capture(root).problems if problem.severity == "error"]
+    assert len(wrong) == 1
+    assert "camera_motion: is 'still', but the frames have" in wrong[0]
+
+
+def test_a_still_capture_stays_one_when_it_is_written_again(theatre: Theatre) -> None:
+    capture = read_capture(theatre.ingest().capture)
+    write_capture(capture, theatre.folder / "again")
+    assert read_capture(theatre.folder / "again").still
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"intrinsics": None}, "recording.yaml: intrinsics: missing; images of a scope that stands still"),
+        ({"camera": "fixed"}, "camera: 'fixed' says nothing of a scope; write still or moving"),
+        ({"stereo": {"video": "right"}}, "stereo.calibration: missing"),
+        ({"stereo": {"calibration": "stereo.yaml"}}, "stereo.video: missing or twice"),
+        ({"camera": "moving"}, "instruments: bar: poses in the camera's frame need a scope that stands still"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_one_line(
+    theatre: Theatre, changes: dict[str, object], words: str
+) -> None:
+    with pytest.raises(NeecoError) as error:
+        theatre.ingest(**changes)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (theatre.folder / "capture").exists()
