@@ -34,6 +34,7 @@ def test_a_base_8_mm_and_5_degrees_off_is_found_with_its_clock():
     assert found.open_directions == ()
 
 
+@pytest.mark.slow
 def test_what_pure_insertion_leaves_open_is_said_and_stays_as_given():
     world = make_world(FRAMES, pure_insertion=True)
     given = disturbed(6, 3, 2, world)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,6 +53,7 @@ SIZES, FINE_SIZES = (
     (1.04, 1.015),
 )  # factors by which everything is made larger or smaller, one after the other
 FARTHEST = 8  # times each
+SPAN, SAMPLES = 0.15, 9  # of the logarithm of the size, over which the loss is sampled at last
 AS_MUCH = 0.95  # of the overlap before must stay: less of an instrument fits more easily
 LEAST_OVERLAP = 0.25  # of the instrument's outline with what moves, to believe a base
 USUAL_RADII = (1.5, 5.5)  # mm: a shaft outside is first taken to be of the usual size
@@ -88,6 +90,26 @@ class BaseRegistration:
     frames: int  # that it was found from
     fit: Fit
     problem: Problem
+
+    def as_json(self) -> dict[str, Any]:
+        """Numbers for scripts: mm, degrees, s; None where a direction is open and nothing was given."""
+
+        def known(values: np.ndarray) -> list[float | None]:
+            return [float(value) if np.isfinite(value) else None for value in values]
+
+        return {
+            "camera_from_base": self.world_from_base.tolist(),
+            "sd_mm": known(self.sd_mm),
+            "sd_deg": known(self.sd_deg),
+            "scale": self.scale,
+            "clock_s": self.clock_s,
+            "clock_sd_s": self.clock_sd_s,
+            "moved_mm": known(np.array([self.moved_mm]))[0],
+            "turned_deg": known(np.array([self.turned_deg]))[0],
+            "overlap": self.overlap,
+            "overlap_before": known(np.array([self.overlap_before]))[0],
+            "open": list(self.open_directions),
+        }
 
 
 def find_base(
@@ -137,9 +159,10 @@ def find_base(
     if not USUAL_RADII[0] < radius < USUAL_RADII[1]:
         best = refine(quick, known, resized(quick, best, USUAL_RADIUS / radius))
     best = _best_size(quick, known, best, SIZES)
-    fit = _best_size(problem, known, fit_outlines(problem, known, best, widths=WIDTHS_PX[-2:]), FINE_SIZES)
+    fit, curvature = _settle_size(problem, known, fit_outlines(problem, known, best, widths=WIDTHS_PX[-2:]))
     _require_moved(name, problem, known, fit)
-    return _result(problem, known, prior, fit, sureness(problem, known, fit))
+    sure = sureness(problem, known, fit)
+    return _result(problem, known, prior, fit, sure, _size_sd(problem, fit, sure, curvature))
 
 
 def _problem(
@@ -232,15 +255,30 @@ def _best_size(problem: Problem, known: Prior, fit: Fit, steps: tuple[float, ...
     return fit
 
 
-def _size_sd(problem: Problem, known: Prior, fit: Fit, sure: Sureness) -> float:
-    """Standard deviation of the logarithm of the size, from how the loss grows when that is changed."""
-    step = 1.03
-    grown = [refine(problem, known, resized(problem, fit, factor), steps=8).loss for factor in (step, 1 / step)]
+def _settle_size(problem: Problem, known: Prior, fit: Fit) -> tuple[Fit, float]:
+    """The fit at the size where the loss is least, by a parabola through those of sizes around, and the curvature of
+    the loss there by the logarithm of the size."""
+    logs = np.linspace(-SPAN, SPAN, SAMPLES)
+    fits = [refine(problem, known, resized(problem, fit, float(np.exp(log))), steps=8) for log in logs]
+    losses = np.array([other.loss for other in fits])
+    near = losses < losses.min() + 0.5 * (np.median(losses) - losses.min()) + 1e-9
+    near |= np.abs(np.arange(SAMPLES) - int(np.argmin(losses))) <= 2
+    curve = np.polyfit(logs[near], losses[near], 2)
+    least = (
+        float(np.clip(-curve[1] / (2 * curve[0]), *logs[near][[0, -1]])) if curve[0] > 0 else logs[np.argmin(losses)]
+    )
+    nearest = fits[int(np.argmin(np.abs(logs - least)))]
+    factor = float(np.exp(least - logs[int(np.argmin(np.abs(logs - least)))]))
+    settled = refine(problem, known, resized(problem, nearest, factor), steps=8)
+    return settled, max(float(curve[0]), 0.0)
+
+
+def _size_sd(problem: Problem, fit: Fit, sure: Sureness, curvature: float) -> float:
+    """Standard deviation of the logarithm of the size, from the curvature of the mean loss."""
     width = problem.seen.distances.shape[2] / 160  # of the narrowest loss, px
     count = problem.seen.distances.shape[0] * 2 * len(fit.stations) * (1 - FRONT)
-    curvature = max(0.5 * sum(grown) - fit.loss, 0.0) * count / np.log(step) ** 2
     variance = (fit.residual_px / 0.67 / width) ** 2 * _alike(sure)
-    return float(np.sqrt(variance / max(curvature, 1e-9)))
+    return float(np.sqrt(variance / max(curvature * count, 1e-9)))
 
 
 def _alike(sure: Sureness) -> float:
@@ -287,12 +325,17 @@ def _unmoved(name: str) -> str:
 
 
 def _result(
-    problem: Problem, known: Prior, prior: tuple[np.ndarray, float, float] | None, fit: Fit, sure: Sureness
+    problem: Problem,
+    known: Prior,
+    prior: tuple[np.ndarray, float, float] | None,
+    fit: Fit,
+    sure: Sureness,
+    size_sd: float,
 ) -> BaseRegistration:
     scale = float(np.exp(fit.log_scale))
     world_from_base = fit.world_from_base.copy()
     world_from_base[:3, 3] += world_from_base[:3, :3] @ ((1 - scale) * problem.middle)
-    covariance, open_directions, clock_sd, scale_sd = _sureness_in_words(problem, known, fit, sure)
+    covariance, open_directions, clock_sd, scale_sd = _sureness_in_words(problem, known, fit, sure, size_sd)
     view = problem.camera_from_world[0, :3, :3]
     turns, shifts = (view @ covariance[part, part] @ view.T for part in (slice(0, 3), slice(3, 6)))
     moved, turned, before = np.nan, np.nan, np.nan
@@ -312,11 +355,10 @@ def _result(
 
 
 def _sureness_in_words(
-    problem: Problem, known: Prior, fit: Fit, sure: Sureness
+    problem: Problem, known: Prior, fit: Fit, sure: Sureness, size_sd: float
 ) -> tuple[np.ndarray, tuple[str, ...], float, float]:
     """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is open, and the
     standard deviations of clock s and scale."""
-    size_sd = _size_sd(problem, known, fit, sure)
     away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by it
     units = np.array([1 / LEVER] * 3 + [1.0] * 3 + [0.05, 0.02])  # about as much of an outline's motion each
     used = np.array([True] * 6 + [known.sd_clock > 0, known.sd_scale > 0])

@@ -114,6 +114,7 @@ def shaft_lines(masks: np.ndarray, hidden: np.ndarray | None = None) -> ShaftLin
         if not touching[end].any():
             tips[row] = places[end].mean(0)
             hulls[row] = cv2.convexHull(places.astype(np.float32))[:, 0]
-    most = max(len(hull) for hull in hulls)
-    corners = np.stack([hull[np.arange(most) % len(hull)] for hull in hulls]).astype(np.float64)
+    most = max((len(hull) for hull in hulls), default=1)
+    padded = [hull[np.arange(most) % len(hull)] for hull in hulls]
+    corners = np.array(padded, np.float64).reshape(count, most, 2)
     return ShaftLines(points, directions, tips, corners)
