@@ -17,15 +17,17 @@ from neeco.capture.lens import Border, Lens
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
+from neeco.ingest.base import BaseRegistration
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
+from neeco.ingest.find_bases import place_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
 from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.still import stands_still
+from neeco.ingest.still import moving_masks, reduced, stands_still
 from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
 from neeco.ingest.synchronized import States, SynchronizedRecording
 
@@ -58,6 +60,7 @@ class IngestResult:
     # video frame -> [h, w] how often pixels were seen to move
     moving: dict[int, np.ndarray] = field(default_factory=dict)
     registered: bool = True  # instrument poses are in the cameras' world
+    bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
 
     @property
     def still(self) -> bool:
@@ -92,6 +95,7 @@ class IngestResult:
             "points": self.points,
             "still": self.still,
             "registered": self.registered,
+            "bases": {name: base.as_json() for name, base in self.bases.items()},
             "tissue_depth": self.tissue,
             "split_rule": self.split_rule,
             "notes": list(self.notes),
@@ -125,6 +129,7 @@ class _Ingest:
         self.data = SynchronizedRecording(recording, progress)
         self.size = self.data.video.size
         self.lens = self._read_lens()
+        self.bases: dict[str, BaseRegistration] = {}  # by instrument, of those found
         self.dropped: dict[int, str] = {}  # video frame -> why
         self.moving: dict[int, np.ndarray] = {}  # video frame -> [h, w] what moves in it
         self.selected = self._choose()  # [K] video frames
@@ -140,6 +145,7 @@ class _Ingest:
         if self._is_still():
             return self._run_still(output)
         self._refuse_camera_frames()
+        self._refuse_bases()
         self.motion = StructureFromMotion(
             self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
             self.visible, self.settings,
@@ -204,11 +210,12 @@ class _Ingest:
         for item in self.recording.instruments:
             if item.poses is not None and item.poses.frame == CAMERA:
                 data.world_from_base[item.name] = np.eye(4)
+        self._place_bases(cameras, pinhole)
         unplaced = [name for name in data.poses if name not in data.world_from_base]
         if unplaced:
             data.note(
-                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}): "
-                "they stay in their own frame (unregistered)"
+                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
+                "or camera_from_base): they stay in their own frame (unregistered)"
             )
         tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in data.world_from_base}
         visible = self._field_of_view()
@@ -219,11 +226,38 @@ class _Ingest:
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
         return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
 
+    def _place_bases(self, cameras: SfmResult, pinhole: Lens) -> None:
+        """The bases that the recording states to its still scope, found from what moves where that is not exact."""
+        data, visible = self.data, self._field_of_view()
+        if not any(item.base is not None for item in self.recording.instruments):
+            return
+        self.progress("finding the robot's base", 0, 0)
+        placed = place_bases(
+            data, self._times(cameras), cameras.world_from_camera, pinhole,
+            lambda rows: moving_masks(self._load, len(self.names), rows, visible),
+            None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255,
+        )  # fmt: skip
+        for name, base in placed.items():
+            data.world_from_base[name] = base.world_from_base
+            if base.clock is not None:
+                data.clocks[data.poses[name].clock] = base.clock
+            if base.found is not None:
+                self.bases[name] = base.found
+
     def _right_camera(self) -> RightCamera | None:
         partner = self.recording.stereo
         if partner is None:
             return None
         return read_right_camera(partner, self.selected, self.data.times, self.folder / "right", self.progress)
+
+    def _refuse_bases(self) -> None:
+        """Raise NeecoError for a base that is stated to the camera of a scope that moves."""
+        for item in self.recording.instruments:
+            if item.base is not None:
+                raise NeecoError(
+                    f"{self.recording.path}: camera_from_base: the base of {item.name} stands still to the camera only "
+                    "if the scope stands still; leave it out and give the poses in the laparoscope's frame"
+                )
 
     def _read_lens(self) -> Lens | None:
         """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
@@ -459,6 +493,7 @@ class _Ingest:
             self._unregistered(states, times, chosen) if registration is not None else {},
             self.moving,
             registered,
+            self.bases,
         )
 
     def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.ingest.basefile import StatedBase
 from neeco.ingest.columns import JointColumns, PoseColumns
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.lens import read_lens
@@ -21,12 +22,14 @@ MIN_FRAMES = 10  # that cameras can be found from
 
 @dataclass(frozen=True)
 class InstrumentLogs:
-    """One instrument: where its poses are (None: it was not tracked), its joints' readings, by joint, and its links."""
+    """One instrument: where its poses are (None: it was not tracked), its joints' readings, by joint, its links, and
+    what is said of the base that its poses are in."""
 
     name: str
     poses: PoseColumns | None = None
     joints: Mapping[str, JointColumns] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
+    base: StatedBase | None = None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from neeco.capture.urdf import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.ingest import columns as named
+from neeco.ingest.basefile import StatedBase, parse_base
 from neeco.ingest.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.formats import format_of
 from neeco.ingest.recording import (
@@ -34,6 +35,7 @@ from neeco.ingest.recording import (
     clocks_of,
 )
 
+BASE_KEY = "camera_from_base"
 LARGEST = 1e12  # number that any key may hold: more is a slip, and overflows what is computed of it
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
@@ -49,6 +51,7 @@ def read_recording(path: Path) -> Recording:
         "stereo",
         "intrinsics",
         "instruments",
+        BASE_KEY,
         "laparoscope",
         "sync",
         "frames",
@@ -289,7 +292,7 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
     if not isinstance(value, list):
         raise top.error("instruments", "must be a list; begin each instrument with `- name:`")
     sections = [
-        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics"))
+        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY))
         for i, item in enumerate(value)
     ]
     names = [section.text("name", required=True) for section in sections]
@@ -304,7 +307,8 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
-        found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints))))
+        base = _base(section if section.node.has(BASE_KEY) else top, columns)
+        found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints)), base))
     return tuple(found)
 
 
@@ -324,6 +328,17 @@ def _check_one_clock(
             raise NeecoError(
                 f"{file}: stream: {printable(log.stream)} is of {own}, the images of {images}; name the same in both"
             )
+
+
+def _base(section: Section, poses: PoseColumns | None) -> StatedBase | None:
+    """What an instrument, or the whole recording, says of the base."""
+    if poses is None or not section.node.has(BASE_KEY):
+        return None
+    if poses.frame == named.CAMERA:
+        if section.place:
+            raise section.error(BASE_KEY, "its poses are in the camera's frame already; leave out one of the two")
+        return None
+    return parse_base(section.node.child(BASE_KEY), section.file.parent)
 
 
 def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:

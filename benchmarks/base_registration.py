@@ -1,0 +1,162 @@
+"""How well a robot's base is found from what moves: seeds by error sizes, on rendered recordings of a still scope.
+
+    python benchmarks/rendered_captures.py bowel CAPTURE --still
+    python benchmarks/base_registration.py CAPTURE... [--seeds 10] [--masks truth|images] [--errors 8x5 20x10]
+
+Of every capture, the exact poses are moved into a base of their own and the clock is set off by 40 ms. The base is then
+given wrong by so many mm and degrees where the instrument is, in a random direction for each seed (0x0: nothing is
+given), and found again from truth's masks or from what moves in the images. Printed for each size of error, over the
+seeds: how many were found within 0.8 mm and 0.4 degrees (1.2 and 0.6 for errors beyond 10 mm) and 8 ms, the median and
+the worst error; with `--json FILE` every single one.
+
+mm is the root mean square over the recording by which the instrument would be drawn beside its place once the best
+constant offset of its own frame is taken out: the shape that is learned makes up for that. `raw` is without.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.interpolate import interp1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from neeco.capture.model import evenly_spaced, swap_camera_axes
+from neeco.errors import NeecoError
+from neeco.files import write_json
+from neeco.ingest.base import find_base
+
+CLOCK_S = 0.04  # by which the log is ahead
+BASE_TURN, BASE_SHIFT = (0.4, -1.1, 0.7), (30.0, -200.0, 90.0)  # base_from_world
+LOOKED_AT = 140  # frames
+EDGE = 5  # frames at both ends whose poses are not known at all clocks tried
+SHARE = 1.7  # an error of so many standard deviations of what is given
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="How well a base is found from what moves.")
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--masks", choices=("truth", "images"), default="truth")
+    parser.add_argument("--errors", nargs="+", default=["8x5", "20x10"], metavar="MMxDEG")
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for path in words.captures:
+        recording = _Recording(path, words.masks)
+        for size in words.errors:
+            mm, degrees = (float(part) for part in size.split("x"))
+            found = [recording.find(mm, degrees, seed) for seed in range(words.seeds)]
+            rows += found
+            print(_line(path.name, words.masks, mm, degrees, found), flush=True)
+    if words.json:
+        write_json(words.json, rows)
+    return 0
+
+
+class _Recording:
+    """A capture of a still scope with its truth."""
+
+    def __init__(self, path: Path, masks: str) -> None:
+        document = json.loads((path / "truth" / "transforms.json").read_text())
+        frames = document["frames"]
+        times = np.array([frame["time"] for frame in frames])
+        base_from_world = np.eye(4)
+        base_from_world[:3, :3] = Rotation.from_rotvec(BASE_TURN).as_matrix()
+        base_from_world[:3, 3] = BASE_SHIFT
+        poses = base_from_world @ np.array([frame["instruments"][0]["pose"] for frame in frames])
+        self.path, self.truth = path, np.linalg.inv(base_from_world)
+        self.turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))
+        self.places = interp1d(times, poses[:, :3, 3], axis=0)
+        self.span = times[[0, -1]]
+        rows = EDGE + np.array(evenly_spaced(len(frames) - 2 * EDGE, LOOKED_AT))
+        self.times, self.poses = times[rows], poses[rows]
+        cameras = np.array([swap_camera_axes(np.array(frames[row]["transform_matrix"])) for row in rows])
+        self.camera_from_world = np.linalg.inv(cameras)
+        self.intrinsics = tuple(document[key] for key in ("fl_x", "fl_y", "cx", "cy"))
+        readings = [list(frames[row]["instruments"][0]["joints"].values()) for row in rows]
+        self.readings = np.array(readings, np.float64)
+        if masks == "truth":
+            files = [path / "truth" / frames[row]["part_mask_path"] for row in rows]
+            self.masks = np.stack([np.asarray(Image.open(file)) > 0 for file in files])
+        else:
+            from neeco.ingest.still import moving_masks
+
+            def load(row: int) -> np.ndarray:
+                return np.asarray(Image.open(path / "truth" / frames[row]["file_path"]).convert("RGB"))
+
+            self.masks = moving_masks(load, len(frames), rows)
+
+    def poses_at(self, shift: float) -> np.ndarray:
+        """[F, 4, 4] as the log has them `shift` s after the frames' times; NaN beyond its ends."""
+        times = self.times + shift - CLOCK_S
+        known = (times >= self.span[0]) & (times <= self.span[1])
+        poses = np.full((len(times), 4, 4), np.nan)
+        poses[known] = np.eye(4)
+        poses[known, :3, :3] = self.turns(times[known]).as_matrix()
+        poses[known, :3, 3] = self.places(times[known])
+        return poses
+
+    def find(self, mm: float, degrees: float, seed: int) -> dict[str, Any]:
+        """One search from a base wrong by so much, and its errors."""
+        given = _wrong(self.truth, self.poses, mm, degrees, seed)
+        prior = None if mm == 0 else (given, mm / SHARE, degrees / SHARE)
+        started = process_time()
+        row: dict[str, Any] = {"capture": self.path.name, "mm": mm, "degrees": degrees, "seed": seed}
+        try:
+            found = find_base(
+                "instrument", self.masks, self.intrinsics, self.camera_from_world, self.poses_at, self.times, prior,
+                readings=self.readings, seed=seed,
+            )  # fmt: skip
+        except NeecoError as error:
+            return row | {"error": str(error)}
+        beside, raw, turned = _errors(found.world_from_base, self.truth, self.poses)
+        return row | {
+            "beside_mm": beside, "raw_mm": raw, "turned_deg": turned, "clock_ms": 1000 * (found.clock_s - CLOCK_S),
+            "sd_mm": found.sd_mm.tolist(), "sd_deg": found.sd_deg.tolist(), "overlap": found.overlap,
+            "open": list(found.open_directions), "cpu_s": process_time() - started,
+        }  # fmt: skip
+
+
+def _wrong(truth: np.ndarray, poses: np.ndarray, mm: float, degrees: float, seed: int) -> np.ndarray:
+    """A base [4, 4] turned and shifted by so much about the middle of the instrument's places."""
+    turn, shift = np.random.default_rng(seed).normal(size=(2, 3))
+    rotation = Rotation.from_rotvec(np.radians(degrees) * turn / np.linalg.norm(turn)).as_matrix()
+    middle = truth[:3, :3] @ poses[:, :3, 3].mean(0) + truth[:3, 3]
+    wrong = truth.copy()
+    wrong[:3, :3] = rotation @ truth[:3, :3]
+    wrong[:3, 3] = rotation @ (truth[:3, 3] - middle) + middle + mm * shift / np.linalg.norm(shift)
+    return wrong
+
+
+def _errors(found: np.ndarray, truth: np.ndarray, poses: np.ndarray) -> tuple[float, float, float]:
+    """mm beside a constant offset of the instrument's frame, raw mm, and degrees."""
+    raw = ((found - truth) @ poses)[:, :3, 3]
+    local = np.einsum("fji,fj->fi", (truth @ poses)[:, :3, :3], raw)
+    beside, all_of_it = (float(np.sqrt(np.square(part).sum(1).mean())) for part in (local - local.mean(0), raw))
+    turn = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T)
+    return beside, all_of_it, float(np.degrees(turn.magnitude()))
+
+
+def _line(name: str, masks: str, mm: float, degrees: float, found: list[dict[str, Any]]) -> str:
+    done = [row for row in found if "error" not in row]
+    most_mm, most_deg = (0.8, 0.4) if mm <= 10 else (1.2, 0.6)
+    good = [row["beside_mm"] <= most_mm and row["turned_deg"] <= most_deg and abs(row["clock_ms"]) <= 8 for row in done]
+    words = f"{name}, masks of {masks}, off by {mm:g} mm {degrees:g} deg: {sum(good)} of {len(found)} found"
+    for key, unit in (("beside_mm", "mm"), ("raw_mm", "mm raw"), ("turned_deg", "deg"), ("clock_ms", "ms")):
+        values = np.abs([row[key] for row in done])
+        if len(values):
+            words += f"; {np.median(values):.2f} ({values.max():.2f}) {unit}"
+    refused = len(found) - len(done)
+    return words + (f"; {refused} refused" if refused else "")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""The bases of a recording's instruments: as the recording states them, or found from what moves before a scope."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from neeco.capture.lens import Lens
+from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.errors import NeecoError
+from neeco.ingest.base import BaseRegistration, find_base
+from neeco.ingest.basefile import StatedBase
+from neeco.ingest.columns import CAMERA
+from neeco.ingest.interpolate import poses_at, readings_at
+from neeco.ingest.recording import InstrumentLogs
+from neeco.ingest.registration import ClockOffset
+from neeco.ingest.synchronized import SynchronizedRecording
+
+FRAMES = 140  # looked at, evenly spaced
+GIVEN, FOUND = "given", "found with the base"
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBase:
+    """world_from_base [4, 4] mm of one instrument, the clock of its log (None: as before), and how they were found
+    (None: stated exactly)."""
+
+    world_from_base: np.ndarray
+    clock: ClockOffset | None = None
+    found: BaseRegistration | None = None
+
+
+def place_bases(
+    data: SynchronizedRecording,
+    times: np.ndarray,
+    cameras: np.ndarray,
+    pinhole: Lens,
+    moving: Callable[[np.ndarray], np.ndarray],
+    hidden: np.ndarray | None = None,
+    metric: bool = False,
+) -> dict[str, PlacedBase]:
+    """The bases of all instruments that say something of theirs.
+
+    times [M] s of the frames, cameras [M, 4, 4] world_from_camera; moving(rows): masks bool [R, h, w] of what moves in
+    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. A base is stated to the first camera.
+    Notes what was found, how sure it is and what is open. Raises NeecoError where nothing moves with an instrument.
+    """
+    placed: dict[str, PlacedBase] = {}
+    unknown = []
+    for item in data.recording.instruments:
+        if item.base is None or item.name not in data.poses or data.poses[item.name].frame == CAMERA:
+            continue
+        if item.base.exact:
+            assert item.base.camera_from_base is not None
+            placed[item.name] = PlacedBase(cameras[0] @ item.base.camera_from_base)
+        else:
+            unknown.append(item)
+    if not unknown:
+        return placed
+    rows = np.array(evenly_spaced(len(times), FRAMES))
+    masks = moving(rows)
+    lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
+    for item in unknown:
+        assert item.base is not None
+        registration, clock = _find(data, item, item.base, masks, lens, times[rows], cameras[rows], hidden, metric)
+        placed[item.name] = PlacedBase(registration.world_from_base, clock, registration)
+        data.note(describe(item.name, registration))
+    return placed
+
+
+def _find(
+    data: SynchronizedRecording,
+    item: InstrumentLogs,
+    stated: StatedBase,
+    masks: np.ndarray,
+    lens: Lens,
+    times: np.ndarray,
+    cameras: np.ndarray,
+    hidden: np.ndarray | None,
+    metric: bool,
+) -> tuple[BaseRegistration, ClockOffset]:
+    log = data.poses[item.name]
+    clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), "assumed equal to the video's"))
+    readings = {
+        joint: readings_at(reading, times + data.clocks.get(reading.clock, clock).seconds)[0]
+        for joint, reading in data.joints[item.name].items()
+    }
+    readings = {joint: values for joint, values in readings.items() if np.isfinite(values).all()}
+
+    def base_from_shaft(shift: float) -> np.ndarray:
+        poses, _ = poses_at(log, times + clock.seconds + shift)
+        tree = item.kinematics
+        if tree is None or tree.pose_of is None or not set(tree.readings) <= set(readings):
+            return poses
+        states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
+        roots = [tree.world_from_root(pose, state) for pose, state in zip(poses, states, strict=True)]
+        return np.stack(roots)
+
+    prior = None
+    if stated.camera_from_base is not None:
+        assert stated.sd_mm is not None
+        assert stated.sd_deg is not None
+        prior = (cameras[0] @ stated.camera_from_base, stated.sd_mm, stated.sd_deg)
+    try:
+        found = find_base(
+            item.name, masks, lens.intrinsics, np.linalg.inv(cameras), base_from_shaft, times, prior,
+            readings=np.stack(list(readings.values()), -1) if readings else None, hidden=hidden,
+            clock_known=clock.source == GIVEN, metric=metric,
+        )  # fmt: skip
+    except NeecoError as error:
+        raise NeecoError(f"{data.recording.path}: {error}") from error
+    if clock.source != GIVEN:
+        clock = ClockOffset(clock.seconds + found.clock_s, found.clock_sd_s, FOUND)
+    return found, clock
+
+
+def describe(name: str, found: BaseRegistration) -> str:
+    """What was found of a base, how sure that is, and what the recording leaves open, in one sentence."""
+
+    def listed(values: np.ndarray) -> str:
+        return ", ".join("open" if not np.isfinite(value) else f"{value:.1f}" for value in values)
+
+    words = f"instrument {name!r}: its base was found from what moves in {found.frames} frames"
+    if np.isfinite(found.moved_mm):
+        words += f", {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from what was given"
+    words += (
+        f"; sure to {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the camera); "
+        f"its outline and what moves overlap by {found.overlap:.2f}"
+    )
+    if np.isfinite(found.overlap_before):
+        words += f" ({found.overlap_before:.2f} as given)"
+    if found.scale_sd > 0:
+        words += f"; lengths of its robot are {100 * (found.scale - 1):+.1f} +- {100 * found.scale_sd:.1f} % off"
+    if found.open_directions:
+        what = "as given" if np.isfinite(found.moved_mm) else "as first guessed"
+        words += f"; its motion does not determine {', nor '.join(found.open_directions)}: there it stays about {what}"
+    return words

@@ -1,0 +1,77 @@
+"""Base to camera: a rigid instrument, posed by an arm whose base is known only roughly, found from what moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ingest.base_world import INTRINSICS, TRUE_CLOCK_S, disturbed, errors, make_world
+
+from neeco.errors import NeecoError
+from neeco.ingest.base import find_base
+from neeco.ingest.base_search import Seen, search, uniform_rotations
+from neeco.ingest.silhouettes import shaft_lines, silhouettes_of
+
+FRAMES = 44
+ROUGH = (5.0, 3.0)  # sd mm, deg of the prior: errors of 8 mm and 5 degrees are within
+
+
+def _find(world, prior, **options):
+    return find_base(
+        "psm1", world.masks, INTRINSICS, world.camera_from_world, world.poses_at, world.times, prior, **options
+    )
+
+
+def test_a_base_8_mm_and_5_degrees_off_is_found_with_its_clock():
+    world = make_world(FRAMES)
+    given = disturbed(8, 5, 1, world)
+    found = _find(world, (given, *ROUGH))
+    beside, _, degrees = errors(found.world_from_base, world.poses_at(0.0))
+    assert errors(given, world.poses_at(0.0))[1] > 7
+    assert beside < 0.8
+    assert degrees < 0.8  # the log is 3.5 s long and the instrument tilts by 9 degrees
+    assert abs(found.clock_s - TRUE_CLOCK_S) < 0.008
+    assert found.overlap > 0.8 > found.overlap_before + 0.1
+    assert found.open_directions == ()
+
+
+@pytest.mark.slow
+def test_what_pure_insertion_leaves_open_is_said_and_stays_as_given():
+    world = make_world(FRAMES, pure_insertion=True)
+    given = disturbed(6, 3, 2, world)
+    found = _find(world, (given, *ROUGH))
+    assert any("shift" in words for words in found.open_directions)
+    assert np.nanmax(found.sd_mm) > 2
+
+
+def test_masks_in_which_nothing_moves_with_the_pose_end_in_one_line():
+    world = make_world(FRAMES)
+    other = np.random.default_rng(0).permutation(len(world.masks))
+    world = type(world)(world.masks[other], world.camera_from_world, world.times, False)
+    with pytest.raises(NeecoError, match=r"'psm1'.*nothing in the images moves with its poses; check") as raised:
+        _find(world, (disturbed(8, 5, 1, world), *ROUGH))
+    assert "\n" not in str(raised.value)
+
+
+def test_masks_without_a_shaft_end_in_one_line():
+    world = make_world(14)
+    blobs = np.zeros_like(world.masks)
+    blobs[:, 40:60, 60:80] = True
+    with pytest.raises(NeecoError, match="looks like a shaft in 0 of 14 frames"):
+        find_base("psm1", blobs, INTRINSICS, world.camera_from_world, world.poses_at, world.times)
+
+
+def test_lines_and_tips_alone_tell_the_rotation_of_a_base_of_which_nothing_is_known():
+    world = make_world(FRAMES)
+    seen = Seen(shaft_lines(world.masks), INTRINSICS, world.camera_from_world, world.poses_at(TRUE_CLOCK_S))
+    generator = np.random.default_rng(3)
+    found = search(seen, uniform_rotations(2000, generator), np.array([0.0, 0.0, 90.0]), 90.0, 90.0, generator, 0.2)
+    assert min(errors(base, world.poses_at(TRUE_CLOCK_S))[2] for base in found.world_from_base) < 12
+
+
+def test_distances_to_outlines_know_no_outline_beyond_the_border():
+    masks = np.zeros((1, 40, 60), dtype=bool)
+    masks[0, :, 20:40] = True
+    seen = silhouettes_of(masks, (50.0, 50.0, 30.0, 20.0))
+    inside, gradient = seen.look_up(np.array([[23.0, 17.0, 23.0]]), np.array([[20.0, 20.0, 2.0]]))
+    assert np.allclose(inside, [[3.0, -3.0, 3.0]], atol=0.05)
+    assert np.allclose(gradient[0, :, 0], 1.0, atol=0.05)

@@ -1,0 +1,88 @@
+"""What recording.yaml says of a base: unknown, rough, exact, or the dVRK's own registration."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from neeco.errors import NeecoError
+from neeco.ingest.basefile import read_dvrk_registration
+from neeco.ingest.recordingfile import read_recording
+
+# rotation about x by a quarter turn, and metres
+TRANSFORM = [[1.0, 0.0, 0.0, 0.05], [0.0, 0.0, -1.0, -0.02], [0.0, 1.0, 0.0, 0.17], [0.0, 0.0, 0.0, 1.0]]
+MILLIMETRES = [[1, 0, 0, 50], [0, 0, -1, -20], [0, 1, 0, 170], [0, 0, 0, 1]]
+FRAME = {"reference-frame": "left_frame", "transform": TRANSFORM}
+
+
+def _recording(tmp_path, base=None, default=None, frame=None):
+    (tmp_path / "video.mp4").touch()
+    (tmp_path / "psm.csv").touch()
+    poses = {"file": "psm.csv"} | ({} if frame is None else {"frame": frame})
+    instrument = {"name": "psm1", "poses": poses} | ({} if base is None else {"camera_from_base": base})
+    document = {"video": "video.mp4", "instruments": [instrument, {"name": "psm2", "poses": "psm.csv"}]}
+    document |= {} if default is None else {"camera_from_base": default}
+    (tmp_path / "recording.yaml").write_text(json.dumps(document))
+    return read_recording(tmp_path / "recording.yaml").instruments
+
+
+def test_a_rough_base_has_a_transform_and_how_far_it_may_be_off(tmp_path):
+    rough = {"transform": MILLIMETRES, "sd_mm": 8, "sd_deg": 5}
+    first, second = _recording(tmp_path, rough, "unknown")
+    assert np.array_equal(first.base.camera_from_base, MILLIMETRES)
+    assert (first.base.sd_mm, first.base.sd_deg, first.base.exact) == (8, 5, False)
+    assert second.base.camera_from_base is None  # what stands at the top holds for all that say nothing
+
+
+def test_a_transform_alone_is_exact(tmp_path):
+    assert _recording(tmp_path, {"transform": MILLIMETRES})[0].base.exact
+
+
+def test_poses_in_the_cameras_frame_need_no_base(tmp_path):
+    assert _recording(tmp_path, None, "unknown", "camera")[0].base is None
+    with pytest.raises(NeecoError, match=r"instruments\[0\].camera_from_base: its poses are in the camera's frame"):
+        _recording(tmp_path, "unknown", None, "camera")
+
+
+def test_a_registration_of_the_dvrk_is_in_metres_and_one_in_its_own_axes_is_turned(tmp_path):
+    (tmp_path / "PSM1-registration-open-cv.json").write_text('{\n"base-frame": ' + json.dumps(FRAME) + "\n}\n")
+    (tmp_path / "PSM1-registration-dVRK.json").write_text('"base-frame": ' + json.dumps(FRAME) + "\n")
+    base = _recording(tmp_path, "PSM1-registration-open-cv.json")[0].base
+    assert np.allclose(base.camera_from_base, MILLIMETRES)
+    assert (base.sd_mm, base.sd_deg) == (8.0, 5.0)
+    turned = read_dvrk_registration(tmp_path / "PSM1-registration-dVRK.json").camera_from_base
+    assert np.allclose(np.diag([-1, -1, 1, 1]) @ turned, MILLIMETRES)
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ("nowhere.json", "no such file"),
+        ([1, 2], "expected `unknown`, a file"),
+        ({"sd_mm": 8, "sd_deg": 5}, "camera_from_base.transform: is missing"),
+        ({"transform": MILLIMETRES, "sd_mm": 8}, "camera_from_base.sd_deg: is missing; give both"),
+        ({"transform": TRANSFORM[:2]}, "transform: "),
+        ({"transform": MILLIMETRES, "sd": 8}, "camera_from_base.sd: unknown key"),
+    ],
+)
+def test_a_wrong_base_ends_in_one_line(tmp_path, base, message):
+    with pytest.raises(NeecoError) as raised:
+        _recording(tmp_path, base)
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"name": "PSM1", "measured_cp": []}', "measured_cp: states the arm in the base of the arm that holds"),
+        ('{"x": 1}', "base-frame.*: is missing"),
+        ("transform", "is not a camera registration"),
+    ],
+)
+def test_another_file_than_a_registration_ends_in_one_line(tmp_path, text, message):
+    (tmp_path / "reg.json").write_text(text)
+    with pytest.raises(NeecoError, match=message):
+        read_dvrk_registration(tmp_path / "reg.json")
