@@ -296,11 +296,11 @@ def overlap(problem: Problem, fit: Fit) -> float:
     for row, mask in enumerate(problem.seen.masks):
         left = np.stack([x[row, :stations], y[row, :stations]], -1)
         right = np.stack([x[row, stations:], y[row, stations:]], -1)
-        drawn = np.zeros(mask.shape, np.uint8)
+        filled = np.zeros(mask.shape, np.uint8)
         corners = np.clip(np.concatenate([left, right[::-1]]), -1e4, 1e4)
-        cv2.fillPoly(drawn, [np.rint(corners - 0.5).astype(np.int32)], 1)
-        both += int((drawn.astype(bool) & mask).sum())
-        either += int((drawn.astype(bool) | mask).sum())
+        cv2.fillPoly(filled, [np.rint(corners - 0.5).astype(np.int32)], 1)
+        both += int((filled.astype(bool) & mask).sum())
+        either += int((filled.astype(bool) | mask).sum())
     return both / max(either, 1)
 
 
