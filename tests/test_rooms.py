@@ -14,6 +14,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("viewer", "report"),
     ("experiments",),
     ("synthesis",),
+    ("tracking",),
     ("evaluation",),
     ("labels",),
     ("training",),

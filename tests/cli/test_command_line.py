@@ -22,6 +22,7 @@ WITH_BAD_PATH = {
     "compare": [MISSING, "--methods", "3dgs", "--iterations", "5", "--output", "compared"],
     "render": [MISSING, "--output", "drawn"],
     "annotate": [MISSING, "--output", "out"],
+    "track": [MISSING, MISSING, "--output", "out"],
     "synthesize": [MISSING, "--output", "dataset", "--count", "1"],
     "score-masks": [MISSING, MISSING],
     "downstream": [MISSING, "--output", "taught"],

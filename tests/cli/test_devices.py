@@ -25,6 +25,7 @@ from neeco.training.train import train
 OF_A_RUN = {
     "evaluate": [],
     "annotate": ["--output", "out"],
+    "track": ["footage", "--output", "out"],
     "export": [],
     "view": ["--export", "page.html"],
     "render": ["--output", "out"],

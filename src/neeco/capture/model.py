@@ -38,10 +38,13 @@ class InstrumentState:
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
+    trust: float | None = None  # in [0, 1], how far `track` trusts it; None: it was recorded
 
     if TYPE_CHECKING:  # what may be given
 
-        def __init__(self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ...) -> None: ...
+        def __init__(
+            self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ..., trust: float | None = ...
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))

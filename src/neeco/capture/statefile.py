@@ -86,13 +86,14 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         nodes = _joint_nodes(item)
         joints = {joint: child.number() for joint, child in (nodes or {}).items()}
         known = {joint: value for joint, value in joints.items() if value is not None}
+        trust = _trust(item)
         if name in states:
             item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
             good = False
         if name is None or pose is None or nodes is None or len(known) < len(joints):
             good = False
             continue
-        states[name] = InstrumentState(torch.from_numpy(pose), known)
+        states[name] = InstrumentState(torch.from_numpy(pose), known, trust)
     return states if good else None
 
 
@@ -137,6 +138,15 @@ def all_instruments(frames: Iterable[Frame], declared: tuple[Instrument, ...]) -
         replace(stated[name], joints=limits) if name in stated else Instrument(name, limits)
         for name, limits in joints.items()
     )
+
+
+def _trust(item: Node) -> float | None:
+    """What a tracked state says of itself; None, reported where it is no share, of one that says nothing."""
+    trust = item.child("trust").number() if item.has("trust") else None
+    if trust is not None and not 0 <= trust <= 1:
+        item.child("trust").error(f"is {trust:g}, not a share", "give 0 to 1, or leave it out")
+        return None
+    return trust
 
 
 def _is_unrecorded(joint: Node) -> bool:

@@ -144,6 +144,7 @@ def _write_frame(
                 joint: _number(value) for joint, value in state.joints.items() if (instrument, joint) not in unrecorded
             },
         }
+        | ({} if state.trust is None else {"trust": _number(state.trust)})
         for instrument, state in frame.state.instruments.items()
     ]
     entry: dict[str, Any] = {

@@ -33,6 +33,7 @@ VERBS = {
     "export": "Write a scene in one state for other viewers of Gaussians (PLY, SPZ).",
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
     "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
+    "track": "Find instruments in footage that has no states, by their learned scene.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }

@@ -9,15 +9,16 @@ scene, so every method is aligned the same way, and a handful of steps does what
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 from neeco.capture.images import area_averaged
 from neeco.capture.model import Frame, State
+from neeco.evaluation.photometric_fit import Observed, minimise
 from neeco.raster import rasterize
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.shadow import shadowed
@@ -135,13 +136,14 @@ class _Problem:
         """The image [h, w, 3] at the moved camera, on the CPU, where the small systems are solved."""
         return rasterize(gaussians, self.moved_camera(level.camera, parameters)).color.cpu()
 
-    def cost(self, level: _Level, image: Tensor, parameters: Tensor) -> float:
-        """Huber cost of the residual plus the prior, in units of -log probability."""
-        huber = self.config.huber
-        residual = _smooth(image - level.target, level.weight).abs()
-        per_value = torch.where(residual < huber, 0.5 * residual**2, huber * (residual - 0.5 * huber))
-        data = self.scale * float(per_value.sum(dtype=torch.float64))
-        return data + 0.5 * float(((parameters / self.sigmas) ** 2).sum())
+    def observed(self, level: _Level) -> Observed:
+        """The recorded image at one resolution."""
+        return Observed(level.target, level.weight, self.config.huber, self.scale)
+
+    @property
+    def precision(self) -> Tensor:
+        """Of the prior, [P, P]."""
+        return torch.diag(self.sigmas**-2)
 
 
 @torch.no_grad()
@@ -166,7 +168,8 @@ def fit_frame(
     if start is not None and len(start) == len(increments):
 
         def cost(tried: Tensor) -> float:
-            return problem.cost(levels[0], problem.render(problem.gaussians(tried), levels[0], tried), tried)
+            image = problem.render(problem.gaussians(tried), levels[0], tried)
+            return problem.observed(levels[0]).cost(image) + 0.5 * float(tried @ problem.precision @ tried)
 
         increments = min((increments, start), key=cost)
     for level, steps in zip(levels, config.steps, strict=True):
@@ -201,59 +204,22 @@ def _level(
 
 def _fit_level(problem: _Problem, level: _Level, parameters: Tensor, steps: int) -> Tensor:
     """A few Levenberg-Marquardt steps at one resolution; every accepted step lowers the cost."""
-    gaussians = problem.gaussians(parameters)
-    image = problem.render(gaussians, level, parameters)
-    cost = problem.cost(level, image, parameters)
-    damping = 1e-3
-    for _ in range(steps):
-        normal, gradient = _normal_equations(problem, level, parameters, gaussians, image)
-        for _ in range(3):
-            system = normal + damping * torch.diag(torch.diagonal(normal))
-            trial = parameters - torch.linalg.solve(system, gradient)
-            trial_gaussians = problem.gaussians(trial)
-            trial_image = problem.render(trial_gaussians, level, trial)
-            trial_cost = problem.cost(level, trial_image, trial)
-            if trial_cost < cost:
-                break
-            damping *= 10
-        else:
-            break
-        parameters, gaussians, image, cost = trial, trial_gaussians, trial_image, trial_cost
-        damping = max(damping / 10, 1e-6)
-    return parameters
 
+    def draw(at: Tensor) -> tuple[Gaussians, Tensor]:
+        gaussians = problem.gaussians(at)
+        return gaussians, problem.render(gaussians, level, at)
 
-def _normal_equations(
-    problem: _Problem, level: _Level, parameters: Tensor, gaussians: Gaussians, image: Tensor
-) -> tuple[Tensor, Tensor]:
-    """J^T W J [P, P] and J^T W r [P] of residual and prior at `parameters`, Jacobian by forward differences."""
-    residual = _smooth(image - level.target, level.weight)
-    weight = problem.scale / (residual.abs() / problem.config.huber).clamp_min(1.0)
-    # drawn a dozen times: the shadows, which move as little as what casts them, once
-    camera = problem.moved_camera(level.camera, parameters)
-    still = shadowed(gaussians, camera, rasterize)
-    columns, steps = [], problem.steps(level)
-    for index in range(len(parameters)):
-        moved = parameters.clone()
-        step = float(steps[index])
-        moved[index] += step
-        is_camera = index >= len(parameters) - 6
-        posed = still if is_camera else replace(problem.gaussians(moved), headlight=still.headlight)
-        columns.append(_smooth(problem.render(posed, level, moved) - image, level.weight).flatten() / step)
-    jacobian = torch.stack(columns)  # [P, h * w * 3]
-    weighted = jacobian * weight.flatten()
-    precision = problem.sigmas**-2
-    normal = (weighted @ jacobian.T).double() + torch.diag(precision)
-    gradient = (weighted @ residual.flatten()).double() + precision * parameters
-    return normal, gradient
+    def differences(at: Tensor, gaussians: Gaussians) -> Iterator[tuple[Tensor, float]]:
+        # drawn a dozen times: the shadows, which move as little as what casts them, once
+        still = shadowed(gaussians, problem.moved_camera(level.camera, at), rasterize)
+        for index, step in enumerate(problem.steps(level).tolist()):
+            moved = at.clone()
+            moved[index] += step
+            is_camera = index >= len(at) - 6
+            posed = still if is_camera else replace(problem.gaussians(moved), headlight=still.headlight)
+            yield problem.render(posed, level, moved), step
 
-
-def _smooth(difference: Tensor, weight: Tensor) -> Tensor:
-    """A 3x3 binomial blur of the counted pixels of [h, w, 3]: an edge's residual stays linear over a larger shift."""
-    taps = difference.new_tensor([0.25, 0.5, 0.25])
-    kernel = (taps[:, None] * taps)[None, None]
-    planes = (difference * weight[..., None]).permute(2, 0, 1)[:, None]
-    return conv2d(planes, kernel, padding=1)[:, 0].permute(1, 2, 0)
+    return minimise(draw, differences, problem.observed(level), problem.precision, parameters, steps).parameters
 
 
 def pose_changes(frame: Frame, state: State, camera: Camera) -> dict[str, dict[str, float]]:

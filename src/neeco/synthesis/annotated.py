@@ -1,28 +1,25 @@
 """`neeco annotate`: recorded frames, labelled by the scene, each with how far to trust its label.
 
-Trust goes by the recorded image alone; every pixel votes. Inside the label the tissue alone may explain a pixel better
-than the instrument does, or neither does (something else is in front): it votes against the label. Beside the label a
-pixel may look as no tissue did in training frames: the label misses it. Trust is the overlap (IoU) that is left.
+What trust is: `neeco.evaluation.trust`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
-import numpy as np
 import torch
-from scipy.ndimage import binary_opening, distance_transform_edt, uniform_filter
 from torch import Tensor
 
 from neeco.capture.model import Capture, Frame
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.align import AlignConfig, Fit, fit_frame, pose_changes
+from neeco.evaluation.trust import Trust, TypicalErrors, estimate_trust, typical_errors_of
 from neeco.labels.annotation import OUTSIDE, InstrumentLabel, Keypoint, annotate
 from neeco.labels.drawing import LayeredDrawing, draw_layers
 from neeco.labels.labellers import CompositedLabels
@@ -41,11 +38,7 @@ if TYPE_CHECKING:
 REFERENCE_FRAMES = 16  # training frames that tell how well pixels are usually explained
 FROM_NEIGHBOUR = AlignConfig(levels=(0.5, 1.0), steps=(2, 1))  # the start is near: no coarse search
 NOT_TRUSTED = "not trusted"
-BESIDE = 0.03  # of the image's diagonal: how far from the label a pixel is looked at that it may miss
-USUAL = 0.99  # share of the pixels of training frames that are explained as well
-HALF = 0.5  # of the error that the tissue alone would have: an instrument that explains more is there, if blurred
 NOT_RECORDED = 0.01  # of a pixel: more than this outside the recorded image, and it is ignored
-SMOOTH = 3  # px, side of the square over which a pixel's error is averaged
 
 
 @dataclass(frozen=True)
@@ -228,75 +221,3 @@ def _check_instruments(scene: Scene, capture: Capture) -> None:
             raise NeecoError(
                 f"{capture.root}: instruments: {instrument.name}: no joint {min(missing)!r}, which the scene learned"
             )
-
-
-@dataclass(frozen=True)
-class TypicalErrors:
-    """How well pixels of training frames are explained: USUAL of them have a smaller error (mean over colours) than
-    these, inside the label and beside it."""
-
-    inside: float
-    beside: float
-
-
-@dataclass(frozen=True)
-class Trust:
-    """How far the recorded image supports a label."""
-
-    value: float  # in [0, 1]: the overlap that the votes leave
-    against: float  # share of the label's pixels that vote against it
-    missed: float  # pixels beside the label that it misses, as a share of the label's
-
-    def to_json(self) -> dict[str, float]:
-        """As plain values, for files."""
-        return {name: round(number, 4) for name, number in asdict(self).items()}
-
-
-@dataclass(frozen=True)
-class _Errors:
-    """Of every pixel [H, W]: in the label, beside it, and how far the drawing and the tissue alone are off."""
-
-    label: np.ndarray
-    beside: np.ndarray
-    whole: np.ndarray
-    tissue: np.ndarray
-
-
-def typical_errors_of(drawings: Sequence[tuple[LayeredDrawing, Tensor, Tensor | None]]) -> TypicalErrors:
-    """From drawings of frames trained on, each with its image [H, W, 3] and loss mask."""
-    errors = [_errors(*drawing) for drawing in drawings]
-    inside = np.concatenate([frame.whole[frame.label] for frame in errors])
-    beside = np.concatenate([frame.whole[frame.beside] for frame in errors])
-    return TypicalErrors(
-        *(round(float(np.quantile(values, USUAL)), 5) if len(values) else 1.0 for values in (inside, beside))
-    )
-
-
-def estimate_trust(
-    drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, typical: TypicalErrors, beside: float = BESIDE
-) -> Trust:
-    """How far the label of `drawing` can be trusted as that of `image` [H, W, 3]; 0 where there is no label.
-
-    Pixels that the frame's loss mask leaves out do not vote; beside the label, those up to `beside` of the image's
-    diagonal away do.
-    """
-    errors = _errors(drawing, image, mask, beside)
-    unexplained = (errors.whole > typical.inside) & (errors.whole > HALF * errors.tissue)
-    against = errors.label & ((errors.whole > errors.tissue) | unexplained)
-    missed = errors.beside & (errors.whole > typical.beside)
-    size = max(1, int(errors.label.sum()))
-    left_out, added = (int(binary_opening(votes).sum()) for votes in (against, missed))  # no single pixels
-    return Trust((int(errors.label.sum()) - left_out) / (size + added), left_out / size, added / size)
-
-
-def _errors(drawing: LayeredDrawing, image: Tensor, mask: Tensor | None, beside: float = BESIDE) -> _Errors:
-    votes = np.ones(drawing.parts.shape, dtype=bool) if mask is None else mask.numpy()
-    label = drawing.parts.numpy() > 0
-    away = distance_transform_edt(~label) if label.any() else np.full(label.shape, np.inf)
-    near = ~label & (away <= beside * float(np.hypot(*label.shape)))
-    assert drawing.tissue_image is not None
-    whole, tissue = (
-        uniform_filter((rendered - image).abs().mean(2).numpy(), SMOOTH)
-        for rendered in (drawing.image, drawing.tissue_image)
-    )
-    return _Errors(label & votes, near & votes, whole, tissue)

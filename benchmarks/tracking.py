@@ -1,0 +1,201 @@
+"""Scores what `neeco track` found against the truth of a rendered capture.
+
+    python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--first-state]
+    python benchmarks/tracking.py score RUN CAPTURE TRACKED
+
+`footage` makes a capture of CAPTURE's images and cameras whose instruments' states are withheld (`--first-state`: all
+but that of the first frame). `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
+all frames of its track.json, whether they were trusted or not.
+
+Errors are those of camera_from_instrument, so that the gauge of the cameras does not count. `px` is where a point near
+the tips falls in the image; `deg` the rotation; `joint` deg (mm where it slides), the largest of an instrument's;
+`IoU` that of the label that RUN draws at the tracked state. Every measure twice: as it is, and without the constant
+offset (one rigid transform and one number a joint, medians over all frames) by which the sensor's frame as learned
+differs from the true one, which no image shows. Lost: tip 10 px or rotation 15 degrees off. Trust: how many of the
+frames that are more than 10 degrees off have less than 0.5, and how many of the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture import read_capture, write_capture
+from neeco.capture.model import State, swap_camera_axes
+from neeco.evaluation.mask_folders import load_reference
+from neeco.labels.drawing import draw
+from neeco.raster.pinhole import project
+from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
+from neeco.raster.types import Camera
+from neeco.tracking.track import state_of
+from neeco.training.run import open_run
+
+DEG = math.pi / 180
+TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
+LOST_PX, LOST_DEG = 10.0, 15.0
+WRONG_DEG, TOLD = 10.0, 0.5
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where an instrument truly was before the camera, by frame, and a point and axis of it to measure by."""
+
+    camera_from_instrument: dict[str, Tensor]
+    joints: dict[str, dict[str, float]]
+    tip: Tensor  # [3] mm, instrument frame
+    axis: Tensor  # [3] unit, along the shaft
+
+    @classmethod
+    def read(cls, root: Path) -> Truth:
+        """Of a rendered capture at `root`."""
+        poses, joints = {}, {}
+        for frame in json.loads((root / "truth" / "transforms.json").read_text())["frames"]:
+            name, (instrument,) = Path(frame["file_path"]).stem, frame["instruments"]
+            camera = torch.from_numpy(swap_camera_axes(np.array(frame["transform_matrix"], float)))
+            poses[name] = torch.linalg.inv(camera) @ torch.tensor(instrument["pose"], dtype=torch.float64)
+            joints[name] = instrument["joints"]
+        return cls(poses, joints, *_tip_and_axis(root))
+
+
+def _tip_and_axis(root: Path) -> tuple[Tensor, Tensor]:
+    for file in ("hinge.json", "kinematics.json"):
+        path = root / "truth" / file
+        if path.exists():
+            hinge = json.loads(path.read_text())
+            if "hinge_pivot" in hinge:
+                axis = torch.tensor(hinge["shaft_direction"], dtype=torch.float64)
+                return torch.tensor(hinge["hinge_pivot"], dtype=torch.float64) + TIP_BEYOND * axis, axis
+    stated = re.search(r"TCP used for checks: \(0,0,([\d.]+)\)", (root / "README.md").read_text())
+    tip = torch.tensor([0, 0, float(stated.group(1)) if stated else 24.3], dtype=torch.float64)
+    return tip, torch.tensor([0.0, 0, 1], dtype=torch.float64)
+
+
+def camera_from_instrument(world_from_camera: Tensor, world_from_instrument: Tensor) -> Tensor:
+    """[4, 4] float64."""
+    return torch.linalg.inv(world_from_camera.double()) @ world_from_instrument.double()
+
+
+def constant_offset(found: Sequence[Tensor], true: Sequence[Tensor]) -> Tensor:
+    """[4, 4] instrument_from_learned: the median of how found poses [4, 4] differ from true ones."""
+    offset = torch.eye(4, dtype=torch.float64)
+    for _ in range(5):
+        rows = []
+        for one, other in zip(found, true, strict=True):
+            left = torch.linalg.inv(offset) @ torch.linalg.inv(other) @ one
+            rows.append(torch.cat([vector_from_rotation(left[:3, :3]), left[:3, 3]]))
+        offset = offset @ rigid_from_vector(torch.stack(rows).median(0).values)
+    return offset
+
+
+def errors(camera: Camera, found: Tensor, true: Tensor, truth: Truth) -> dict[str, float]:
+    """px, deg and roll (deg) of camera_from_instrument [4, 4] against the true one."""
+    tips = torch.stack([pose[:3, :3] @ truth.tip + pose[:3, 3] for pose in (found, true)])
+    x, y = project(tips, camera.fx, camera.fy, camera.cx, camera.cy, nearest=1.0)
+    turned = vector_from_rotation(true[:3, :3].T @ found[:3, :3]) / DEG
+    return {
+        "px": math.hypot(float(x[0] - x[1]), float(y[0] - y[1])),
+        "deg": float(turned.norm()),
+        "roll": abs(float(turned @ truth.axis)),
+    }
+
+
+def score(run: Path, root: Path, tracked: Path) -> None:
+    """Print tables of errors and of trust."""
+    capture, truth = read_capture(root), Truth.read(root)
+    frames = {frame.name: frame for frame in capture.frames}
+    records = json.loads((tracked / "track.json").read_text())["frames"]
+    found, true, rows = [], [], []
+    with open_run(run) as opened:
+        for record in records:
+            frame = frames[record["frame"]]
+            given = next(iter(record["instruments"].values()))
+            pose = torch.tensor(given["pose"], dtype=torch.float64)
+            found.append(camera_from_instrument(frame.camera.world_from_camera, pose))
+            true.append(truth.camera_from_instrument[frame.name])
+            joints = [given["joints"][j] - value for j, value in truth.joints[frame.name].items()]
+            row = {"split": frame.split, "trust": record["trust"]["value"], "how": record["how"], "joints": joints}
+            reference, parts = load_reference(capture, frame), draw(opened.scene, state_of(record), frame.camera).parts
+            if reference is not None and parts is not None:
+                one, other = parts.numpy() > 0, reference.mask.numpy() > 0
+                row["iou"] = float((one & other).sum() / max(1, (one | other).sum()))
+            rows.append(row)
+    offset = torch.linalg.inv(constant_offset(found, true))
+    joints = np.median([row["joints"] for row in rows], axis=0)
+    print("| split | n | offset | tip px | rotation deg | roll deg | joint deg | IoU | lost |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for kind in ("as it is", "taken out"):
+        for row, record, one, other in zip(rows, records, found, true, strict=True):
+            out = kind == "taken out"
+            row |= errors(frames[record["frame"]].camera, one @ offset if out else one, other, truth)
+            row["joint"] = float(np.abs(np.array(row["joints"]) - (joints if out else 0)).max(initial=0)) / DEG
+        for split in dict.fromkeys(row["split"] for row in rows):
+            print_row([row for row in rows if row["split"] == split], split, kind)
+    print_trust(rows)
+
+
+def print_row(rows: Sequence[dict[str, Any]], split: str, kind: str) -> None:
+    """Median / 95 % of every measure."""
+    cells = []
+    for name in ("px", "deg", "roll", "joint"):
+        values = [row[name] for row in rows]
+        cells.append(f"{np.median(values):.2f} / {np.percentile(values, 95):.2f}")
+    overlaps = [row["iou"] for row in rows if "iou" in row]
+    lost = np.mean([row["px"] > LOST_PX or row["deg"] > LOST_DEG for row in rows])
+    iou = f"{np.mean(overlaps):.3f}" if overlaps else "-"
+    print(f"| {split} | {len(rows)} | {kind} | {' | '.join(cells)} | {iou} | {100 * lost:.1f} % |")
+
+
+def print_trust(rows: Sequence[dict[str, Any]]) -> None:
+    """Who is told: trust against errors, offset taken out."""
+    trust = np.array([row["trust"] for row in rows])
+    off = np.array([row["deg"] > WRONG_DEG or row["px"] > LOST_PX for row in rows])
+    for name, those in (("more than 10 degrees or 10 px off", off), ("others", ~off)):
+        told = f"{100 * (trust[those] < TOLD).mean():.1f} % have trust below {TOLD}" if those.any() else "-"
+        print(f"{name}: {those.sum()} frames, {told}")
+
+
+def footage(root: Path, output: Path, splits: Sequence[str], every: int, first_state: bool) -> None:
+    """Write a capture without states."""
+    capture = read_capture(root)
+    frames = sorted(capture.frames, key=lambda frame: frame.state.time)
+    chosen = [frame for frame in frames if not splits or frame.split in splits][::every]
+    bare = [
+        frame if first_state and k == 0 else replace(frame, state=State({}, frame.state.time))
+        for k, frame in enumerate(chosen)
+    ]
+    write_capture(replace(capture, frames=tuple(bare), instruments=capture.instruments if first_state else ()), output)
+    print(f"{output}: {len(bare)} frames without states")
+
+
+def main() -> None:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    made = commands.add_parser("footage")
+    made.add_argument("capture", type=Path)
+    made.add_argument("output", type=Path)
+    made.add_argument("--splits", nargs="*", default=())
+    made.add_argument("--every", type=int, default=1)
+    made.add_argument("--first-state", action="store_true")
+    scored = commands.add_parser("score")
+    for name in ("run", "capture", "tracked"):
+        scored.add_argument(name, type=Path)
+    given = parser.parse_args()
+    if given.command == "footage":
+        footage(given.capture, given.output, given.splits, given.every, given.first_state)
+    else:
+        score(given.run, given.capture, given.tracked)
+
+
+if __name__ == "__main__":
+    main()

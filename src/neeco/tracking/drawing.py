@@ -1,0 +1,169 @@
+"""Instruments alone, drawn in a crop over tissue that was drawn once: what makes a drawing cheap enough to fit by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neeco.capture.images import area_averaged
+from neeco.capture.model import Frame, State
+from neeco.labels.labellers import CompositedLabels, composited_labels
+from neeco.raster import rasterize
+from neeco.raster.pinhole import project_world
+from neeco.raster.shadow import shadowed
+from neeco.raster.types import Camera
+from neeco.scene import CanonicalGaussians, Recorded, Scene
+
+BLOCK = 8  # px to multiples of which images are trimmed and crops rounded, so that they are halved three times exactly
+MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
+SOLID = 0.2  # opacity of Gaussians that say where the instrument is
+OUTERMOST = 0.002  # share of them at each side that a crop need not hold
+
+Box = tuple[int, int, int, int]  # px: left, top, right, bottom
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame's image, reduced or cropped, what counts of it, and the tissue behind the instruments."""
+
+    camera: Camera
+    image: Tensor  # [h, w, 3]
+    weight: Tensor  # [h, w], 0 where pixels do not count
+    tissue: Tensor  # [h, w, 3]
+
+    def crop(self, box: Box) -> View:
+        """What lies in a box."""
+        left, top, right, bottom = box
+        camera = self.camera
+        camera = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top)
+        rows = slice(top, bottom), slice(left, right)
+        return View(camera, self.image[rows], self.weight[rows], self.tissue[rows])
+
+
+def working_size(camera: Camera, recorded: Recorded) -> Camera:
+    """The camera as it is worked with: no larger than MAX_PIXELS nor than the images that were learned from, trimmed to
+    multiples of BLOCK."""
+    learned = recorded.scale * max(other.fx for other in recorded.cameras)
+    factor = min(1.0, math.sqrt(MAX_PIXELS / (camera.width * camera.height)), learned / camera.fx)
+    scaled = camera if factor == 1 else camera.scaled(factor)
+    width, height = (max(BLOCK, size // BLOCK * BLOCK) for size in (scaled.width, scaled.height))
+    return replace(scaled, width=width, height=height)
+
+
+def view_of(frame: Frame, camera: Camera, tissue: Tissue, state: State | None) -> View:
+    """A frame as `working_size` says, before the tissue with the shadow of instruments in `state`. Raises NeecoError
+    when its image cannot be read."""
+    image, mask, given = frame.load_image(), frame.load_mask(), frame.camera
+    counted = torch.ones(given.height, given.width) if mask is None else mask.float()
+    factor = camera.fx / given.fx
+    width, height = max(camera.width, round(given.width * factor)), max(camera.height, round(given.height * factor))
+    if (width, height) != (given.width, given.height):
+        image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
+    rows = slice(0, camera.height), slice(0, camera.width)
+    weight = torch.where(counted[rows] > 0.99, 1.0, 0.0)
+    return View(camera, image[rows], weight, tissue.draw(camera, state))
+
+
+class InstrumentDrawer:
+    """Draws a scene's instruments without its tissue, on the CPU whatever device draws."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.alone = _without_tissue(scene)
+        tissue = scene.canonical.counts[0]
+        self.labeller = CompositedLabels(scene)
+        self._channels = self.labeller.channels[tissue:].contiguous()
+        self._black = scene.canonical.means.new_zeros(3)
+
+    @torch.no_grad()
+    def draw(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
+        """(colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
+        rendering = rasterize(self.alone.at(state), camera, background=self._black)
+        return rendering.color.cpu(), rendering.alpha.cpu()
+
+    def composed(self, state: State, view: View) -> Tensor:
+        """[h, w, 3]: the instruments in `state` over a view's tissue."""
+        color, alpha = self.draw(state, view.camera)
+        return color + (1 - alpha[..., None]) * view.tissue
+
+    @torch.no_grad()
+    def labelled(self, state: State, view: View) -> LabelledView:
+        """The instruments over a view's tissue, with their parts."""
+        posed = self.alone.at(state)
+        unobserved = self.alone.unobserved(posed, view.camera)
+        channels = torch.cat([self._channels, unobserved[:, None]], 1)
+        drawing = rasterize(posed, view.camera, channels=channels, background=self._black)
+        assert drawing.channels is not None
+        labels = replace(drawing, channels=drawing.channels[..., :-1])
+        parts, _ = composited_labels(labels, self.labeller.threshold)
+        color, alpha = drawing.color.cpu(), drawing.alpha.cpu()
+        image = (color + (1 - alpha[..., None]) * view.tissue).clamp(0, 1)
+        return LabelledView(image, parts.cpu(), view.tissue, alpha, drawing.channels[..., -1].cpu())
+
+    @torch.no_grad()
+    def box(self, state: State, camera: Camera, margin: float) -> Box | None:
+        """Where the instruments fall in the image and `margin` px about that; None where they are outside of it."""
+        posed = self.alone.at(state)
+        means = posed.means[posed.opacities > SOLID]
+        pixels, depth = project_world(means, camera)
+        x, y = pixels.unbind(-1)
+        inside = (depth > camera.near) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
+        if not inside.any():
+            return None
+        ends = torch.tensor([OUTERMOST, 1 - OUTERMOST], device=x.device)
+        (left, right), (top, bottom) = (values[inside].quantile(ends).tolist() for values in (x, y))
+        return (
+            max(0, int((left - margin) // BLOCK) * BLOCK),
+            max(0, int((top - margin) // BLOCK) * BLOCK),
+            min(camera.width, -int(-(right + margin) // BLOCK) * BLOCK),
+            min(camera.height, -int(-(bottom + margin) // BLOCK) * BLOCK),
+        )
+
+
+@dataclass(frozen=True)
+class LabelledView:
+    """Instruments drawn over tissue, with what `neeco.evaluation.trust` asks for."""
+
+    image: Tensor  # [h, w, 3] in [0, 1]
+    parts: Tensor  # [h, w] uint8
+    tissue_image: Tensor  # [h, w, 3]
+    alpha: Tensor  # [h, w]
+    unobserved: Tensor  # [h, w] share of a pixel that is of instruments no training frame saw, or not from about there
+
+
+class Tissue:
+    """Draws the tissue of a learned scene, with the shadow that its instruments cast."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._rows = ~scene.canonical.of_instruments
+
+    @property
+    def shaded(self) -> bool:
+        """Whether it looks otherwise where an instrument casts its shadow."""
+        return self.scene.casts_shadow
+
+    @torch.no_grad()
+    def draw(self, camera: Camera, state: State | None) -> Tensor:
+        """[h, w, 3] with the shadow of instruments in `state` (None: of none)."""
+        gaussians = self.scene.at(self.scene.recorded.states[0] if state is None else state)
+        if state is not None:
+            gaussians = shadowed(gaussians, camera, rasterize)
+        elif gaussians.headlight is not None:
+            gaussians = replace(gaussians, headlight=replace(gaussians.headlight, shadow=None))
+        return rasterize(gaussians.select(self._rows), camera).color.clamp(0, 1).cpu()
+
+
+def _without_tissue(scene: Scene) -> Scene:
+    """The scene's instruments: the same modules, Gaussians of their own."""
+    scene.visibility()  # measured on the whole, where training did not store it
+    tissue, *others = scene.canonical.counts
+    tensors = {name: tensor[tissue:].contiguous() for name, tensor in scene.canonical.tensors().items()}
+    own = CanonicalGaussians.from_tensors(tensors, (0, *others))
+    alone = Scene(scene.method, own, scene.deformation, scene.instruments, scene.recorded, scene.center)
+    alone.load_state_dict(scene.state_dict())
+    alone.sh_degree = scene.sh_degree
+    return alone.to(scene.center.device).requires_grad_(False)

@@ -1,0 +1,112 @@
+"""How instruments move between frames: at a constant velocity, but for accelerations as large as were recorded.
+
+A Kalman filter over increments (`Coordinates`) and their velocities. Frames enter through fits: the information that
+their pixels give is what is measured, so that prediction and image are weighed in the fit itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.model import State
+from neeco.tracking.coordinates import Coordinates
+from neeco.tracking.fitting import Fit
+
+FEWEST = 8  # second differences that tell accelerations
+NORMAL = 1.4826  # standard deviations a median absolute deviation
+STILLEST = (0.05, 0.03, 0.1, 0.05)  # deg, mm, deg and mm of joints: least second difference between frames
+BEGINNING = (2.0, 2.0, 3.0, 1.0)  # the same: standard deviations of a state just found
+LONGEST = 0.4  # s: what is not seen for longer has to be found anew
+
+
+@dataclass(frozen=True)
+class Moving:
+    """What is known of a state at an instant."""
+
+    state: State
+    velocity: Tensor  # [P] a second
+    covariance: Tensor  # [2 P, 2 P] of increments and velocity
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The instruments' motion as recorded."""
+
+    coordinates: Coordinates
+    density: Tensor  # [P] of the white noise that accelerates: variance of the velocity a second
+    velocities: Tensor  # [P, P] covariance of the velocities, a second
+    interval: float  # s between recorded frames
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, states: Sequence[State]) -> Motion:
+        """Learned from recorded states: robust deviation of second differences between frames that follow each
+        other; of first differences where there are too few of these."""
+        ordered = sorted(states, key=lambda state: state.time)
+        gaps = np.diff([state.time for state in ordered])
+        gaps = gaps[gaps > 0]
+        interval = float(np.median(gaps)) if len(gaps) else 0.04
+        steps: list[Tensor | None] = []
+        for before, after in pairwise(ordered):
+            follows = abs(after.time - before.time - interval) < interval / 2
+            steps.append(coordinates.between(before, after) if follows else None)
+        turns = [b - a for a, b in pairwise(steps) if a is not None and b is not None]
+        if len(turns) < FEWEST:
+            turns = [step for step in steps if step is not None]
+        deviation, place = coordinates.each(*STILLEST), coordinates.each(*BEGINNING)
+        if turns:
+            deviation = torch.maximum(deviation, NORMAL * torch.stack(turns).abs().median(0).values)
+        velocities = torch.diag((deviation if turns else place) / interval) ** 2
+        known = [step for step in steps if step is not None]
+        if known:
+            paces = torch.stack(known) / interval
+            velocities = velocities + paces.T @ paces / len(paces)
+        return cls(coordinates, deviation**2 / interval**3, velocities, interval)
+
+    def begin(self, state: State) -> Moving:
+        """Just found: its velocity is not known."""
+        place = torch.diag(self.coordinates.each(*BEGINNING) ** 2)
+        return Moving(state, torch.zeros_like(place[0]), torch.block_diag(place, self.velocities))
+
+    def predict(self, moving: Moving, seconds: float) -> Moving:
+        """After so long, which may be negative: backwards in time."""
+        size, step = self.coordinates.size, abs(seconds)
+        eye = torch.eye(size, dtype=torch.float64)
+        forward = torch.cat(
+            [torch.cat([eye, step * eye], 1), torch.cat([torch.zeros_like(eye), eye], 1)]
+        )  # velocities are along the way in which frames are followed
+        noise = torch.diag(self.density)
+        added = torch.cat(
+            [
+                torch.cat([noise * step**3 / 3, noise * step**2 / 2], 1),
+                torch.cat([noise * step**2 / 2, noise * step], 1),
+            ]
+        )
+        covariance = forward @ moving.covariance @ forward.T + added
+        state = self.coordinates.moved(moving.state, step * moving.velocity)
+        return Moving(state, moving.velocity, (covariance + covariance.T) / 2)
+
+    def precision(self, predicted: Moving) -> Tensor:
+        """[P, P] with which a state is expected."""
+        size = self.coordinates.size
+        return torch.linalg.inv(predicted.covariance[:size, :size])
+
+    def update(self, predicted: Moving, fit: Fit) -> Moving:
+        """After a frame to which the predicted state was fitted."""
+        size = self.coordinates.size
+        moved = self.coordinates.between(predicted.state, fit.state)
+        own, cross = predicted.covariance[:size, :size], predicted.covariance[size:, :size]
+        velocity = predicted.velocity + cross @ torch.linalg.solve(own, moved)
+        measured = torch.linalg.inv(fit.information + 1e-9 * torch.eye(size, dtype=torch.float64))
+        gain = torch.linalg.solve((own + measured).T, predicted.covariance[:, :size].T).T
+        covariance = predicted.covariance - gain @ predicted.covariance[:size]
+        return Moving(fit.state, velocity, (covariance + covariance.T) / 2)
+
+    def freed(self, moving: Moving) -> Moving:
+        """After a fit that the motion did not foresee: how fast it was is forgotten."""
+        return Moving(moving.state, moving.velocity, moving.covariance + self.begin(moving.state).covariance)

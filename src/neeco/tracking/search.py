@@ -1,0 +1,157 @@
+"""States looked for where a fit from near does not get: beside what was expected, or anywhere, nothing known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from neeco.capture.model import InstrumentState, State, evenly_spaced
+from neeco.raster.types import Camera
+from neeco.scene import Recorded
+from neeco.tracking.coordinates import DEG, Coordinates
+from neeco.tracking.drawing import View
+from neeco.tracking.fitting import Fit, Fitter, observed, reduced, wide
+from neeco.tracking.motion import Motion, Moving
+
+ALONG_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: teeth, rings and its end hold a fit where it was
+ROLL_DEG = (-8.0, 0.0, 8.0)  # about it
+SAMPLES = 48  # of what is expected
+SLACK = 3.0  # times what is expected: how far those beside may be from it
+FOLLOWED = 3  # of those beside, that are fitted
+FAR = (30.0, 30.0, 40.0)  # deg, mm, deg of joints: prior of a search anywhere
+
+BANK = 96  # recorded states tried
+STARTS = 6  # of them fitted
+TURNED = 3  # of the best one turned and opened otherwise
+FINALISTS = 2  # fitted at full size
+APART_MM, APART_DEG, APART_JOINT_DEG = 8.0, 15.0, 15.0  # states nearer than this lead to the same
+OTHER_ROLLS = (-90.0, -60.0, -40.0, -25.0, 25.0, 40.0, 60.0, 90.0, 180.0)  # deg
+OTHER_JOINTS = (-15.0, 15.0)  # deg, or as many quarters of a mm
+QUARTER_MM = 0.25
+
+
+@dataclass(frozen=True)
+class Search:
+    """Looks for the instruments in single frames."""
+
+    fitter: Fitter
+    motion: Motion
+    recorded: Recorded
+
+    @property
+    def coordinates(self) -> Coordinates:
+        return self.fitter.coordinates
+
+    def ranked(self, view: View, states: Iterable[State], size: float) -> list[State]:
+        """The best first, as they explain a view reduced to `size`."""
+        seen = observed(view, size)
+        scored = [
+            (float(seen.errors(reduced(self.fitter.drawer.composed(state, view), size)).sum()), k, state)
+            for k, state in enumerate(states)
+        ]
+        return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
+
+    def beside(self, view: View, predicted: Moving, others: Sequence[State], usual: float) -> Fit | None:
+        """The best fit begun along the shaft, at other rolls, and where else the state may be by its covariance, from
+        what is predicted and from `others`; the first whose misfit is `usual`."""
+        coordinates, tried = self.coordinates, []
+        for base in (predicted.state, *others):
+            for k in range(len(coordinates.instruments)):
+                tried += [
+                    coordinates.moved(base, coordinates.along(k, along, roll * DEG))
+                    for along in ALONG_MM
+                    for roll in ROLL_DEG
+                ]
+        size, generator = coordinates.size, torch.Generator().manual_seed(0)
+        root = torch.linalg.cholesky(predicted.covariance[:size, :size])
+        normal = torch.randn(SAMPLES, size, generator=generator, dtype=torch.float64)
+        tried += [coordinates.moved(predicted.state, increments) for increments in normal @ root.T]
+        precision = self.motion.precision(predicted)
+        best: Fit | None = None
+        for start in self.ranked(view, tried, 0.25)[:FOLLOWED]:
+            fit = self.fitter.fit(
+                view, predicted.state, precision / SLACK**2, start, levels=(0.125, 0.25, 0.5), steps=(6, 4, 3)
+            )
+            if fit is not None and (best is None or fit.gain > best.gain):
+                best = fit
+                if fit.misfit <= usual:
+                    break
+        if best is None:
+            return None
+        return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(6,))
+
+    def anywhere(self, view: View) -> Fit | None:
+        """The best fit, nothing else known: from recorded states, then from the best one turned and opened otherwise.
+        None where none explains the image better than the tissue alone."""
+        fitter, far = self.fitter, wide(self.coordinates, *FAR)
+        starts = self._different(self.ranked(view, self.bank(view.camera), 0.125), STARTS)
+        fits = [fitter.fit(view, state, far, levels=(0.125, 0.25), steps=(6, 4)) for state in starts]
+        found = _by_gain(fits)
+        if found:
+            others = self._different(self.ranked(view, self.turned(found[0].state), 0.25), TURNED)
+            fits = [fitter.fit(view, state, far, levels=(0.25,), steps=(6,)) for state in others]
+            found = _by_gain([*found, *fits])
+        last = [fitter.fit(view, fit.state, far, levels=(0.5, 1.0), steps=(4, 4)) for fit in found[:FINALISTS]]
+        best = _by_gain(last)
+        return best[0] if best and best[0].gain > 0 else None
+
+    def bank(self, camera: Camera) -> list[State]:
+        """Recorded states as they were before their cameras, before `camera`."""
+        recorded, world = self.recorded, camera.world_from_camera.double().cpu()
+        states = []
+        for k in evenly_spaced(len(recorded.states), BANK):
+            carry = world @ torch.linalg.inv(recorded.cameras[k].world_from_camera.double().cpu())
+            instruments = {
+                name: InstrumentState(carry @ given.pose.double().cpu(), given.joints)
+                for name, given in recorded.states[k].instruments.items()
+            }
+            states.append(State(instruments, 0.0))
+        return states
+
+    def turned(self, state: State) -> list[State]:
+        """One instrument after the other at other rolls, with its joints as they are and otherwise."""
+        coordinates, found = self.coordinates, []
+        for k, item in enumerate(coordinates.instruments):
+            given = state.instruments[item.name].joints
+            values = [given[name] for name in item.joints]
+            for roll in (0.0, *OTHER_ROLLS):
+                rolled = coordinates.moved(state, coordinates.along(k, roll=roll * DEG))
+                found += [rolled] if roll else []
+                for j, slides in enumerate(item.slides):
+                    for change in OTHER_JOINTS:
+                        moved = [*values]
+                        moved[j] += change * (QUARTER_MM if slides else DEG)
+                        found.append(coordinates.with_joints(rolled, k, moved))
+        return found
+
+    def _different(self, states: Sequence[State], count: int) -> list[State]:
+        """The first few that differ in place, turn or joints."""
+        chosen: list[State] = []
+        for state in states:
+            if all(differ(self.coordinates, state, other, APART_DEG, APART_JOINT_DEG, APART_MM) for other in chosen):
+                chosen.append(state)
+            if len(chosen) == count:
+                break
+        return chosen
+
+
+def _by_gain(fits: Iterable[Fit | None]) -> list[Fit]:
+    return sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.gain)
+
+
+def differ(
+    coordinates: Coordinates, one: State, other: State, degrees: float, joints: float, millimetres: float = math.inf
+) -> bool:
+    """Whether two states are turned by more than `degrees`, shifted by more than `millimetres`, or a joint by more than
+    `joints` deg (or as many quarters of a mm)."""
+    apart = coordinates.between(one, other)
+    for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
+        own = apart[rows]
+        units = torch.tensor([QUARTER_MM if slides else DEG for slides in item.slides], dtype=torch.float64)
+        turned, shifted = float(own[:3].norm()) / DEG, float(own[3:6].norm())
+        if turned > degrees or shifted > millimetres or bool((own[6:].abs() > joints * units).any()):
+            return True
+    return False

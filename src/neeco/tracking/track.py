@@ -1,0 +1,309 @@
+"""`neeco track`: footage whose states are not known becomes a capture, each state with how far to trust it.
+
+Frames are followed forwards from where the instruments were first found, backwards to the beginning, and once more
+backwards through every stretch of little trust from the frame beyond it; of two results the more trusted is kept.
+Every step is written beside the output as it is made, so that work that was broken off goes on to the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+import neeco
+from neeco.capture.model import Capture, Frame, InstrumentState, State
+from neeco.capture.writer import fingerprint, write_capture
+from neeco.errors import NeecoError
+from neeco.files import is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
+from neeco.scene.scene import gaussian_scene
+from neeco.tracking.coordinates import Coordinates
+from neeco.tracking.drawing import InstrumentDrawer, Tissue
+from neeco.tracking.fitting import Fitter
+from neeco.tracking.follow import Follower, Step
+from neeco.tracking.motion import Motion
+from neeco.tracking.search import Search
+from neeco.tracking.trust import Judge, Reference
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
+    from neeco.training.run import Run
+
+SCHEMA = "neeco-track/1"
+INFO = "track.json"
+STEPS = "steps"  # the folder of what is done, gone at the end
+MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
+SURE = 0.8  # trust with which instruments are begun to be followed at once
+BEGINNINGS = 8  # frames in which the instruments are looked for, until one is SURE
+TOGETHER = 0.7  # trust below which a stretch is followed once more, from its far end
+
+Start = Literal["first", "none"]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What was found: a record of every frame, in order of time, and the capture of those that are trusted."""
+
+    output: Path
+    footage: Capture
+    records: list[dict[str, Any]]
+    written: int
+    min_trust: float
+    scene: Scene
+
+    def require_trusted(self) -> None:
+        """Raises NeecoError where no frame is trusted."""
+        if not self.written:
+            best = max(record["trust"]["value"] for record in self.records)
+            raise NeecoError(
+                f"{self.footage.root}: no frame is trusted by {self.min_trust:g}, the best is by {best:.2f}; is it the "
+                f"run's instrument, over its tissue? {self.output} shows what was found"
+            )
+
+
+def track_footage(
+    run: Run,
+    footage: Capture,
+    output: Path,
+    *,
+    start: Start = "none",
+    min_trust: float = MIN_TRUST,
+    resume: bool = False,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Tracked:
+    """Find the states of the run's instruments in every frame of `footage`, which shows them over the run's tissue, its
+    cameras in the run's world, and write those that are trusted as a capture.
+
+    States that the footage has are not looked at, but for that of its first frame where `start` is "first". Interrupted
+    (Ctrl-C) or failing, it keeps what is done, for `resume`. How many threads torch takes is the caller's to set
+    (`open_run`). Raises NeecoError for a run that cannot be followed by, footage without the state that is asked for, a
+    share that is none, and an `output` that is not empty (without `resume`) or was begun otherwise.
+    """
+    if not 0 <= min_trust <= 1:
+        raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
+    scene = gaussian_scene(run.scene, "track")
+    coordinates = Coordinates.of(scene)
+    frames = sorted(footage.frames, key=lambda frame: frame.state.time)
+    given = _first_state(footage, frames[0], scene) if start == "first" else None
+    trained_on = run.capture()
+    scene_file = Path(run.path) / "scene.safetensors"
+    digest = hashlib.sha256(read_bytes(scene_file, "a learned scene", "no such file; train the run first")).hexdigest()
+    info: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": neeco.__version__,
+        "run": os.path.abspath(run.path),
+        "footage": os.path.abspath(footage.root),
+        "scene_sha256": digest,
+        "captures_sha256": [fingerprint(capture) for capture in (footage, trained_on)],
+        "start": start,
+        "min_trust": min_trust,
+    }
+    _check_output(output, info, resume)
+    with own_folder(output):
+        stored = read_json(output / INFO) if (output / INFO).exists() else {}
+        if not stored.get("complete"):
+            write_json(output / INFO, info | {"complete": False})
+            fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
+            motion = Motion.of(coordinates, scene.recorded.states)
+            search = Search(fitter, motion, scene.recorded)
+            reference = Reference.of(fitter, trained_on.split("train"))
+            follower = Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
+            work = _Work(output / STEPS, follower, on_progress)
+            records = [_record(frames[k], step, coordinates) for k, step in enumerate(work.all_steps(given))]
+            info |= {"complete": True, "reference": reference.to_json(), "frames": records}
+        else:
+            info = stored
+        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust)
+        write_json(output / INFO, info)
+        if (output / STEPS).exists():
+            shutil.rmtree(output / STEPS)
+    return Tracked(output, footage, info["frames"], written, min_trust, scene)
+
+
+@dataclass
+class _Work:
+    """Steps that were made or are read back, each in a file of its own."""
+
+    folder: Path
+    follower: Follower
+    on_progress: Callable[[int, int], None]
+    done: int = 0
+
+    def all_steps(self, given: State | None) -> list[Step]:
+        """The best step of every frame, in order of time."""
+        count = len(self.follower.frames)
+        if given is None:
+            first = self._beginning()
+        else:
+            first = self._step("begin-0", lambda: self.follower.begin(0, given))
+        steps: dict[int, Step] = {first.frame: first}
+        self._count(count)
+        for way, end in ((1, count), (-1, -1)):
+            before = first
+            for frame in range(first.frame + way, end, way):
+                before = steps[frame] = self._follow("pass", before, frame)
+                self._count(count)
+        self._again(steps)
+        return [steps[frame] for frame in range(count)]
+
+    def _beginning(self) -> Step:
+        """Where the instruments are found first, of a few frames spread over the footage."""
+        count, found = len(self.follower.frames), []
+        spread = [k * count // BEGINNINGS for k in range(BEGINNINGS)]
+        for frame in dict.fromkeys(spread):
+            found.append(self._step(f"find-{frame}", partial(self.follower.find, frame)))
+            if found[-1].trust.value >= SURE:
+                break
+        return max(found, key=lambda step: step.trust.value)
+
+    def _again(self, steps: dict[int, Step]) -> None:
+        """Go backwards through every stretch of little trust that a trusted frame follows."""
+        before: Step | None = None
+        for frame in range(len(steps) - 1, -1, -1):
+            if steps[frame].trust.value >= TOGETHER:
+                before = steps[frame]
+                continue
+            if before is None:
+                continue
+            if before is steps.get(frame + 1):  # its motion was learned the other way
+                turned = self.follower.motion.begin(before.moving.state)
+                before = replace(before, moving=turned)
+            before = self._follow("again", before, frame)
+            if before.trust.value > steps[frame].trust.value:
+                steps[frame] = before
+
+    def _follow(self, name: str, before: Step, frame: int) -> Step:
+        return self._step(f"{name}-{frame}", lambda: self.follower.follow(before, frame))
+
+    def _step(self, name: str, make: Callable[[], Step]) -> Step:
+        """One step, always as its file says."""
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            write_json(path, make().to_json())
+        stored = require_like(read_json(path), STEP, str(path), "remove the output folder and track again")
+        return Step.from_json(stored)
+
+    def _count(self, total: int) -> None:
+        self.done += 1
+        self.on_progress(self.done, total)
+
+
+STEP = {
+    "frame": int,
+    "how": str,
+    "instruments": {str: {"pose": [[float]], "joints": {str: float}}},
+    "time": float,
+    "velocity": [float],
+    "covariance": [[float]],
+    "misfit": float,
+    "gain": float,
+    "trust": [float],
+    "recent": [float],
+    "seen_at": float,
+    "searched_at": float,
+    "unlooked": int,
+}
+
+
+def _record(frame: Frame, step: Step, coordinates: Coordinates) -> dict[str, Any]:
+    """What track.json says of a frame. `deviation`: of rotation (rad), place (mm) and every joint, one standard
+    deviation."""
+    instruments = {}
+    variance = step.moving.covariance.diagonal()
+    for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
+        state, own = step.moving.state.instruments[item.name], variance[rows].clamp_min(0)
+        deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:6].sum().sqrt())}
+        deviation |= {f"joint.{name}": float(own[6 + k].sqrt()) for k, name in enumerate(item.joints)}
+        instruments[item.name] = {
+            "pose": state.pose.tolist(),
+            "joints": dict(state.joints),
+            "deviation": {name: round(value, 5) for name, value in deviation.items()},
+        }
+    return {
+        "frame": frame.name,
+        "split": frame.split,
+        "time": frame.state.time,
+        "how": step.how,
+        "trust": step.trust.to_json(),
+        "misfit": round(step.misfit, 4),
+        "instruments": instruments,
+    }
+
+
+def state_of(record: dict[str, Any]) -> State:
+    """The state that a record of track.json tells."""
+    trust = record["trust"]["value"]
+    instruments = {
+        name: InstrumentState(torch.tensor(given["pose"], dtype=torch.float64), given["joints"], trust)
+        for name, given in record["instruments"].items()
+    }
+    return State(instruments, record["time"])
+
+
+def _write(
+    output: Path,
+    footage: Capture,
+    scene: Scene,
+    trained_on: Capture,
+    frames: Sequence[Frame],
+    records: Sequence[dict[str, Any]],
+    min_trust: float,
+) -> int:
+    """Write the trusted frames as a capture; how many there are."""
+    chosen = tuple(
+        replace(frame, state=state_of(record))
+        for frame, record in zip(frames, records, strict=True)
+        if record["trust"]["value"] >= min_trust
+    )
+    if chosen:
+        points = footage.points if footage.points.measured else trained_on.points
+        write_capture(
+            Capture(output, chosen, scene.instruments, points, timed=footage.timed, lens=footage.lens),
+            output,
+            overwrite=True,
+        )
+    return len(chosen)
+
+
+def _first_state(footage: Capture, frame: Frame, scene: Scene) -> State:
+    """What the footage says of its first frame. Raises NeecoError where it says nothing of an instrument or joint."""
+    states = {}
+    for item in scene.instruments:
+        given = frame.state.instruments.get(item.name)
+        missing = [name for name in item.joints if given is not None and name not in given.joints]
+        if given is None or missing:
+            what = f"instrument {item.name!r}" if given is None else f"joint {missing[0]!r} of {item.name!r}"
+            raise NeecoError(
+                f"{footage.root}: {frame.name}: instruments: the first frame does not state {what}; state it there, "
+                "or use --start none"
+            )
+        states[item.name] = InstrumentState(given.pose.double(), {name: given.joints[name] for name in item.joints})
+    return State(states, frame.state.time)
+
+
+def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
+    """Raises NeecoError when `output` may not be written to."""
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give a folder")
+    if is_vacant(output):
+        return
+    if not resume:
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
+    file = output / INFO
+    if not file.exists():
+        raise NeecoError(
+            f"{output}: not empty and no {INFO} in it; --resume goes on only with footage that was tracked"
+        )
+    begun = read_json(require_inside(file, output))
+    if not isinstance(begun, dict):
+        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
+    for key in ("schema", "version", "scene_sha256", "captures_sha256", "start", "min_trust"):
+        if begun.get(key) != info[key]:
+            raise NeecoError(f"{file}: {key}: begun with {begun.get(key)!r}, now {info[key]!r}; use a new folder")

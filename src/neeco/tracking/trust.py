@@ -1,0 +1,144 @@
+"""How far a tracked state is trusted: by its place, roll and joints, not by its outline alone.
+
+Trust is a product of four shares, each 1 where nothing speaks against the state:
+
+- `overlap`: the overlap (IoU) of its label that the image supports (`neeco.evaluation.trust`). An instrument turned by
+  25 degrees still explains most of its pixels, so the outline alone says nothing of roll and joints;
+- `explained`: how badly pixels are explained, against what is usual for the frames that the scene was learned from;
+- `observed`: how much of what is seen of the instrument some training frame saw, and from about there. Of sides that
+  nobody saw, a scene draws what it likes, and images of them fit wrong rolls as well;
+- `single`: whether another state, turned or opened otherwise, explains the image about as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from neeco.capture.model import Frame, evenly_spaced
+from neeco.errors import NeecoError
+from neeco.evaluation.trust import TypicalErrors, estimate_trust, typical_errors_of
+from neeco.tracking.drawing import LabelledView, View, view_of, working_size
+from neeco.tracking.fitting import Fit, Fitter, wide
+from neeco.tracking.search import Search, differ
+
+REFERENCE_FRAMES = 16  # training frames that tell what is usual
+USUAL = 0.9  # of them have a smaller misfit
+LEAST_MISFIT = 0.2  # about 5 of 255 grey levels: what explains images better is not held against them
+LEAST_ERROR = 0.012  # of a pixel's colour, of 1: the same
+HALF_TRUSTED = 3.0  # times the usual misfit: where `explained` is 1/2
+STEEPNESS = 4.0
+LEAST_OBSERVED = 0.9  # of what the worst of the reference frames has, is as good as all
+DOUBTED = 0.9  # of trust otherwise, below which another state is looked for
+OTHERS_FITTED = 2
+NEARBY = (20.0, 5.0, 20.0)  # deg, mm, deg of joints: prior of the other state
+OTHER_DEG, OTHER_JOINT_DEG = 10.0, 8.0  # nearer than this a state is the same
+AS_GOOD = (0.9, 1.0)  # of the gain: another state takes no trust, or AMBIGUOUS of it
+AMBIGUOUS = 0.6
+
+
+@dataclass(frozen=True)
+class TrackTrust:
+    """Shares of which the product is how far a state is trusted."""
+
+    overlap: float
+    explained: float
+    observed: float
+    single: float
+
+    @property
+    def value(self) -> float:
+        """In [0, 1]."""
+        return self.overlap * self.explained * self.observed * self.single
+
+    def to_json(self) -> dict[str, float]:
+        """As plain values, for files."""
+        return {"value": round(self.value, 4)} | {name: round(share, 4) for name, share in asdict(self).items()}
+
+
+NONE = TrackTrust(0.0, 0.0, 0.0, 0.0)  # where no state was found
+
+
+@dataclass(frozen=True)
+class Reference:
+    """How the scene explains frames that it was learned from."""
+
+    errors: TypicalErrors
+    misfit: float  # USUAL of them have a smaller one
+    observed: float  # share of the label's pixels, at the worst of them
+
+    @classmethod
+    def of(cls, fitter: Fitter, frames: Sequence[Frame]) -> Reference:
+        """Of a few of the frames trained on, states fitted to each. Raises NeecoError when an image cannot be read."""
+        coordinates, scene = fitter.coordinates, fitter.drawer.scene
+        chosen = [frames[k] for k in evenly_spaced(len(frames), REFERENCE_FRAMES)]
+        states = dict(zip(scene.recorded.names, scene.recorded.states, strict=True))
+        near = wide(coordinates, 2.0, 2.0, 4.0)
+        judged, misfits, shares = [], [], []
+        for frame in chosen:
+            start = states.get(frame.name, frame.state)
+            view = view_of(frame, working_size(frame.camera, scene.recorded), fitter.tissue, start)
+            fit = fitter.fit(view, start, near)
+            if fit is None:
+                continue
+            drawing = fitter.labelled(view, fit.state)
+            judged.append((drawing, view.image, view.weight > 0))
+            misfits.append(fit.misfit)
+            shares.append(observed_share(drawing))
+        if not misfits:
+            raise NeecoError("track: no training frame of the run shows an instrument; train it again")
+        misfit = max(LEAST_MISFIT, float(np.quantile(misfits, USUAL)))
+        typical = typical_errors_of(judged)
+        errors = TypicalErrors(max(LEAST_ERROR, typical.inside), max(LEAST_ERROR, typical.beside))
+        return cls(errors, misfit, min(shares))
+
+    def to_json(self) -> dict[str, float]:
+        """As plain values, for files."""
+        return {**asdict(self.errors), "misfit": round(self.misfit, 5), "observed": round(self.observed, 5)}
+
+
+def observed_share(drawing: LabelledView) -> float:
+    """Of the label's pixels, as far as training frames observed what they show; 0 without a label."""
+    label = drawing.parts > 0
+    if not label.any():
+        return 0.0
+    return float(1 - (drawing.unobserved[label] / drawing.alpha[label].clamp_min(1e-6)).clamp(0, 1).mean())
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Says how far tracked states are trusted."""
+
+    fitter: Fitter
+    search: Search
+    reference: Reference
+
+    def judge(self, view: View, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
+        """Of a state fitted to a whole view; and, where another was looked for (with `look`, or where the state is
+        doubted), the best one found that differs."""
+        drawing = self.fitter.labelled(view, fit.state)
+        overlap = estimate_trust(drawing, view.image, view.weight > 0, self.reference.errors).value
+        explained = 1 / (1 + (fit.misfit / (HALF_TRUSTED * self.reference.misfit)) ** STEEPNESS)
+        observed = min(1.0, observed_share(drawing) / (LEAST_OBSERVED * self.reference.observed))
+        trust = TrackTrust(overlap, explained, observed, 1.0)
+        if not look and trust.value >= DOUBTED:
+            return trust, None
+        other = self._second(view, fit)
+        ratio = 0.0 if other is None else other.gain / max(fit.gain, 1e-9)
+        low, high = AS_GOOD
+        return replace(trust, single=1 - AMBIGUOUS * min(1.0, max(0.0, (ratio - low) / (high - low)))), other
+
+    def _second(self, view: View, fit: Fit) -> Fit | None:
+        """The best fit found, at half size, of a state that differs."""
+        coordinates, best = self.fitter.coordinates, None
+        view = self.fitter.with_shadow(view, fit.state)
+        loose = wide(coordinates, *NEARBY)
+        for state in self.search.ranked(view, self.search.turned(fit.state), 0.25)[:OTHERS_FITTED]:
+            found = self.fitter.fit(view, state, loose, levels=(0.25, 0.5), steps=(4, 3))
+            if found is None or not differ(coordinates, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG):
+                continue
+            if best is None or found.gain > best.gain:
+                best = found
+        return best

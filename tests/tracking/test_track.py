@@ -1,0 +1,186 @@
+"""Footage without states becomes a capture with them, each trusted as far as it should be."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from grasper_world import CAMERA, FRAMES, RecordedRun, grasper_state, moving, record, withheld
+
+from neeco.capture import check_capture, errors_only, read_capture
+from neeco.capture.images import write_image
+from neeco.capture.model import Capture, State
+from neeco.errors import NeecoError
+from neeco.report.track_page import write_track_page
+from neeco.tracking.coordinates import DEG, Coordinates
+from neeco.tracking.drawing import InstrumentDrawer, Tissue, view_of
+from neeco.tracking.fitting import Fitter, wide
+from neeco.tracking.motion import Motion
+from neeco.tracking.track import Tracked, state_of, track_footage
+
+
+def fitter_of(run: RecordedRun) -> Fitter:
+    return Fitter(InstrumentDrawer(run.scene), Coordinates.of(run.scene), Tissue(run.scene))
+
+
+def off(found: State, true: State) -> tuple[float, float, float]:
+    """deg, mm and deg of the jaw between two states; the shift is the hinge's."""
+    a, b = found.instruments["grasper"], true.instruments["grasper"]
+    turn = a.pose[:3, :3].T @ b.pose[:3, :3]
+    angle = math.acos(max(-1.0, min(1.0, (float(turn.diagonal().sum()) - 1) / 2)))
+    jaw = abs(a.joints["jaw_angle"] - b.joints["jaw_angle"])
+    return angle / DEG, float((a.pose[:3, 3] - b.pose[:3, 3]).norm()), jaw / DEG
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def tracked(tracked_run: RecordedRun, footage: Capture, tmp_path_factory: pytest.TempPathFactory) -> Tracked:
+    output = tmp_path_factory.mktemp("tracked") / "capture"
+    return track_footage(tracked_run, withheld(footage), output, start="first")
+
+
+def test_an_increment_leads_from_one_state_to_another(tracked_run: RecordedRun) -> None:
+    coordinates = Coordinates.of(tracked_run.scene)
+    one, other = grasper_state(jaw=0.4), grasper_state(3, -2, 75, 0.3, -0.5, 0.7)
+    reached = coordinates.moved(one, coordinates.between(one, other))
+    assert off(reached, other) == pytest.approx((0, 0, 0), abs=1e-4)
+
+
+def test_a_joint_is_not_moved_beyond_its_bounds(tracked_run: RecordedRun) -> None:
+    coordinates = Coordinates.of(tracked_run.scene)
+    opened = torch.tensor([0.0] * 6 + [5.0], dtype=torch.float64)
+    assert coordinates.moved(grasper_state(), opened).instruments["grasper"].joints["jaw_angle"] <= 1.2
+
+
+@pytest.mark.parametrize("size", [0.25, 1.0])
+def test_a_fit_ends_at_the_state_that_was_drawn_at_any_size(tracked_run: RecordedRun, size: float) -> None:
+    fitter, true = fitter_of(tracked_run), grasper_state(2, 1, 72, 0.1, 0.1, 0.5)
+    frame = record(tracked_run.scene, tracked_run.path / f"at-{size}", [true], "new").frames[0]
+    view = view_of(frame, CAMERA, fitter.tissue, None)
+    near = wide(fitter.coordinates, 20, 20, 20)
+    start = grasper_state(3.0, 0.3, 71, 0.13, 0.16, 0.55)
+    fit = fitter.fit(view, start, near, levels=(size,), steps=(12,))
+    assert fit is not None
+    degrees, millimetres, jaw = off(fit.state, true)
+    assert degrees < 1.5
+    assert millimetres < 1.5
+    assert jaw < 2.5
+    assert fit.gain > 0
+
+
+def test_footage_gets_the_states_it_was_drawn_in(tracked: Tracked) -> None:
+    assert tracked.written == FRAMES
+    for k, rec in enumerate(tracked.records):
+        degrees, millimetres, jaw = off(state_of(rec), moving(k))
+        assert degrees < 1.5
+        assert millimetres < 1.5  # 2 % of the distance; a pixel is 0.8 mm
+        assert jaw < 2.5
+        assert rec["trust"]["value"] > 0.8
+    tracked.require_trusted()
+
+
+def test_the_output_is_a_capture_that_says_its_trust(tracked: Tracked) -> None:
+    assert not errors_only(check_capture(tracked.output))
+    capture = read_capture(tracked.output)
+    assert len(capture.frames) == FRAMES
+    for frame, rec in zip(capture.frames, tracked.records, strict=True):
+        given = frame.state.instruments["grasper"]
+        assert given.trust == rec["trust"]["value"]
+        assert given.pose.tolist() == rec["instruments"]["grasper"]["pose"]
+    page = write_track_page(tracked).read_text()
+    assert page.count("<img") == 2 * FRAMES  # few frames: all in the strip, all among the least trusted
+    assert "jaw_angle, deg" in page
+
+
+def test_an_instrument_is_found_where_nothing_is_known(
+    tracked_run: RecordedRun, footage: Capture, tmp_path: Path
+) -> None:
+    bare = tuple(replace(frame, state=State({}, frame.state.time)) for frame in footage.frames[2:5])
+    found = track_footage(tracked_run, replace(footage, frames=bare), tmp_path / "found")
+    assert found.written == 3
+    for k, rec in enumerate(found.records, 2):
+        degrees, millimetres, jaw = off(state_of(rec), moving(k))
+        assert degrees < 1.5
+        assert millimetres < 1.5
+        assert jaw < 2.5
+
+
+def test_footage_without_the_instrument_is_trusted_nowhere(
+    tracked_run: RecordedRun, footage: Capture, tmp_path: Path
+) -> None:
+    wall = Tissue(tracked_run.scene).draw(CAMERA, None)
+    frames = []
+    for k, pixels in enumerate((wall, torch.zeros_like(wall), 1 - wall)):
+        path = tmp_path / f"{k}.png"
+        write_image(path, pixels)
+        frames.append(replace(footage.frames[k], image_path=path, state=State({}, k / 25)))
+    tracked = track_footage(tracked_run, replace(footage, frames=tuple(frames)), tmp_path / "out")
+    assert tracked.written == 0
+    assert max(rec["trust"]["value"] for rec in tracked.records) < 0.2
+    assert not (tmp_path / "out" / "transforms.json").exists()
+    with pytest.raises(NeecoError, match=r"no frame is trusted by 0\.5"):
+        tracked.require_trusted()
+
+
+def test_what_was_broken_off_goes_on_to_the_same_bytes(
+    tracked_run: RecordedRun, footage: Capture, tracked: Tracked, tmp_path: Path
+) -> None:
+    output = tmp_path / "capture"
+
+    def stop(done: int, total: int) -> None:
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track_footage(tracked_run, withheld(footage), output, start="first", on_progress=stop)
+    with pytest.raises(NeecoError, match="not empty"):
+        track_footage(tracked_run, withheld(footage), output, start="first")
+    with pytest.raises(NeecoError, match="min_trust: begun with"):
+        track_footage(tracked_run, withheld(footage), output, start="first", min_trust=0.4, resume=True)
+    track_footage(tracked_run, withheld(footage), output, start="first", resume=True)
+    whole, resumed = contents(tracked.output), contents(output)
+    whole.pop("track.html", None)
+    assert resumed == whole
+    track_footage(tracked_run, withheld(footage), output, start="first", resume=True)  # complete: nothing to do
+    assert contents(output) == whole
+
+
+def test_what_cannot_be_tracked_is_refused_in_words(tracked_run: RecordedRun, footage: Capture, tmp_path: Path) -> None:
+    bare = replace(footage, frames=tuple(replace(f, state=State({}, f.state.time)) for f in footage.frames))
+    with pytest.raises(NeecoError, match="first frame does not state instrument 'grasper'"):
+        track_footage(tracked_run, bare, tmp_path / "a", start="first")
+    with pytest.raises(NeecoError, match="--min-trust"):
+        track_footage(tracked_run, bare, tmp_path / "a", min_trust=1.5)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_trust_that_is_no_share_is_reported(tracked: Tracked, tmp_path: Path) -> None:
+    document = json.loads((tracked.output / "transforms.json").read_text())
+    document["frames"][0]["instruments"][0]["trust"] = 1.5
+    for name in ("images", "sparse.ply"):
+        (tmp_path / name).symlink_to(tracked.output / name)
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert any("trust" in problem.field for problem in errors_only(check_capture(tmp_path)))
+
+
+def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> None:
+    coordinates = Coordinates.of(tracked_run.scene)
+    motion = Motion.of(coordinates, tracked_run.scene.recorded.states)
+    begun = motion.begin(moving(0))
+    soon, late = motion.predict(begun, 1 / 25), motion.predict(begun, 6 / 25)
+    assert bool((late.covariance.diagonal()[:7] > soon.covariance.diagonal()[:7]).all())
+    assert off(late.state, moving(0)) == pytest.approx((0, 0, 0), abs=1e-4)  # its velocity is not known yet
+
+
+def test_the_recorded_pace_is_what_is_expected(tracked_run: RecordedRun) -> None:
+    motion = Motion.of(Coordinates.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    assert motion.interval == pytest.approx(1 / 25)
+    jaw = float(motion.velocities[6, 6].sqrt())  # opens by 0.04 rad a frame
+    assert jaw == pytest.approx(0.04 * 25, rel=0.2)
