@@ -178,12 +178,11 @@ class _Ingest:
 
     def _refuse_camera_frames(self) -> None:
         """Raise NeecoError for poses in the frame of a camera that moves."""
-        for item in self.recording.instruments:
-            if item.poses is not None and item.poses.frame == CAMERA:
+        for name, log in self.data.poses.items():
+            if log.frame == CAMERA:
                 raise NeecoError(
-                    f"{self.recording.path}: instruments: {item.name}: poses in the camera's frame need a scope that "
-                    "stands still, and this one moves; give poses in a frame that stays, and the scope's own "
-                    "(laparoscope)"
+                    f"{self.recording.path}: instruments: {name}: poses in the camera's frame need a scope that stands "
+                    "still, and this one moves; give poses in a frame that stays, and the scope's own (laparoscope)"
                 )
 
     def _run_still(self, output: Path) -> IngestResult:
@@ -201,15 +200,7 @@ class _Ingest:
         right = self._right_camera()
         cameras = still_cameras(len(self.names))
         self._find_instrument_clocks(cameras, pinhole)
-        for item in self.recording.instruments:
-            if item.poses is not None and item.poses.frame == CAMERA:
-                data.world_from_base[item.name] = np.eye(4)
-        unplaced = [name for name in data.poses if name not in data.world_from_base]
-        if unplaced:
-            data.note(
-                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}): "
-                "they stay in their own frame (unregistered)"
-            )
+        self._place_bases()
         tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in data.world_from_base}
         visible = self._field_of_view()
         found = look_behind(self._load, len(self.names), pinhole, visible, tracked, self.settings, right, self.progress)
@@ -218,6 +209,20 @@ class _Ingest:
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
         return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
+
+    def _place_bases(self) -> None:
+        """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as
+        that is known (`SynchronizedRecording.world_from_base`)."""
+        data = self.data
+        for name, log in data.poses.items():
+            if log.frame == CAMERA:
+                data.world_from_base[name] = np.eye(4)
+        unplaced = [name for name in data.poses if name not in data.world_from_base]
+        if unplaced:
+            data.note(
+                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}): "
+                "they stay in their own frame (unregistered)"
+            )
 
     def _right_camera(self) -> RightCamera | None:
         partner = self.recording.stereo
