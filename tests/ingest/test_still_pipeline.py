@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,8 @@ from neeco.capture import read_capture, write_capture
 from neeco.capture.check import inspect_capture
 from neeco.capture.images import write_image
 from neeco.errors import NeecoError
+from neeco.ingest import synchronized
+from neeco.ingest.logs import read_pose_log
 from neeco.ingest.pipeline import IngestResult, ingest
 from neeco.ingest.recordingfile import read_recording
 
@@ -131,6 +133,16 @@ def test_a_still_scope_is_noticed_and_the_instruments_clock_found_from_its_motio
     result = theatre.ingest(camera=None, sync=None)
     assert result.still
     assert any("stands still" in note for note in result.notes)
+
+
+def test_a_log_that_states_the_cameras_frame_itself_needs_no_word_in_the_recording(
+    theatre: Theatre, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(synchronized, "read_pose_log", lambda source: replace(read_pose_log(source), frame="camera"))
+    with pytest.raises(NeecoError, match="need a scope that stands still"):
+        theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}], camera="moving")
+    result = theatre.ingest(instruments=[{"name": "bar", "poses": "bar.csv"}])
+    assert read_capture(result.capture).registered
 
 
 def test_poses_in_an_unknown_frame_stay_unregistered_and_the_notes_say_so(theatre: Theatre) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from grasper_world import CAMERA, FRAMES, RecordedRun, grasper_state, moving, re
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, State
+from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.report.track_page import write_track_page
 from neeco.tracking.coordinates import DEG, Coordinates
@@ -159,6 +161,19 @@ def test_what_cannot_be_tracked_is_refused_in_words(tracked_run: RecordedRun, fo
     with pytest.raises(NeecoError, match="--min-trust"):
         track_footage(tracked_run, bare, tmp_path / "a", min_trust=1.5)
     assert not (tmp_path / "a").exists()
+
+
+def test_a_run_without_instruments_is_refused_in_words(tracked_run: RecordedRun) -> None:
+    bare = copy(tracked_run.scene)
+    bare.instruments = ()
+    with pytest.raises(NeecoError, match="the run has no instrument"):
+        Coordinates.of(bare)
+
+
+def test_a_wrong_run_is_told_in_one_line(footage: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["track", str(tmp_path / "nothing"), str(footage.root), "--output", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_trust_that_is_no_share_is_reported(tracked: Tracked, tmp_path: Path) -> None:

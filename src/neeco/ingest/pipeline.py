@@ -184,12 +184,11 @@ class _Ingest:
 
     def _refuse_camera_frames(self) -> None:
         """Raise NeecoError for poses in the frame of a camera that moves."""
-        for item in self.recording.instruments:
-            if item.poses is not None and item.poses.frame == CAMERA:
+        for name, log in self.data.poses.items():
+            if log.frame == CAMERA:
                 raise NeecoError(
-                    f"{self.recording.path}: instruments: {item.name}: poses in the camera's frame need a scope that "
-                    "stands still, and this one moves; give poses in a frame that stays, and the scope's own "
-                    "(laparoscope)"
+                    f"{self.recording.path}: instruments: {name}: poses in the camera's frame need a scope that stands "
+                    "still, and this one moves; give poses in a frame that stays, and the scope's own (laparoscope)"
                 )
 
     def _run_still(self, output: Path) -> IngestResult:
@@ -207,16 +206,7 @@ class _Ingest:
         right = self._right_camera()
         cameras = still_cameras(len(self.names))
         self._find_instrument_clocks(cameras, pinhole)
-        for item in self.recording.instruments:
-            if item.poses is not None and item.poses.frame == CAMERA:
-                data.world_from_base[item.name] = np.eye(4)
         self._place_bases(cameras, pinhole)
-        unplaced = [name for name in data.poses if name not in data.world_from_base]
-        if unplaced:
-            data.note(
-                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
-                "or camera_from_base): they stay in their own frame (unregistered)"
-            )
         tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in data.world_from_base}
         visible = self._field_of_view()
         found = look_behind(self._load, len(self.names), pinhole, visible, tracked, self.settings, right, self.progress)
@@ -227,22 +217,32 @@ class _Ingest:
         return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
 
     def _place_bases(self, cameras: SfmResult, pinhole: Lens) -> None:
-        """The bases that the recording states to its still scope, found from what moves where that is not exact."""
+        """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as
+        that is known (`SynchronizedRecording.world_from_base`): it is the camera's, is stated, or is found from what
+        moves."""
         data, visible = self.data, self._field_of_view()
-        if not any(item.base is not None for item in self.recording.instruments):
-            return
-        self.progress("finding the robot's base", 0, 0)
-        placed = place_bases(
-            data, self._times(cameras), cameras.world_from_camera, pinhole,
-            lambda rows: moving_masks(self._load, len(self.names), rows, visible),
-            None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255,
-        )  # fmt: skip
-        for name, base in placed.items():
-            data.world_from_base[name] = base.world_from_base
-            if base.clock is not None:
-                data.clocks[data.poses[name].clock] = base.clock
-            if base.found is not None:
-                self.bases[name] = base.found
+        for name, log in data.poses.items():
+            if log.frame == CAMERA:
+                data.world_from_base[name] = np.eye(4)
+        if any(item.base is not None for item in self.recording.instruments):
+            self.progress("finding the robot's base", 0, 0)
+            placed = place_bases(
+                data, self._times(cameras), cameras.world_from_camera, pinhole,
+                lambda rows: moving_masks(self._load, len(self.names), rows, visible),
+                None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255,
+            )  # fmt: skip
+            for name, base in placed.items():
+                data.world_from_base[name] = base.world_from_base
+                if base.clock is not None:
+                    data.clocks[data.poses[name].clock] = base.clock
+                if base.found is not None:
+                    self.bases[name] = base.found
+        unplaced = [name for name in data.poses if name not in data.world_from_base]
+        if unplaced:
+            data.note(
+                f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
+                "or camera_from_base): they stay in their own frame (unregistered)"
+            )
 
     def _right_camera(self) -> RightCamera | None:
         partner = self.recording.stereo
