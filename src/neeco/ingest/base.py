@@ -56,6 +56,7 @@ FARTHEST = 8  # times each
 SPAN, SAMPLES = 0.15, 9  # of the logarithm of the size, over which the loss is sampled at last
 AS_MUCH = 0.95  # of the overlap before must stay: less of an instrument fits more easily
 LEAST_OVERLAP = 0.25  # of the instrument's outline with what moves, to believe a base
+SIZE_BIAS = 0.03  # by which the size is off however many frames there are: jaws blur where the tip is
 USUAL_RADII = (1.5, 5.5)  # mm: a shaft outside is first taken to be of the usual size
 USUAL_RADIUS = 3.5  # mm of a shaft, to guess how far away one is
 LEVER = 40.0  # mm from the instrument's middle at which a turn counts as a shift
@@ -278,7 +279,8 @@ def _size_sd(problem: Problem, fit: Fit, sure: Sureness, curvature: float) -> fl
     width = problem.seen.distances.shape[2] / 160  # of the narrowest loss, px
     count = problem.seen.distances.shape[0] * 2 * len(fit.stations) * (1 - FRONT)
     variance = (fit.residual_px / 0.67 / width) ** 2 * _alike(sure)
-    return float(np.sqrt(variance / max(curvature * count, 1e-9)))
+    still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
+    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), SIZE_BIAS if still else 0.0))
 
 
 def _alike(sure: Sureness) -> float:
