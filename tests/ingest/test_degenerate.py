@@ -14,8 +14,9 @@ import yaml
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
-from neeco.ingest.pipeline import IngestResult, ingest
+from neeco.ingest.pipeline import ingest
 from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.result import IngestResult
 
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")

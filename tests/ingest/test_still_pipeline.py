@@ -18,8 +18,9 @@ from neeco.capture.images import write_image
 from neeco.errors import NeecoError
 from neeco.ingest import synchronized
 from neeco.ingest.logs import read_pose_log
-from neeco.ingest.pipeline import IngestResult, ingest
+from neeco.ingest.pipeline import ingest
 from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.result import IngestResult
 
 WIDTH, HEIGHT, FOCAL, FRAMES, RATE = 160, 128, 150.0, 40, 25.0
 BAR, TISSUE, BASELINE = 60.0, 100.0, 8.0  # mm: depths of a bar and of the tissue behind it, between two cameras

@@ -18,8 +18,8 @@ from PIL import Image
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.motion import RoughShape
-from neeco.ingest.pipeline import IngestResult
 from neeco.ingest.registration import ClockOffset, Registration
+from neeco.ingest.result import IngestResult
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_assessment import assess_ingest
 from neeco.report.ingest_figures import in_view, main_axes, read_tracks, round_length

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from neeco.ingest.pipeline import IngestResult
     from neeco.ingest.recording import Recording
+    from neeco.ingest.result import IngestResult
 
 PAGE = "ingest.html"
 RECORDING = "recording.yaml"

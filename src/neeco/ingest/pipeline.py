@@ -5,9 +5,8 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,82 +24,12 @@ from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames,
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
-from neeco.ingest.registration import ClockOffset, Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.still import moving_masks, reduced, stands_still
 from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
 from neeco.ingest.synchronized import States, SynchronizedRecording
-
-
-@dataclass(frozen=True)
-class IngestResult:
-    """Everything about one ingest. The capture itself (images, cameras, states, points) is read from `capture`."""
-
-    capture: Path
-    recording: str  # where it came from, in words
-    video_frames: int
-    video_fps: float
-    size: tuple[int, int]  # width, height px
-    selected: np.ndarray  # [K] indices of the video frames in the capture
-    selected_times: np.ndarray  # [K] s, video clock
-    dropped: tuple[tuple[int, str], ...]  # video frame, why
-    clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
-    registration: Registration | None  # None: instrument poses stay in their tracker's frame
-    registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
-    reprojection_px: float | None  # None: cameras were not found by SfM
-    points: int
-    shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
-    tissue: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
-    split_rule: str = ""
-    notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
-    search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
-    # camera_from_instrument [K, 4, 4] mm of each instrument before registration: the laparoscope's sensor taken for its
-    # camera. NaN where a log has a gap; empty where there was no registration
-    unregistered: dict[str, np.ndarray] = field(default_factory=dict)
-    # video frame -> [h, w] how often pixels were seen to move
-    moving: dict[int, np.ndarray] = field(default_factory=dict)
-    registered: bool = True  # instrument poses are in the cameras' world
-    bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
-
-    @property
-    def still(self) -> bool:
-        """Whether the scope stood still, so that cameras were not looked for."""
-        return self.tissue is not None
-
-    def as_json(self) -> dict[str, Any]:
-        """Numbers for scripts (`--json`): mm, degrees, px, s."""
-        clocks = {
-            name: {
-                "offset_s": clock.seconds,
-                "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # nobody knows
-                "source": clock.source,
-            }
-            for name, clock in self.clocks.items()
-        }
-        registration = self.registration and {
-            "scale_mm_per_unit": self.registration.scale,
-            "scale_sd": self.registration.scale_sd,
-            "position_rms_mm": float(np.sqrt(np.mean(self.registration.position_residual**2))),
-            "rotation_rms_deg": float(np.degrees(np.sqrt(np.mean(self.registration.rotation_residual**2)))),
-            "camera_from_sensor": self.registration.camera_from_sensor.tolist(),
-        }
-        return {
-            "capture": str(self.capture),
-            "video_frames": self.video_frames,
-            "kept": len(self.selected),
-            "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
-            "clocks": clocks,
-            "registration": registration,
-            "reprojection_px": self.reprojection_px,
-            "points": self.points,
-            "still": self.still,
-            "registered": self.registered,
-            "bases": {name: base.as_json() for name, base in self.bases.items()},
-            "tissue_depth": self.tissue,
-            "split_rule": self.split_rule,
-            "notes": list(self.notes),
-            "search": list(self.search),
-        }
 
 
 def ingest(

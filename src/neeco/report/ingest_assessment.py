@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from neeco.capture.model import Capture
-from neeco.ingest.pipeline import IngestResult
+from neeco.ingest.result import IngestResult
 
 # Limits above which the page begins to doubt: conventions, not measurements.
 POSITION_MM, ROTATION_DEG, REPROJECTION_PX, SCALE, CLOCK_MM = 1.0, 0.5, 1.0, 0.015, 0.5

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Capture, Frame
-from neeco.ingest.pipeline import IngestResult
+from neeco.ingest.result import IngestResult
 from neeco.report import ingest_figures as figures
 from neeco.report.charts import residual_chart
 from neeco.report.coverage import SPLIT_COLORS, degrees_of_freedom, extrapolations, histogram, unvisited

@@ -11,7 +11,7 @@ from PIL import Image
 from neeco.capture.model import Capture, Frame
 from neeco.errors import NeecoError
 from neeco.files import write_atomically
-from neeco.ingest.pipeline import IngestResult
+from neeco.ingest.result import IngestResult
 from neeco.report.ingest_figures import AXIS_COLORS, axis_length
 
 MISSING = "--rrd: needs the package rerun-sdk; install neeco[rerun]"

@@ -1,0 +1,84 @@
+"""What an ingest found, for the page and for scripts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.ingest.base import BaseRegistration
+from neeco.ingest.motion import RoughShape
+from neeco.ingest.registration import ClockOffset, Registration
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """Everything about one ingest. The capture itself (images, cameras, states, points) is read from `capture`."""
+
+    capture: Path
+    recording: str  # where it came from, in words
+    video_frames: int
+    video_fps: float
+    size: tuple[int, int]  # width, height px
+    selected: np.ndarray  # [K] indices of the video frames in the capture
+    selected_times: np.ndarray  # [K] s, video clock
+    dropped: tuple[tuple[int, str], ...]  # video frame, why
+    clocks: dict[str, ClockOffset]  # by the clock's name: "em", or a joint's
+    registration: Registration | None  # None: instrument poses stay in their tracker's frame
+    registered_frames: np.ndarray  # [R] row of `selected` of each entry of `registration.used`; -1: not in the capture
+    reprojection_px: float | None  # None: cameras were not found by SfM
+    points: int
+    shapes: dict[str, RoughShape] = field(default_factory=dict)  # rough shape of each instrument, its own frame
+    tissue: str | None = None  # how a still scope's tissue got its depth, after "the tissue's depth is"
+    split_rule: str = ""
+    notes: tuple[str, ...] = ()  # what was lost, dropped or doubtful, one sentence each
+    search: tuple[str, ...] = ()  # what was tried to find cameras and what was taken, one sentence each
+    # camera_from_instrument [K, 4, 4] mm of each instrument before registration: the laparoscope's sensor taken for its
+    # camera. NaN where a log has a gap; empty where there was no registration
+    unregistered: dict[str, np.ndarray] = field(default_factory=dict)
+    # video frame -> [h, w] how often pixels were seen to move
+    moving: dict[int, np.ndarray] = field(default_factory=dict)
+    registered: bool = True  # instrument poses are in the cameras' world
+    bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
+
+    @property
+    def still(self) -> bool:
+        """Whether the scope stood still, so that cameras were not looked for."""
+        return self.tissue is not None
+
+    def as_json(self) -> dict[str, Any]:
+        """Numbers for scripts (`--json`): mm, degrees, px, s."""
+        clocks = {
+            name: {
+                "offset_s": clock.seconds,
+                "sd_s": clock.sd if np.isfinite(clock.sd) else None,  # nobody knows
+                "source": clock.source,
+            }
+            for name, clock in self.clocks.items()
+        }
+        registration = self.registration and {
+            "scale_mm_per_unit": self.registration.scale,
+            "scale_sd": self.registration.scale_sd,
+            "position_rms_mm": float(np.sqrt(np.mean(self.registration.position_residual**2))),
+            "rotation_rms_deg": float(np.degrees(np.sqrt(np.mean(self.registration.rotation_residual**2)))),
+            "camera_from_sensor": self.registration.camera_from_sensor.tolist(),
+        }
+        return {
+            "capture": str(self.capture),
+            "video_frames": self.video_frames,
+            "kept": len(self.selected),
+            "dropped": [{"frame": frame, "why": why} for frame, why in self.dropped],
+            "clocks": clocks,
+            "registration": registration,
+            "reprojection_px": self.reprojection_px,
+            "points": self.points,
+            "still": self.still,
+            "registered": self.registered,
+            "bases": {name: base.as_json() for name, base in self.bases.items()},
+            "tissue_depth": self.tissue,
+            "split_rule": self.split_rule,
+            "notes": list(self.notes),
+            "search": list(self.search),
+        }
