@@ -21,8 +21,10 @@ from neeco.report.track_page import write_track_page
 from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue, view_of
 from neeco.tracking.fitting import Fitter, wide
+from neeco.tracking.follow import LOOK_EVERY, Step
 from neeco.tracking.motion import Motion
-from neeco.tracking.track import Tracked, state_of, track_footage
+from neeco.tracking.track import Tracked, _Work, state_of, track_footage
+from neeco.tracking.trust import TrackTrust
 
 
 def fitter_of(run: RecordedRun) -> Fitter:
@@ -53,6 +55,36 @@ def test_an_increment_leads_from_one_state_to_another(tracked_run: RecordedRun) 
     one, other = grasper_state(jaw=0.4), grasper_state(3, -2, 75, 0.3, -0.5, 0.7)
     reached = coordinates.moved(one, coordinates.between(one, other))
     assert off(reached, other) == pytest.approx((0, 0, 0), abs=1e-4)
+
+
+def test_a_stretch_of_little_trust_is_gone_through_backwards_looking_for_other_rolls_in_every_frame(
+    tmp_path: Path, tracked_run: RecordedRun
+) -> None:
+    motion = Motion.of(Coordinates.of(tracked_run.scene), tracked_run.scene.recorded.states)
+    moving = motion.begin(grasper_state())
+    asked = []
+
+    class Follower:
+        frames = range(6)
+
+        def __init__(self) -> None:
+            self.motion = motion
+
+        def begin(self, frame: int, given: State) -> Step:
+            return step(frame, 1.0)
+
+        def follow(self, before: Step, frame: int) -> Step:
+            back = frame < before.frame
+            asked.extend([before.unlooked] if back else [])
+            return step(frame, 0.9 if back else (0.5 if 1 < frame < 5 else 1.0))
+
+    def step(frame: int, single: float) -> Step:
+        trust = TrackTrust(1.0, 1.0, 1.0, single)
+        return Step(frame, "followed", moving, 0.01, 1.0, trust, (0.01,), 0.0, 0.0, unlooked=1)
+
+    steps = _Work(tmp_path, Follower(), lambda done, total: None).all_steps(grasper_state())
+    assert asked == [LOOK_EVERY] * 3
+    assert [one.trust.value for one in steps] == [1.0, 1.0, 0.9, 0.9, 0.9, 1.0]
 
 
 def test_a_joint_is_not_moved_beyond_its_bounds(tracked_run: RecordedRun) -> None:

@@ -27,7 +27,7 @@ from neeco.scene.scene import gaussian_scene
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.fitting import Fitter
-from neeco.tracking.follow import Follower, Step
+from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.motion import Motion
 from neeco.tracking.search import Search
 from neeco.tracking.trust import Judge, Reference
@@ -164,7 +164,8 @@ class _Work:
         return max(found, key=lambda step: step.trust.value)
 
     def _again(self, steps: dict[int, Step]) -> None:
-        """Go backwards through every stretch of little trust that a trusted frame follows."""
+        """Go backwards through every stretch of little trust that a trusted frame follows; other rolls are looked for
+        in every frame of it, so that what comes from beyond is doubted as what came before was."""
         before: Step | None = None
         for frame in range(len(steps) - 1, -1, -1):
             if steps[frame].trust.value >= TOGETHER:
@@ -175,7 +176,7 @@ class _Work:
             if before is steps.get(frame + 1):  # its motion was learned the other way
                 turned = self.follower.motion.begin(before.moving.state)
                 before = replace(before, moving=turned)
-            before = self._follow("again", before, frame)
+            before = self._follow("again", replace(before, unlooked=LOOK_EVERY), frame)
             if before.trust.value > steps[frame].trust.value:
                 steps[frame] = before
 
