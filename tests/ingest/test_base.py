@@ -44,6 +44,7 @@ def test_what_pure_insertion_leaves_open_is_said_and_stays_as_given():
     assert np.nanmax(found.sd_mm) > 2
 
 
+@pytest.mark.slow
 def test_masks_in_which_nothing_moves_with_the_pose_end_in_one_line():
     world = make_world(FRAMES)
     other = np.random.default_rng(0).permutation(len(world.masks))

@@ -156,8 +156,8 @@ def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
 ) -> None:
     real = check.inspect_capture
 
-    def check_then_break(*args: object):
-        problems = real(*args)
+    def check_then_break(*args: object, **options: object):
+        problems = real(*args, **options)
         (capture / "images/000003.png").write_bytes(b"a disk gone bad")
         return problems
 

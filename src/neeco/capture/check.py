@@ -70,19 +70,15 @@ def check_capture(path: Path | str, transforms: str = "transforms.json") -> list
 
 def read_checked(path: Path | str, transforms: str = "transforms.json") -> Capture:
     """A capture that can be trained on. Raises NeecoError with the first error that `check_capture` finds."""
-    checked = _inspect(path, transforms)
+    checked = inspect_capture(path, transforms, motion=False)
     ProblemReport(checked.problems).raise_first(path)
     assert checked.capture is not None  # else there would be an error
     return checked.capture
 
 
-def inspect_capture(path: Path | str, transforms: str = "transforms.json") -> Checked:
-    """What is wrong with a capture, what it holds, and the capture itself."""
-    return _inspect(path, transforms, motion=True)
-
-
-def _inspect(path: Path | str, transforms: str, motion: bool = False) -> Checked:
-    """`inspect_capture`; without the seconds that `motion` takes and that finds warnings alone."""
+def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, motion: bool = True) -> Checked:
+    """What is wrong with a capture, what it holds, and the capture itself. motion: whether states are compared with
+    the images, which takes seconds and finds warnings alone."""
     report = ProblemReport()
     parsed = parse_capture(path, report, transforms)
     if not parsed.frames and not errors_only(report.problems):
