@@ -35,6 +35,7 @@ BLOCKS = 12  # of frames that follow each other, whose answers count as independ
 # changes much at once; transposed rotations only as much as the instrument turns.
 CLEARLY_TURNED, CLEARLY_SHIFTED = 1.1, 1.15
 SURELY_TURNED, SURELY_SHIFTED = 3.0, 5.0  # standard errors over the blocks; of many shifts one may fit by chance
+TURNING = 25.0  # deg, root mean square: who turns less is explained by transposed rotations nearly as well, or better
 EVIDENT = 0.1  # more evidence than elsewhere at its place, without which no poses explain anything
 BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
 
@@ -289,9 +290,10 @@ def _likeliest_mistake(
     message = f"rotations of {name} are transposed: so turned back they fit what moves in the images better"
     remedy = "transpose them: their columns are the instrument's axes in the world"
     everywhere = np.ones(len(rows), dtype=bool)
-    tried = [
-        _Alternative(message, remedy, (CLEARLY_TURNED, SURELY_TURNED), *rays.compare(given, turned[rows], everywhere))
-    ]
+    tried = []
+    if _turning(poses[rows]) > TURNING:
+        compared = rays.compare(given, turned[rows], everywhere)
+        tried.append(_Alternative(message, remedy, (CLEARLY_TURNED, SURELY_TURNED), *compared))
     for shift in range(-timeline.longest_shift, timeline.longest_shift + 1):
         if shift == 0:
             continue
@@ -316,3 +318,9 @@ def _of_root(instrument: Instrument, poses: np.ndarray, states: list[InstrumentS
     if tree is None or tree.pose_of is None:
         return poses
     return np.stack([tree.world_from_root(pose, state.joints) for pose, state in zip(poses, states, strict=True)])
+
+
+def _turning(poses: np.ndarray) -> float:
+    """Root mean square deg by which poses [F, 4, 4] are turned from their mean; the same for transposed rotations."""
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    return float(np.degrees(np.sqrt(((turns.mean().inv() * turns).magnitude() ** 2).mean())))
