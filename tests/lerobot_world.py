@@ -3,17 +3,14 @@ imports this is skipped where pyarrow or av is absent."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from rendered_truth import BENCHMARKS
+from rendered_truth import rendered_module
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
@@ -50,7 +47,7 @@ def write_data_set(
     **options: Any,
 ) -> Path:
     """A data set with these states of every episode; shown: how many images an episode has, where not as many."""
-    writer = _loaded()
+    writer = rendered_module("lerobotwriter")
 
     def images(episode: int, count: int) -> Any:
         return lambda: (picture(episode, number) for number in range(count))
@@ -60,15 +57,3 @@ def write_data_set(
         count = (shown or {}).get(number, len(next(iter(held.values()))))
         episodes.append(writer.Episode(held, {key: images(number, count) for key in cameras}))
     return Path(writer.LeRobotWriter(folder, version, episodes, Fraction(FPS), SIZE, **options).write())
-
-
-def _loaded() -> ModuleType:
-    if "neeco_lerobotwriter" not in sys.modules:
-        path = BENCHMARKS / "rendered" / "lerobotwriter.py"
-        spec = importlib.util.spec_from_file_location("neeco_lerobotwriter", path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = module
-        spec.loader.exec_module(module)
-    return sys.modules["neeco_lerobotwriter"]
