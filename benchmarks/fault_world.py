@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from forked import TESTS, Child, hasten_ingest, module_at
+from forked import TESTS, Child, hasten_ingest, import_modules, module_at
 
 STEPS = 40
 FORMATS = ("coco", "yolo", "webdataset", "bop", "imagefolder")
@@ -52,6 +52,7 @@ def prepare() -> None:
     """Import what the verbs need, and make their intervals fit short recordings."""
     import torch
 
+    import_modules()
     torch.set_num_threads(1)
     hasten_ingest()
     still_the_clocks()
@@ -72,7 +73,9 @@ def make_verbs(work: Path, names: Sequence[str]) -> list[Verb]:
     recording = work / "recording"
     recording.mkdir()
     world = sys.modules["ingest_world"]
-    world.Recorded(world.World(recording)).write()
+    recorded = world.Recorded(world.World(recording))
+    recorded.frames = 14
+    recorded.write()
     image = capture / "images" / "000003.png"
 
     def verb(name: str, *words: str, **more: object) -> Verb:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import gc
 import json
 import os
 import random
@@ -368,6 +369,7 @@ def main() -> int:
     args = parser.parse_args()
     tally, began = Tally(), time.monotonic()
     prepare()
+    gc.freeze()  # what is there is never collected in a child, so its pages stay shared
     with tempfile.TemporaryDirectory() as temporary:
         work = args.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)

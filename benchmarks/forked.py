@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import resource
@@ -121,6 +122,44 @@ def module_at(path: Path, name: str = "") -> ModuleType:
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def import_modules() -> None:
+    """Import what the verbs use, most of which they import only when they run, once for all children."""
+    for verb in (
+        "check",
+        "train",
+        "evaluate",
+        "render",
+        "synthesize",
+        "annotate",
+        "view",
+        "export",
+        "score_masks",
+        "compare",
+    ):
+        importlib.import_module(f"neeco.cli.{verb}")
+    for module in (
+        "rich.progress",
+        "neeco.experiments.comparison",
+        "neeco.experiments.downstream.experiment",
+        "neeco.ingest.pipeline",
+        "neeco.ingest.convert",
+        "neeco.report.run_page",
+        "neeco.report.study_pages",
+        "neeco.report.downstream_page",
+        "neeco.report.ingest_page",
+        "neeco.synthesis.annotated",
+        "neeco.synthesis.dataset",
+        "neeco.synthesis.rendered_views",
+        "neeco.viewer.export",
+        "neeco.viewer.splats",
+        "neeco.evaluation.mask_scores",
+        "neeco.report",
+        "matplotlib.pyplot",
+        "av",
+    ):
+        importlib.import_module(module)
 
 
 def hasten_ingest() -> None:

@@ -7,57 +7,26 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from forked import TESTS, Child, hasten_ingest, module_at
+from forked import TESTS, Child, hasten_ingest, import_modules, module_at
 from PIL import Image
 
 DRAW = ["--no-tissue-check", "--min-share", "0", "--max-unseen", "1"]
 
 
-def prepare() -> None:
+def prepare(verbs: Sequence[str]) -> None:
     """Import what the verbs need; SfM answers from known cameras."""
     import torch
 
-    for verb in (
-        "check",
-        "train",
-        "evaluate",
-        "render",
-        "synthesize",
-        "annotate",
-        "view",
-        "export",
-        "score_masks",
-        "compare",
-    ):
-        importlib.import_module(f"neeco.cli.{verb}")
-    for module in (
-        "monai.networks.nets",
-        "rich.progress",
-        "neeco.experiments.comparison",
-        "neeco.experiments.downstream.experiment",
-        "neeco.ingest.pipeline",
-        "neeco.ingest.convert",
-        "neeco.report.run_page",
-        "neeco.report.study_pages",
-        "neeco.report.downstream_page",
-        "neeco.report.ingest_page",
-        "neeco.synthesis.annotated",
-        "neeco.synthesis.dataset",
-        "neeco.synthesis.rendered_views",
-        "neeco.viewer.export",
-        "neeco.viewer.splats",
-        "neeco.evaluation.mask_scores",
-        "neeco.experiments.downstream.models.unet",
-        "neeco.report",
-        "matplotlib.pyplot",
-        "av",
-    ):
-        importlib.import_module(module)
+    import_modules()
+    if "downstream" in verbs:
+        for module in ("monai.networks.nets", "neeco.experiments.downstream.models.unet"):
+            importlib.import_module(module)
     from neeco.experiments import machine
 
     torch.set_num_threads(1)
@@ -108,8 +77,10 @@ def make_world(desk: Path, wanted: set[str]) -> None:
     }
     for name in sorted(longer.keys() & wanted):
         run([*longer[name], "--output", name], desk)
-    make_recording(desk / "recording")
-    make_bags(desk / "bags", desk / "recording")
+    if {"recording", "bags"} & wanted:
+        make_recording(desk / "recording")
+    if "bags" in wanted:
+        make_bags(desk / "bags", desk / "recording")
     make_endonerf(desk / "endonerf")
     make_colmap(desk / "colmap", document)
 

@@ -380,7 +380,7 @@ def main() -> int:
     parser.add_argument("--work", type=Path, help="an absent folder to work in; kept (default: a temporary one)")
     args = parser.parse_args()
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    prepare()
+    prepare(args.verbs)
     gc.freeze()  # what is there is never collected in a child, so its pages stay shared
     began, counts, refusals, wrong = time.monotonic(), Counter[str](), Counter[str](), Counter[str]()
     spent = Counter[str]()
