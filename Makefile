@@ -11,7 +11,7 @@ demo: .venv/installed
 	$(BIN)/neeco demo --output demo
 
 test: .venv/installed
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 # as other processors and Pythons run the suite; an hour
 test-cpus: .venv/installed
