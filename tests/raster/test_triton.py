@@ -102,8 +102,8 @@ def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[s
 @pytest.mark.parametrize(
     ("capability", "scene", "deterministic"),
     [
-        (80, {"sh_count": 9, "channels": 5}, True),
-        (90, {"sh_count": 4, "channels": 3, "frames": False}, False),
+        (80, {"sh_count": 4, "channels": 5}, True),
+        (90, {"sh_count": 9, "channels": 1, "frames": False}, False),
         (90, {"sh_count": 1, "channels": 0, "frames": False, "light": False, "width": 1, "height": 1}, False),
         pytest.param(90, {"sh_count": 16, "channels": 32}, True, marks=pytest.mark.slow),
         pytest.param(75, {"sh_count": 16, "channels": 1}, False, marks=pytest.mark.slow),

@@ -162,7 +162,9 @@ def test_a_frame_that_becomes_unreadable_after_the_check_is_named(
         return problems
 
     monkeypatch.setattr(check, "inspect_capture", check_then_break)
-    assert main(["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs"]) == 1
+    assert (
+        main(["train", str(capture), "--output", str(tmp_path / "run"), "--method", "3dgs", "--iterations", "60"]) == 1
+    )
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1
     assert "000003.png" in told[0]
