@@ -41,7 +41,7 @@ def test_poses_of_every_kind(seed: int) -> None:
     assert_same_as_definition(make_world((6, 0, 5), (hinges(1), hinges(2), hinges(0)), seed=seed, roll=-1.0), 5e-5)
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(tree=trees())
 def test_any_tree(tree: Tree) -> None:
     assert_same_as_definition(make_world((7, 6), (None, tree), seed=1, roll=0.4), 5e-5)
