@@ -6,7 +6,7 @@ from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco_mask
 
 from neeco.labels.annotation import bounding_box, minimum_rectangle, outer_polygons, signed_area
-from neeco.labels.drawing import without_small_components
+from neeco.labels.drawing import without_part_islands, without_small_components
 from neeco.synthesis.writers.yolo import joined_polygon
 
 masks = hnp.arrays(bool, st.tuples(st.integers(1, 14), st.integers(1, 14))).filter(lambda mask: mask.any())
@@ -101,6 +101,20 @@ def test_small_components_go_and_large_ones_stay():
     with_component[1, 1] = True
     assert (without_small_components(with_component, 0.01) == mask).all()
     assert without_small_components(with_component, 0.0)[1, 1]
+
+
+def test_specks_of_a_part_take_the_part_around_them_and_nothing_else_changes():
+    parts = np.zeros((40, 60), np.uint8)
+    parts[10:30, 5:35], parts[10:30, 35:50] = 1, 2  # two parts beside each other
+    speckled = parts.copy()
+    speckled[15:18, 12:14] = 2  # an island of the second in the first
+    speckled[22, 40] = 1  # and the other way round
+    speckled[10, 20] = 3  # the only pixels of a third part stay
+    speckled[2, 2] = 2  # as does what touches no other part
+    expected = parts.copy()
+    expected[10, 20], expected[2, 2] = 3, 2
+    assert (without_part_islands(speckled, [1, 2, 3], 0.02) == expected).all()
+    assert (without_part_islands(speckled, [1, 2, 3], 0.0) == speckled).all()
 
 
 def test_polygons_run_along_pixel_edges_and_pixels_that_touch_at_a_corner_are_two_pieces():
