@@ -1,0 +1,160 @@
+"""Kinematic trees of instruments whose joints are named and logged, but whose axes nobody stated, from images alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
+from neeco.capture.model import Instrument
+from neeco.training.instruments.chain_search import ChainFound, Finding, find_chain
+from neeco.training.instruments.chain_volume import ChainEvidence
+from neeco.training.instruments.color_evidence import clear_by_color
+from neeco.training.instruments.discovery import tissue_evidence
+from neeco.training.instruments.evidence import (
+    POSSIBLE,
+    CarvedShape,
+    Evidence,
+    camera_from_instrument,
+    carve,
+    carve_along,
+    frame_along,
+)
+from neeco.training.instruments.trocar import trocar_line
+from neeco.training.session import GaussianSession
+
+ROOT = "shaft"
+UNITS = ("_rad", "_deg", "_mm", "_angle")  # endings of readings that links' names do without
+MAX_OFF = 0.1  # of the distance to the tissue: the trocar's line may pass the carved shape at most so far
+WELL_SEEN = 0.4  # of the shaft's length, before which no joint is looked for: it is seen too rarely
+
+
+def find_trees(session: GaussianSession) -> tuple[Instrument, ...] | None:
+    """The instruments of the session's scene, those of which several readings move and no kinematics are stated with
+    the trees that were found, or of one joint with that reading alone; None where there are none such.
+
+    An instrument of which nothing was found stays as it is.
+    """
+    instruments = session.scene.instruments
+    if not any(_is_unknown(instrument) for instrument in instruments):
+        return None
+    names = ", ".join(instrument.name for instrument in instruments if _is_unknown(instrument))
+    session.report(f"{names}: several joints and no kinematics: looking for the joints' axes in the images")
+    evidence = tissue_evidence(session.scene, session.views, session.config)
+    evidence = clear_by_color(evidence, session.views)
+    return tuple(_with_tree(session, evidence, item) if _is_unknown(item) else item for item in instruments)
+
+
+def _is_unknown(instrument: Instrument) -> bool:
+    return instrument.kinematics is None and len(instrument.joints) > 1
+
+
+def _with_tree(session: GaussianSession, evidence: Evidence, instrument: Instrument) -> Instrument:
+    name, report = instrument.name, session.report
+    shape = _shaft(session, evidence, name)
+    if shape is None:
+        report(f"warning: {name}: no shaft was found in the images; its joints are learned as hinges across one")
+        return instrument
+    base = shape.instrument_from_shaft
+    recorded = [frame.state.instruments[name].joints for frame in evidence.frames]
+    given = {joint: torch.tensor([joints[joint] for joints in recorded]).float() for joint in instrument.joints}
+    middles = {joint: float(readings.double().mean()) for joint, readings in given.items()}
+    known = ChainEvidence(
+        evidence,
+        camera_from_instrument(evidence, name) @ base,
+        {joint: (readings - middles[joint]).to(evidence.device) for joint, readings in given.items()},
+        shape.radius,
+        session.config.seed,
+    )
+    slides = [joint for joint in instrument.joints if instrument.slides(joint)]
+    found = find_chain(known, slides, shape.near + WELL_SEEN * (shape.tip - shape.near), shape.tip)
+    for line in _lines(name, found, base):
+        report(line)
+    if not found.findings:
+        report(f"warning: {name}: no joint was found; its joints are learned as hinges across the shaft")
+        return instrument
+    left_out = {joint: limits for joint, limits in instrument.joints.items() if joint not in found.left_out}
+    if len(left_out) == 1 and not found.chain[0].slides:
+        return replace(instrument, joints=left_out)  # a hinge, which has a search of its own
+    return replace(instrument, joints=left_out, kinematics=tree_of(found, base, middles))
+
+
+def _shaft(session: GaussianSession, evidence: Evidence, name: str) -> CarvedShape | None:
+    """The shaft along the line through a trocar, where the poses show one that runs through what is carved; else as
+    carved. None where nothing is."""
+    search = session.config.search
+    generator = torch.Generator().manual_seed(session.config.seed)
+    shape = carve(evidence, name, generator, search)
+    if shape is None:
+        return None
+    poses = [frame.state.instruments[name].pose.double().cpu() for frame in session.views.frames]
+    line = trocar_line(torch.stack(poses).numpy())
+    base = shape.instrument_from_shaft
+    if line is not None and line.clear:
+        center = base[:3, 3]
+        point, along = (torch.from_numpy(part).to(center) for part in (line.point, line.direction))
+        arm = center - point
+        along = along * torch.sign(arm @ along)
+        on_line = point + (arm @ along) * along
+        if float((center - on_line).norm()) < MAX_OFF * evidence.distance:
+            session.report(
+                f"{name}: the shaft's line is where its poses pass one point, the trocar: {line.off:.2f} mm off it, "
+                f"sliding by {line.slide:.0f} mm"
+            )
+            return carve_along(evidence, name, frame_along(on_line, along), POSSIBLE, generator, search)
+    session.report(f"{name}: its poses show no trocar; the shaft's line is as it is carved from the images")
+    return carve_along(evidence, name, base, POSSIBLE, generator, search)
+
+
+def tree_of(found: ChainFound, instrument_from_shaft: Tensor, middles: Mapping[str, float]) -> KinematicTree:
+    """The tree of a chain, at rest where all readings are at their `middles`."""
+    base = instrument_from_shaft.double().cpu().numpy()
+    links = [Link(ROOT)]
+    parent, last = ROOT, np.zeros(3)
+    for joint in found.chain:
+        pivot = base[:3, :3] @ joint.pivot.double().cpu().numpy() + base[:3, 3]
+        axis = base[:3, :3] @ joint.axis.double().cpu().numpy()
+        origin = np.eye(4)
+        origin[:3, 3] = pivot - last
+        names = _link_names(joint.parts[0][-1][0], len(joint.parts))
+        for name, part in zip(names, joint.parts, strict=True):
+            offset = -sum(gain * middles[reading] for reading, gain in part)
+            kind = PRISMATIC if joint.slides else REVOLUTE
+            links.append(Link(name, parent, kind, origin, axis / np.linalg.norm(axis), dict(part), offset))
+        parent, last = names[0], pivot
+    return KinematicTree(tuple(links))
+
+
+def _link_names(reading: str, count: int) -> tuple[str, ...]:
+    stem = reading
+    for unit in UNITS:
+        stem = stem.removesuffix(unit) or stem
+    return (f"{stem}_left", f"{stem}_right") if count > 1 else (stem if stem != ROOT else reading,)
+
+
+def _lines(name: str, found: ChainFound, base: Tensor) -> list[str]:
+    """What was found, one line a joint."""
+    lines = [f"{name}: {_words(finding, base)}" for finding in found.findings]
+    return lines + [
+        f"warning: {name}: joint {reading} was NOT found: its readings explain nothing in the images; it moves no part"
+        for reading in found.left_out
+    ]
+
+
+def _words(finding: Finding, base: Tensor) -> str:
+    joint = finding.joint
+    pivot = [round(float(v), 1) for v in base[:3, :3] @ joint.pivot + base[:3, 3]]
+    axis = [round(float(v), 2) for v in base[:3, :3] @ joint.axis]
+    does = "slides" if joint.slides else "turns" if len(joint.parts) == 1 else "opens two jaws"
+    about = f"along {axis}, out of" if joint.slides else f"about {axis} at"
+    about += f" {pivot} mm"
+    if len(joint.parts[0]) > 1:
+        about += f", the axis that {joint.parts[0][0][0]} turns about"
+    return (
+        f"joint {finding.reading} found: it {does} {about}; explains {finding.explained:.0f} mm^3 "
+        f"({finding.by_chance:.0f} by chance)"
+    )
