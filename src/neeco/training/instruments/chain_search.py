@@ -29,8 +29,8 @@ NEXT = 0.5, 4.5  # radii beyond the last pivot where the next is looked for
 BEHIND, BEYOND = 2.0, 7.0  # radii about the first pivot in which all links lie
 EXCHANGES = 0.31, 0.57, 0.17, 0.79  # shares of the frames by which readings are shifted against the images
 MIN_RATIO = 1.5  # of the volume that a reading explains to what it does when exchanged
-MIN_VOLUME = 0.1  # radii^3 that it must explain
-OWN_AXIS = 1.2  # times what it explains on the axis before: an axis of its own is believed
+MIN_VOLUME = 0.01  # radii^3 that it must explain
+OWN_AXIS = 1.2  # times what it explains about the axis before: an axis of its own is believed
 # units of what is refined, and the share of the volume that one unit off the line or off right angles costs
 UNIT_MM, UNIT_RAD = 2.0, math.radians(10)
 STRAY = 0.002
@@ -53,21 +53,19 @@ class Finding:
         return self.joint.parts[0][-1][0]
 
     @property
-    def excess(self) -> float:
-        """mm^3 that are no chance."""
-        return self.explained - self.by_chance
+    def opens(self) -> str | None:
+        """The reading that turns the joint as a whole, where the last one opens jaws about its axis."""
+        first = self.joint.parts[0][0][0]
+        return None if first == self.reading else first
 
 
 @dataclass(frozen=True)
 class ChainFound:
     """The joints of a chain from the shaft outwards, and the readings that explain nothing."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...]  # in the order in which they were found
+    chain: Chain
     left_out: tuple[str, ...]
-
-    @property
-    def chain(self) -> Chain:
-        return tuple(finding.joint for finding in self.findings)
 
 
 @torch.no_grad()
@@ -76,24 +74,23 @@ def find_chain(evidence: ChainEvidence, slides: Sequence[str], near: float, tip:
     looked for from `near` to `tip`, mm along the shaft."""
     step = STEP * evidence.radius
     left = list(evidence.readings)
-    found: list[Finding] = []
+    findings: list[Finding] = []
+    chain: Chain = ()
     depths = np.arange(near, tip, step)
     while left and len(depths):
-        search = _Search(evidence, tuple(finding.joint for finding in found), frozenset(slides))
-        best = search.next_joint(left, depths)
+        best = _Search(evidence, chain, frozenset(slides)).next_joint(left, depths)
         if best is None:
             break
         left.remove(best.reading)
-        if found and best.joint.parts[0][0][0] != best.reading:  # about the axis of the joint before
-            found.pop()
-        found.append(best)
+        findings.append(best)
+        chain = (*(chain[:-1] if best.opens else chain), best.joint)
         if len(best.joint.parts) > 1:
             break
         pivot = float(best.joint.pivot[2])
         depths = np.arange(pivot + NEXT[0] * evidence.radius, pivot + NEXT[1] * evidence.radius, step)
-    if len(found) > 1:
-        found = _refined_together(evidence, found)
-    return ChainFound(tuple(found), tuple(left))
+    if len(chain) > 1:
+        chain = tuple(_climb(evidence, (), chain, chain[0].pivot, LAST_STEP))
+    return ChainFound(tuple(findings), chain, tuple(left))
 
 
 @dataclass(frozen=True)
@@ -116,13 +113,12 @@ class _Search:
             if len(left) > 1 and self._believed(single):
                 return single
         options = [single] if len(left) == 1 else []
-        options += [self._weighed(self._start(self._jaws(name), depths)[0]) for name in left if name not in self.slides]
-        options = [option for option in options if self._believed(option)]
-        own = max(options, key=lambda option: option.excess, default=None)
-        opened = [self._opened(name) for name in left if self._may_open(name)]
-        opened = [option for option in opened if self._believed(option)]
-        shared = max(opened, key=lambda option: option.excess, default=None)
-        if shared is None or (own is not None and own.excess > OWN_AXIS * shared.excess):
+        turning = [name for name in left if name not in self.slides]
+        options += [self._weighed(self._start(self._jaws(name), depths)[0]) for name in turning]
+        own = max(filter(self._believed, options), key=lambda option: option.explained, default=None)
+        opened = [self._opened(name) for name in turning if self.chain and not self.chain[-1].slides]
+        shared = max(filter(self._believed, opened), key=lambda option: option.explained, default=None)
+        if shared is None or (own is not None and own.explained > OWN_AXIS * shared.explained):
             return own
         return shared
 
@@ -131,9 +127,6 @@ class _Search:
 
     def _jaws(self, name: str) -> tuple[Part, ...]:
         return tuple(((name, gain),) for gain in JAWS)
-
-    def _may_open(self, name: str) -> bool:
-        return bool(self.chain) and not self.chain[-1].slides and name not in self.slides
 
     def _opened(self, name: str) -> Finding:
         """Jaws about the axis of the chain's last joint."""
@@ -186,7 +179,9 @@ class _Search:
     def _weighed(self, start: ChainJoint, before: Chain | None = None) -> Finding:
         """A joint, refined, with what it explains; `before`: the joints that carry it, where that is not the chain."""
         before = self.chain if before is None else before
-        (joint,) = _climb(self.evidence, before, [start], self._first_pivot(start), FIRST_STEP)
+        # along a shaft that looks the same everywhere, sliding explains much at any reading
+        shift = self._shifts()[0] if start.slides else None
+        (joint,) = _climb(self.evidence, before, [start], self._first_pivot(start), FIRST_STEP, shift)
         return self._explains(joint, before)
 
     def _explains(self, joint: ChainJoint, before: Chain) -> Finding:
@@ -210,15 +205,16 @@ class _Search:
         return [round(share * len(self.evidence.camera_from_shaft)) for share in EXCHANGES]
 
 
-def _refined_together(evidence: ChainEvidence, found: Sequence[Finding]) -> list[Finding]:
-    joints = _climb(evidence, (), [finding.joint for finding in found], found[0].joint.pivot, LAST_STEP)
-    return [replace(finding, joint=joint) for finding, joint in zip(found, joints, strict=True)]
-
-
 def _climb(
-    evidence: ChainEvidence, before: Chain, joints: Sequence[ChainJoint], pivot: Tensor, step: float
+    evidence: ChainEvidence,
+    before: Chain,
+    joints: Sequence[ChainJoint],
+    pivot: Tensor,
+    step: float,
+    shift: int | None = None,
 ) -> list[ChainJoint]:
-    """`joints`, which follow the chain `before`, moved to where they explain most of the volume about `pivot`."""
+    """`joints`, which follow the chain `before`, moved to where they explain most of the volume about `pivot`; most
+    beyond what they do with the last reading shifted by `shift` frames, where that is given."""
     points = evidence.box(pivot, BEHIND, BEYOND)
     known = evidence.explained(before, points, evidence.volume(evidence.still, points))
     carrier = evidence.carrier(before)
@@ -232,7 +228,10 @@ def _climb(
     def loss(numbers: Array) -> float:
         moved = joints_of(numbers)
         strayed = 1 - STRAY * sum(_strayed(joint) for joint in moved)
-        return -float(evidence.explained(tuple(moved), points, known, carrier).double().sum()) * strayed
+        volume = evidence.explained(tuple(moved), points, known, carrier).double().sum()
+        if shift is not None:
+            volume = volume - evidence.explained(tuple(moved), points, known, carrier, shift).double().sum()
+        return -float(volume) * strayed
 
     start = np.concatenate(starts)
     simplex = np.vstack([start, start + step * np.eye(len(start))])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument
-from neeco.training.instruments.chain_search import ChainFound, Finding, find_chain
+from neeco.training.instruments.chain_search import ChainFound, find_chain
 from neeco.training.instruments.chain_volume import ChainEvidence
 from neeco.training.instruments.color_evidence import clear_by_color
 from neeco.training.instruments.discovery import tissue_evidence
@@ -138,23 +138,20 @@ def _link_names(reading: str, count: int) -> tuple[str, ...]:
 
 def _lines(name: str, found: ChainFound, base: Tensor) -> list[str]:
     """What was found, one line a joint."""
-    lines = [f"{name}: {_words(finding, base)}" for finding in found.findings]
+    lines = []
+    for finding in found.findings:
+        joint = next(joint for joint in found.chain if any(finding.reading in dict(part) for part in joint.parts))
+        pivot = [round(float(v), 1) for v in base[:3, :3] @ joint.pivot + base[:3, 3]]
+        axis = [round(float(v), 2) for v in base[:3, :3] @ joint.axis]
+        if finding.opens is not None:
+            does = f"opens two jaws about the axis of {finding.opens}"
+        elif finding.joint.slides:
+            does = f"slides along {axis} from {pivot} mm on"
+        else:
+            does = f"{'turns' if len(finding.joint.parts) == 1 else 'opens two jaws'} about {axis} at {pivot} mm"
+        sure = f"explains {finding.explained:.1f} mm^3 of the images' evidence, {finding.by_chance:.1f} if exchanged"
+        lines.append(f"{name}: joint {finding.reading} found: {does}; {sure}")
     return lines + [
         f"warning: {name}: joint {reading} was NOT found: its readings explain nothing in the images; it moves no part"
         for reading in found.left_out
     ]
-
-
-def _words(finding: Finding, base: Tensor) -> str:
-    joint = finding.joint
-    pivot = [round(float(v), 1) for v in base[:3, :3] @ joint.pivot + base[:3, 3]]
-    axis = [round(float(v), 2) for v in base[:3, :3] @ joint.axis]
-    does = "slides" if joint.slides else "turns" if len(joint.parts) == 1 else "opens two jaws"
-    about = f"along {axis}, out of" if joint.slides else f"about {axis} at"
-    about += f" {pivot} mm"
-    if len(joint.parts[0]) > 1:
-        about += f", the axis that {joint.parts[0][0][0]} turns about"
-    return (
-        f"joint {finding.reading} found: it {does} {about}; explains {finding.explained:.0f} mm^3 "
-        f"({finding.by_chance:.0f} by chance)"
-    )

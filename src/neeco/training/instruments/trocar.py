@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 STARTS = 6  # directions from which the fit begins
 FAR = 100.0  # mm: where the trocar is looked for first, from the tracked frame
 MIN_FRAMES = 8  # with fewer, any line fits
-MIN_SLIDE = 3.0  # times the distance of the line from the trocar: with less, the line could have any direction
+MIN_SLIDE = 20.0  # times its distance from the trocar: sliding less, the line could have any direction
 
 
 @dataclass(frozen=True)
