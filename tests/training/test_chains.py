@@ -1,4 +1,4 @@
-"""Joints whose axes nobody stated are found in images, one after the other, and those that explain nothing are named."""
+"""Joints whose axes nobody stated are found in images one after the other, and those that explain nothing are named."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neeco.raster.rotations import rigid_from_vector
 from neeco.scene.articulation.stated import StatedLinks
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import SearchConfig
-from neeco.training.instruments import chains
+from neeco.training.instruments import chain_search, chains
 from neeco.training.instruments.chains import find_trees
 from neeco.training.instruments.color_evidence import clear_by_color
 from neeco.training.instruments.evidence import Evidence
@@ -61,7 +61,7 @@ def resting(link: int, count: int = 2500) -> Tensor:
     return torch.stack([out * turn.cos(), out * turn.sin(), near + (far - near) * along], -1)
 
 
-def world_of(tree: KinematicTree, ranges: dict[str, tuple[float, float]], frames: int = 60) -> Evidence:
+def world_of(tree: KinematicTree, ranges: dict[str, tuple[float, float]], frames: int = 40) -> Evidence:
     """Silhouettes of the tree's links at random readings; `noise`: a reading that moves nothing."""
     links = StatedLinks(tree).requires_grad_(False)
 
@@ -76,6 +76,8 @@ def search_in(
     evidence: Evidence, names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Instrument, list[str]]:
     """What is found of an instrument with these joints, and what is said of it."""
+    monkeypatch.setattr(chain_search, "EVALUATIONS", 12)  # coarser, for speed
+    monkeypatch.setattr(chain_search, "ANGLES", 12)
     monkeypatch.setattr(chains, "tissue_evidence", lambda scene, views, config: evidence)
     monkeypatch.setattr(chains, "clear_by_color", lambda known, views: known)
     told: list[str] = []

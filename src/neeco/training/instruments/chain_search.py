@@ -29,7 +29,7 @@ NEXT = 0.5, 4.5  # radii beyond the last pivot where the next is looked for
 BEHIND, BEYOND = 2.0, 7.0  # radii about the first pivot in which all links lie
 EXCHANGES = 0.31, 0.57, 0.17, 0.79  # shares of the frames by which readings are shifted against the images
 MIN_RATIO = 1.5  # of the volume that a reading explains to what it does when exchanged
-MIN_VOLUME = 0.01  # radii^3 that it must explain
+MIN_VOLUME, MIN_OPENING = 0.03, 0.01  # radii^3 that it must explain; where it opens jaws about the axis before
 OWN_AXIS = 1.2  # times what it explains about the axis before: an axis of its own is believed
 # units of what is refined, and the share of the volume that one unit off the line or off right angles costs
 UNIT_MM, UNIT_RAD = 2.0, math.radians(10)
@@ -53,6 +53,11 @@ class Finding:
         return self.joint.parts[0][-1][0]
 
     @property
+    def opens_jaws(self) -> bool:
+        """Whether it moves two links."""
+        return len(self.joint.parts) > 1
+
+    @property
     def opens(self) -> str | None:
         """The reading that turns the joint as a whole, where the last one opens jaws about its axis."""
         first = self.joint.parts[0][0][0]
@@ -72,25 +77,30 @@ class ChainFound:
 def find_chain(evidence: ChainEvidence, slides: Sequence[str], near: float, tip: float) -> ChainFound:
     """The joints that the readings of `evidence` drive; those named in `slides` slide, the others turn. The first is
     looked for from `near` to `tip`, mm along the shaft."""
-    step = STEP * evidence.radius
     left = list(evidence.readings)
     findings: list[Finding] = []
-    chain: Chain = ()
-    depths = np.arange(near, tip, step)
-    while left and len(depths):
-        best = _Search(evidence, chain, frozenset(slides)).next_joint(left, depths)
+    depths = np.arange(near, tip, STEP * evidence.radius)
+    while left and not (findings and findings[-1].opens_jaws):
+        search = _Search(evidence, _joints(findings), frozenset(slides))
+        best = search.single(left, depths)
+        best = search.jaws(left if best is None else [best.reading], depths, best)
         if best is None:
             break
         left.remove(best.reading)
         findings.append(best)
-        chain = (*(chain[:-1] if best.opens else chain), best.joint)
-        if len(best.joint.parts) > 1:
-            break
-        pivot = float(best.joint.pivot[2])
-        depths = np.arange(pivot + NEXT[0] * evidence.radius, pivot + NEXT[1] * evidence.radius, step)
+        depths = float(best.joint.pivot[2]) + evidence.radius * np.arange(*NEXT, STEP)
+    chain = _joints(findings)
     if len(chain) > 1:
         chain = tuple(_climb(evidence, (), chain, chain[0].pivot, LAST_STEP))
     return ChainFound(tuple(findings), chain, tuple(left))
+
+
+def _joints(findings: Sequence[Finding]) -> Chain:
+    """Of all findings; one that opens jaws about the axis of the joint before takes its place."""
+    chain: Chain = ()
+    for finding in findings:
+        chain = (*(chain[:-1] if finding.opens is not None else chain), finding.joint)
+    return chain
 
 
 @dataclass(frozen=True)
@@ -101,26 +111,32 @@ class _Search:
     chain: Chain
     slides: frozenset[str]
 
-    def next_joint(self, left: Sequence[str], depths: Array) -> Finding | None:
-        """The joint that the readings `left` explain most of, or None where they explain nothing.
-
-        The last reading, or where none turns a single link, may open two jaws: better of two turns always explains
-        more, so these do not compete with single links before.
-        """
+    def single(self, left: Sequence[str], depths: Array) -> Finding | None:
+        """The joint of a single link that one of the readings `left` explains most of; None where none explains
+        anything."""
         starts = {name: self._start(self._single(name), depths) for name in left}
         for name in sorted(left, key=lambda name: -starts[name][1]):
-            single = self._weighed(starts[name][0])
-            if len(left) > 1 and self._believed(single):
-                return single
-        options = [single] if len(left) == 1 else []
+            finding = self._weighed(starts[name][0])
+            if self._believed(finding):
+                return finding
+        return None
+
+    def jaws(self, left: Sequence[str], depths: Array, single: Finding | None = None) -> Finding | None:
+        """Two jaws that one of the readings `left` opens, about the axis of the joint before or one of their own; or a
+        `single` link, where they do not explain clearly more: the better of two turns always explains a little more.
+        None where nothing explains anything."""
         turning = [name for name in left if name not in self.slides]
-        options += [self._weighed(self._start(self._jaws(name), depths)[0]) for name in turning]
-        own = max(filter(self._believed, options), key=lambda option: option.explained, default=None)
+        own = [self._weighed(self._start(self._jaws(name), depths)[0]) for name in turning]
         opened = [self._opened(name) for name in turning if self.chain and not self.chain[-1].slides]
-        shared = max(filter(self._believed, opened), key=lambda option: option.explained, default=None)
-        if shared is None or (own is not None and own.explained > OWN_AXIS * shared.explained):
-            return own
-        return shared
+        best = max(filter(self._believed, opened), key=lambda finding: finding.explained, default=None)
+        others = [] if single is None else [single]
+        for other in sorted(filter(self._believed, own), key=lambda finding: -finding.explained)[:1]:
+            if single is None or other.explained > OWN_AXIS * single.explained:
+                others.append(other)
+        for other in others:
+            if best is None or other.explained > OWN_AXIS * best.explained:
+                best = other
+        return best
 
     def _single(self, name: str) -> tuple[Part, ...]:
         return (((name, 1.0),),)
@@ -135,7 +151,7 @@ class _Search:
         return self._weighed(replace(last, parts=parts), self.chain[:-1])
 
     def _believed(self, finding: Finding) -> bool:
-        least = MIN_VOLUME * self.evidence.radius**3
+        least = (MIN_VOLUME if finding.opens is None else MIN_OPENING) * self.evidence.radius**3
         return finding.explained > max(least, MIN_RATIO * finding.by_chance)
 
     def _start(self, parts: tuple[Part, ...], depths: Array) -> tuple[ChainJoint, float]:
