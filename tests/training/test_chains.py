@@ -78,6 +78,7 @@ def search_in(
     """What is found of an instrument with these joints, and what is said of it."""
     monkeypatch.setattr(chain_search, "EVALUATIONS", 12)  # coarser, for speed
     monkeypatch.setattr(chain_search, "ANGLES", 12)
+    monkeypatch.setattr(chain_search, "GRID_POINTS", 250)
     monkeypatch.setattr(chains, "tissue_evidence", lambda scene, views, config: evidence)
     monkeypatch.setattr(chains, "clear_by_color", lambda known, views: known)
     told: list[str] = []

@@ -68,7 +68,7 @@ def _with_trees(capture: Capture, scene: Scene, views: TrainingViews, config: Tr
     if found is None:
         return scene
     again = initial_scene(replace(capture, instruments=found), views.frames, config, lambda text: None)
-    again.diagnostics |= scene.diagnostics
+    again.diagnostics |= session.scene.diagnostics
     return again
 
 

@@ -53,6 +53,11 @@ class Finding:
         return self.joint.parts[0][-1][0]
 
     @property
+    def excess(self) -> float:
+        """mm^3 that are no chance."""
+        return self.explained - self.by_chance
+
+    @property
     def opens_jaws(self) -> bool:
         """Whether it moves two links."""
         return len(self.joint.parts) > 1
@@ -128,13 +133,13 @@ class _Search:
         turning = [name for name in left if name not in self.slides]
         own = [self._weighed(self._start(self._jaws(name), depths)[0]) for name in turning]
         opened = [self._opened(name) for name in turning if self.chain and not self.chain[-1].slides]
-        best = max(filter(self._believed, opened), key=lambda finding: finding.explained, default=None)
+        best = max(filter(self._believed, opened), key=lambda finding: finding.excess, default=None)
         others = [] if single is None else [single]
-        for other in sorted(filter(self._believed, own), key=lambda finding: -finding.explained)[:1]:
-            if single is None or other.explained > OWN_AXIS * single.explained:
+        for other in sorted(filter(self._believed, own), key=lambda finding: -finding.excess)[:1]:
+            if single is None or other.excess > OWN_AXIS * single.excess:
                 others.append(other)
         for other in others:
-            if best is None or other.explained > OWN_AXIS * best.explained:
+            if best is None or other.excess > OWN_AXIS * best.excess:
                 best = other
         return best
 
@@ -151,8 +156,9 @@ class _Search:
         return self._weighed(replace(last, parts=parts), self.chain[:-1])
 
     def _believed(self, finding: Finding) -> bool:
+        beyond = finding.opens is not None or not self.chain or bool(finding.joint.pivot[2] > self.chain[-1].pivot[2])
         least = (MIN_VOLUME if finding.opens is None else MIN_OPENING) * self.evidence.radius**3
-        return finding.explained > max(least, MIN_RATIO * finding.by_chance)
+        return beyond and finding.explained > max(least, MIN_RATIO * finding.by_chance)
 
     def _start(self, parts: tuple[Part, ...], depths: Array) -> tuple[ChainJoint, float]:
         """The best joint on a grid, with how much more mm^3 it turns onto evidence than exchanged readings do."""

@@ -72,8 +72,10 @@ def _with_tree(session: GaussianSession, evidence: Evidence, instrument: Instrum
     )
     slides = [joint for joint in instrument.joints if instrument.slides(joint)]
     found = find_chain(known, slides, shape.near + WELL_SEEN * (shape.tip - shape.near), shape.tip)
-    for line in _lines(name, found, base):
-        report(line)
+    verdicts = session.scene.diagnostics.setdefault("kinematics", {})
+    for reading, verdict in _verdicts(found, base).items():
+        verdicts[f"{name}.{reading}"] = {"verdict": f"{reading} {verdict}"}
+        report(f"{'warning: ' if reading in found.left_out else ''}{name}: joint {reading} {verdict}")
     if not found.findings:
         report(f"warning: {name}: no joint was found; its joints are learned as hinges across the shaft")
         return instrument
@@ -136,22 +138,20 @@ def _link_names(reading: str, count: int) -> tuple[str, ...]:
     return (f"{stem}_left", f"{stem}_right") if count > 1 else (stem if stem != ROOT else reading,)
 
 
-def _lines(name: str, found: ChainFound, base: Tensor) -> list[str]:
-    """What was found, one line a joint."""
-    lines = []
+def _verdicts(found: ChainFound, base: Tensor) -> dict[str, str]:
+    """By reading what was found of it, or that nothing was."""
+    verdicts = {}
     for finding in found.findings:
         joint = next(joint for joint in found.chain if any(finding.reading in dict(part) for part in joint.parts))
         pivot = [round(float(v), 1) for v in base[:3, :3] @ joint.pivot + base[:3, 3]]
         axis = [round(float(v), 2) for v in base[:3, :3] @ joint.axis]
         if finding.opens is not None:
             does = f"opens two jaws about the axis of {finding.opens}"
-        elif finding.joint.slides:
+        elif joint.slides:
             does = f"slides along {axis} from {pivot} mm on"
         else:
-            does = f"{'turns' if len(finding.joint.parts) == 1 else 'opens two jaws'} about {axis} at {pivot} mm"
+            does = f"{'opens two jaws' if finding.opens_jaws else 'turns'} about {axis} at {pivot} mm"
         sure = f"explains {finding.explained:.1f} mm^3 of the images' evidence, {finding.by_chance:.1f} if exchanged"
-        lines.append(f"{name}: joint {finding.reading} found: {does}; {sure}")
-    return lines + [
-        f"warning: {name}: joint {reading} was NOT found: its readings explain nothing in the images; it moves no part"
-        for reading in found.left_out
-    ]
+        verdicts[finding.reading] = f"found: {does}; {sure}"
+    nothing = "was NOT found: its readings explain nothing in the images, so it moves no part"
+    return verdicts | dict.fromkeys(found.left_out, nothing)
