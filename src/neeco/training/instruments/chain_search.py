@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,18 +74,21 @@ class ChainFound:
     """The joints of a chain from the shaft outwards, and the readings that explain nothing."""
 
     findings: tuple[Finding, ...]  # in the order in which they were found
-    chain: Chain
+    chain: Chain  # refined together
     left_out: tuple[str, ...]
 
 
 @torch.no_grad()
-def find_chain(evidence: ChainEvidence, slides: Sequence[str], near: float, tip: float) -> ChainFound:
+def find_chain(
+    evidence: ChainEvidence, slides: Sequence[str], near: float, tip: float, report: Callable[[str], None]
+) -> ChainFound:
     """The joints that the readings of `evidence` drive; those named in `slides` slide, the others turn. The first is
     looked for from `near` to `tip`, mm along the shaft."""
     left = list(evidence.readings)
     findings: list[Finding] = []
     depths = np.arange(near, tip, STEP * evidence.radius)
     while left and not (findings and findings[-1].opens_jaws):
+        report(f"looking for joint {len(findings) + 1}, which {' or '.join(left)} may move")
         search = _Search(evidence, _joints(findings), frozenset(slides))
         best = search.single(left, depths)
         best = search.jaws(left if best is None else [best.reading], depths, best)

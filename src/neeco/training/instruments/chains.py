@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument
 from neeco.training.instruments.chain_search import ChainFound, find_chain
 from neeco.training.instruments.chain_volume import ChainEvidence
 from neeco.training.instruments.color_evidence import clear_by_color
-from neeco.training.instruments.discovery import tissue_evidence
+from neeco.training.instruments.discovery import fit_tissue, tissue_evidence
 from neeco.training.instruments.evidence import (
     POSSIBLE,
     CarvedShape,
@@ -23,6 +24,7 @@ from neeco.training.instruments.evidence import (
     carve,
     carve_along,
     frame_along,
+    gather_evidence,
 )
 from neeco.training.instruments.trocar import trocar_line
 from neeco.training.session import GaussianSession
@@ -30,6 +32,8 @@ from neeco.training.session import GaussianSession
 ROOT = "shaft"
 UNITS = ("_rad", "_deg", "_mm", "_angle")  # endings of readings that links' names do without
 MAX_OFF = 0.1  # of the distance to the tissue: the trocar's line may pass the carved shape at most so far
+MASKED, MARGIN = 0.3, 3  # evidence from which a pixel, and those so many px about it, are no tissue
+DENSITY_START = 200  # steps of the longer fit
 WELL_SEEN = 0.4  # of the shaft's length, before which no joint is looked for: it is seen too rarely
 
 
@@ -46,7 +50,27 @@ def find_trees(session: GaussianSession) -> tuple[Instrument, ...] | None:
     session.report(f"{names}: several joints and no kinematics: looking for the joints' axes in the images")
     evidence = tissue_evidence(session.scene, session.views, session.config)
     evidence = clear_by_color(evidence, session.views)
+    evidence = clear_by_color(_fitted_again(session, evidence), session.views)
     return tuple(_with_tree(session, evidence, item) if _is_unknown(item) else item for item in instruments)
+
+
+def _fitted_again(session: GaussianSession, evidence: Evidence) -> Evidence:
+    """Evidence after a longer fit of the tissue in the same frames that leaves out where it was before, lest the fit
+    take parts of instruments in."""
+    views, masks = session.views, []
+    places = {frame.name: index for index, frame in enumerate(views.frames)}
+    chosen = [places[frame.name] for frame in evidence.frames]
+    for index, hits in zip(chosen, evidence.hits, strict=True):
+        height, width = views.images[index].shape[:2]
+        near = max_pool2d(hits[None, :height, :width], 2 * MARGIN + 1, 1, MARGIN)[0]
+        mask = views.mask(index)
+        masks.append(near < MASKED if mask is None else (near < MASKED) & mask)
+    images = tuple(views.images[index] for index in chosen)
+    fitted = replace(views, frames=evidence.frames, images=images, masks=tuple(masks))
+    steps = session.config.search.long_tissue_steps
+    tissue = fit_tissue(session.scene, fitted, session.config, steps, DENSITY_START)
+    given = replace(fitted, masks=tuple(views.masks[index] for index in chosen))
+    return gather_evidence(tissue, given, replace(session.config.search, evidence_frames=len(chosen)))
 
 
 def _is_unknown(instrument: Instrument) -> bool:
@@ -71,7 +95,8 @@ def _with_tree(session: GaussianSession, evidence: Evidence, instrument: Instrum
         session.config.seed,
     )
     slides = [joint for joint in instrument.joints if instrument.slides(joint)]
-    found = find_chain(known, slides, shape.near + WELL_SEEN * (shape.tip - shape.near), shape.tip)
+    near = shape.near + WELL_SEEN * (shape.tip - shape.near)
+    found = find_chain(known, slides, near, shape.tip, lambda text: report(f"{name}: {text}"))
     verdicts = session.scene.diagnostics.setdefault("kinematics", {})
     for reading, verdict in _verdicts(found, base).items():
         verdicts[f"{name}.{reading}"] = {"verdict": f"{reading} {verdict}"}
@@ -79,10 +104,10 @@ def _with_tree(session: GaussianSession, evidence: Evidence, instrument: Instrum
     if not found.findings:
         report(f"warning: {name}: no joint was found; its joints are learned as hinges across the shaft")
         return instrument
-    left_out = {joint: limits for joint, limits in instrument.joints.items() if joint not in found.left_out}
-    if len(left_out) == 1 and not found.chain[0].slides:
-        return replace(instrument, joints=left_out)  # a hinge, which has a search of its own
-    return replace(instrument, joints=left_out, kinematics=tree_of(found, base, middles))
+    kept = {joint: limits for joint, limits in instrument.joints.items() if joint not in found.left_out}
+    if len(kept) == 1 and not found.chain[0].slides:
+        return replace(instrument, joints=kept)  # a hinge, which has a search of its own
+    return replace(instrument, joints=kept, kinematics=tree_of(found, base, middles))
 
 
 def _shaft(session: GaussianSession, evidence: Evidence, name: str) -> CarvedShape | None:
@@ -122,7 +147,7 @@ def tree_of(found: ChainFound, instrument_from_shaft: Tensor, middles: Mapping[s
         axis = base[:3, :3] @ joint.axis.double().cpu().numpy()
         origin = np.eye(4)
         origin[:3, 3] = pivot - last
-        names = _link_names(joint.parts[0][-1][0], len(joint.parts))
+        names = _link_names(joint.parts[0][-1][0], len(joint.parts), [link.name for link in links])
         for name, part in zip(names, joint.parts, strict=True):
             offset = -sum(gain * middles[reading] for reading, gain in part)
             kind = PRISMATIC if joint.slides else REVOLUTE
@@ -131,11 +156,14 @@ def tree_of(found: ChainFound, instrument_from_shaft: Tensor, middles: Mapping[s
     return KinematicTree(tuple(links))
 
 
-def _link_names(reading: str, count: int) -> tuple[str, ...]:
+def _link_names(reading: str, count: int, taken: Sequence[str]) -> list[str]:
+    """Of the one link, or the left and right jaw, that a reading moves: as the reading is called, without its unit."""
     stem = reading
     for unit in UNITS:
         stem = stem.removesuffix(unit) or stem
-    return (f"{stem}_left", f"{stem}_right") if count > 1 else (stem if stem != ROOT else reading,)
+    sides = ("_left", "_right") if count > 1 else ("",)
+    names = [stem + side for side in sides]
+    return [reading + side for side in sides] if set(names) & set(taken) else names
 
 
 def _verdicts(found: ChainFound, base: Tensor) -> dict[str, str]:

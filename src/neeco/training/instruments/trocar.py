@@ -59,7 +59,10 @@ def trocar_line(poses: Array) -> TrocarLine | None:
     direction = best[3:6] / np.linalg.norm(best[3:6])
     along = (seen(best[:3]) - best[6:]) @ direction
     off = float(np.sqrt(np.square(apart(best)).sum() / len(poses)))
-    return TrocarLine(best[6:] + along.mean() * direction, direction, off, float(np.ptp(along)))
+    # rounded, as LAPACK's last bits may differ from run to run
+    point: Array = np.round(best[6:] + along.mean() * direction, 4)
+    direction = np.round(direction, 6)
+    return TrocarLine(point, direction, off, float(np.ptp(along)))
 
 
 def _spread_directions(count: int) -> Array:
