@@ -80,6 +80,7 @@ def search_in(
     monkeypatch.setattr(chain_search, "ANGLES", 12)
     monkeypatch.setattr(chain_search, "GRID_POINTS", 250)
     monkeypatch.setattr(chains, "tissue_evidence", lambda scene, views, config: evidence)
+    monkeypatch.setattr(chains, "_fitted_again", lambda session, known: known)
     monkeypatch.setattr(chains, "clear_by_color", lambda known, views: known)
     told: list[str] = []
     session = SimpleNamespace(

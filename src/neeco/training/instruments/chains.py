@@ -104,10 +104,10 @@ def _with_tree(session: GaussianSession, evidence: Evidence, instrument: Instrum
     if not found.findings:
         report(f"warning: {name}: no joint was found; its joints are learned as hinges across the shaft")
         return instrument
-    kept = {joint: limits for joint, limits in instrument.joints.items() if joint not in found.left_out}
-    if len(kept) == 1 and not found.chain[0].slides:
-        return replace(instrument, joints=kept)  # a hinge, which has a search of its own
-    return replace(instrument, joints=kept, kinematics=tree_of(found, base, middles))
+    moving = {joint: limits for joint, limits in instrument.joints.items() if joint not in found.left_out}
+    if len(moving) == 1 and not found.chain[0].slides:
+        return replace(instrument, joints=moving)  # a hinge, which has a search of its own
+    return replace(instrument, joints=moving, kinematics=tree_of(found, base, middles))
 
 
 def _shaft(session: GaussianSession, evidence: Evidence, name: str) -> CarvedShape | None:

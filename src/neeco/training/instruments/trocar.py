@@ -61,7 +61,7 @@ def trocar_line(poses: Array) -> TrocarLine | None:
     off = float(np.sqrt(np.square(apart(best)).sum() / len(poses)))
     # rounded, as LAPACK's last bits may differ from run to run
     point: Array = np.round(best[6:] + along.mean() * direction, 4)
-    direction = np.round(direction, 6)
+    direction = np.asarray(np.round(direction, 6), np.float64)
     return TrocarLine(point, direction, off, float(np.ptp(along)))
 
 
