@@ -19,6 +19,7 @@ from neeco.scene.scene import Scene
 from neeco.scene.training_session import InstrumentSearch, Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
+from neeco.training.instruments.chains import find_trees
 from neeco.training.instruments.discovery import bound_volume, find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.label_shares import store_label_shares
@@ -37,7 +38,7 @@ def begin_session(
         return method.session(capture, views, config.deformation, config.length, config.seed, scene)
     is_new = scene is None
     if scene is None:
-        scene = initial_scene(capture, views.frames, config, report)
+        scene = _with_trees(capture, initial_scene(capture, views.frames, config, report), views, config, report)
     assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
@@ -54,6 +55,21 @@ def begin_session(
         scene.deformation.begin(session)
     session.start()
     return session
+
+
+def _with_trees(capture: Capture, scene: Scene, views: TrainingViews, config: TrainConfig, report: Report) -> Scene:
+    """`scene`, a new one, or where several joints move an instrument whose axes nobody stated, one with the kinematic
+    trees that the images show."""
+    if config.joints is not None or not getattr(config.deformation, "kinematics", False):
+        return scene
+    session = new_session(scene.to(views.device), views, config, report)
+    with session.searching():
+        found = find_trees(session)
+    if found is None:
+        return scene
+    again = initial_scene(replace(capture, instruments=found), views.frames, config, lambda text: None)
+    again.diagnostics |= session.scene.diagnostics
+    return again
 
 
 def _searching(session: GaussianSession, search: Callable[..., None], as_learned: bool = False) -> Callable[..., None]:
