@@ -186,7 +186,7 @@ def test_links_that_are_none_are_told_with_their_key(world, folder, words, messa
 def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder):
     recording = read_recording(world.text("video: video.mp4\nsplits: {test: [3]}\n", "recording.yaml"))
     assert recording.settings == IngestSettings()
-    assert recording.splits == Splits(8, 0.15, None, ((3, 3),))
+    assert recording.splits == Splits(None, 0.15, None, ((3, 3),))
 
 
 @pytest.mark.parametrize(

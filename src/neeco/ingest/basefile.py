@@ -34,6 +34,15 @@ class StatedBase:
         return self.camera_from_base is not None and self.sd_mm is None
 
 
+def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
+    """Whether two recordings say the same of a base."""
+    if one is None or other is None:
+        return one is other
+    mine, theirs = one.camera_from_base, other.camera_from_base
+    alike = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
+    return alike and (one.sd_mm, one.sd_deg) == (other.sd_mm, other.sd_deg)
+
+
 def read_dvrk_registration(path: Path) -> StatedBase:
     """The file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a camera that stands
     still: `…-registration-open-cv.json`, or `…-registration-dVRK.json`, which is no JSON by itself but a piece of a

@@ -13,10 +13,10 @@ from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration, find_base
 from neeco.ingest.basefile import StatedBase
 from neeco.ingest.columns import CAMERA
+from neeco.ingest.episodes import Episodes
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.recording import InstrumentLogs
 from neeco.ingest.registration import ClockOffset
-from neeco.ingest.synchronized import SynchronizedRecording
 
 FRAMES = 140  # looked at, evenly spaced
 GIVEN, FOUND = "given", "found with the base"
@@ -33,7 +33,7 @@ class PlacedBase:
 
 
 def place_bases(
-    data: SynchronizedRecording,
+    data: Episodes,
     times: np.ndarray,
     cameras: np.ndarray,
     pinhole: Lens,
@@ -71,7 +71,7 @@ def place_bases(
 
 
 def _find(
-    data: SynchronizedRecording,
+    data: Episodes,
     item: InstrumentLogs,
     stated: StatedBase,
     masks: np.ndarray,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,34 +17,37 @@ from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, Poi
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
+from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
+from neeco.ingest.episodes import Episodes, separate
 from neeco.ingest.find_bases import place_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
-from neeco.ingest.registration import Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.still import moving_masks, reduced, stands_still
+from neeco.ingest.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
 from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
-from neeco.ingest.synchronized import States, SynchronizedRecording
+from neeco.ingest.synchronized import States
 
 
 def ingest(
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     output: Path,
     progress: StageProgress,
     complete: Callable[[IngestResult, Path], None] = lambda result, folder: None,
 ) -> IngestResult:
-    """Make the capture `output` from a recording and say how good it is.
+    """Make the capture `output` from a recording, or from several of one instrument, and say how good it is.
 
     Nothing appears at `output` before the capture is whole: `complete` may add files to its `folder` before. Raises
     NeecoError for unusable input: file, row or key, and what to do.
     """
+    recordings = separate([recording] if isinstance(recording, Recording) else recording)
     with staged(output) as folder:
-        result = _Ingest(recording, folder, progress).run(output)
+        result = _Ingest(recordings, folder, progress).run(output)
         complete(result, folder / "capture")
         return result
 
@@ -52,10 +55,11 @@ def ingest(
 class _Ingest:
     """One ingest under way, with a folder for everything temporary."""
 
-    def __init__(self, recording: Recording, folder: Path, progress: StageProgress) -> None:
-        self.recording, self.folder, self.progress = recording, folder, progress
-        self.settings = recording.settings
-        self.data = SynchronizedRecording(recording, progress)
+    def __init__(self, recordings: Sequence[Recording], folder: Path, progress: StageProgress) -> None:
+        self.folder, self.progress = folder, progress
+        self.data = Episodes(recordings, progress)
+        self.recording = self.data.recording
+        self.settings = self.recording.settings
         self.size = self.data.video.size
         self.lens = self._read_lens()
         self.bases: dict[str, BaseRegistration] = {}  # by instrument, of those found
@@ -77,9 +81,10 @@ class _Ingest:
         self._refuse_bases()
         self.motion = StructureFromMotion(
             self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
-            self.visible, self.settings,
+            self.visible, self.settings, self._episodes(),
         )  # fmt: skip
         sfm = self.motion.reconstruct(self.progress)
+        self.data.refuse_alone(self.selected[sfm.indices])
         if self.pinhole is None:
             assert sfm.lens is not None
             self.lens, self.pinhole = sfm.lens, sfm.lens.pinhole(self.size)
@@ -102,10 +107,22 @@ class _Ingest:
         if self.recording.stereo is not None:
             return True
         self.progress("looking whether the scope moves", 0, 0)
-        still = stands_still(self._load, len(self.names))
+        still = all(stands_still(self._loader(rows), len(rows)) for rows in self._rows_by_episode())
         if still:
             self.data.note("the scope stands still: nothing but what passes before it moves in the images")
         return still
+
+    def _episodes(self) -> np.ndarray:
+        """[K] the episode of every chosen frame."""
+        return self.data.episode_of(self.selected)
+
+    def _rows_by_episode(self) -> list[np.ndarray]:
+        """Rows of the chosen frames, of every episode that has some."""
+        return [np.flatnonzero(self._episodes() == episode) for episode in np.unique(self._episodes())]
+
+    def _loader(self, rows: np.ndarray) -> Callable[[int], np.ndarray]:
+        """`_load`, of some rows alone."""
+        return lambda place: self._load(int(rows[place]))
 
     def _load(self, row: int) -> np.ndarray:
         """uint8 [H, W, 3], one of the chosen frames."""
@@ -132,6 +149,7 @@ class _Ingest:
             data.note(
                 "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
             )
+        self._refuse_other_places()
         right = self._right_camera()
         cameras = still_cameras(len(self.names))
         self._find_instrument_clocks(cameras, pinhole)
@@ -144,6 +162,19 @@ class _Ingest:
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
         return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
+
+    def _refuse_other_places(self) -> None:
+        """Raise NeecoError when a still scope looked at something else in one episode than in another."""
+        if self.data.single:
+            return
+        self.progress("comparing what the recordings show", 0, 0)
+        backgrounds, episodes = [], []
+        for rows in self._rows_by_episode():
+            load = self._loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
+            found = find_background(load, min(len(rows), LOOKED_AT))
+            backgrounds.append(np.clip(found.colors, 0, 255).astype(np.uint8))
+            episodes.append(int(self._episodes()[rows[0]]))
+        self.data.refuse_elsewhere(backgrounds, episodes)
 
     def _place_bases(self, cameras: SfmResult, pinhole: Lens) -> None:
         """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as
@@ -163,7 +194,7 @@ class _Ingest:
             for name, base in placed.items():
                 data.world_from_base[name] = base.world_from_base
                 if base.clock is not None:
-                    data.clocks[data.poses[name].clock] = base.clock
+                    data.move_clock(data.poses[name].clock, base.clock)
                 if base.found is not None:
                     self.bases[name] = base.found
         unplaced = [name for name in data.poses if name not in data.world_from_base]
@@ -174,10 +205,19 @@ class _Ingest:
             )
 
     def _right_camera(self) -> RightCamera | None:
-        partner = self.recording.stereo
-        if partner is None:
+        if self.recording.stereo is None:
             return None
-        return read_right_camera(partner, self.selected, self.data.times, self.folder / "right", self.progress)
+        names = [self.data.frame_name(int(frame)) for frame in self.selected]
+        cameras = []
+        for episode, part in enumerate(self.data.parts):
+            rows = np.flatnonzero(self._episodes() == episode)
+            assert part.recording.stereo is not None
+            found = read_right_camera(
+                part.recording.stereo, self.selected[rows] - self.data.first[episode], part.times,
+                [names[row] for row in rows], self.folder / "right", self.progress,
+            )  # fmt: skip
+            cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
+        return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})
 
     def _refuse_bases(self) -> None:
         """Raise NeecoError for a base that is stated to the camera of a scope that moves."""
@@ -268,52 +308,22 @@ class _Ingest:
 
     def _register(self, sfm: SfmResult) -> Registration | None:
         """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
-        data, scope = self.data, self.data.scope
-        if scope is None:
-            data.note(
-                "the laparoscope was not tracked: "
-                + ("instrument poses stay in the tracker's frame (unregistered), and " if data.poses else "")
-                + f"lengths are scaled as if the tissue were {self.settings.scene_distance_mm:g} mm away"
-            )
-            return None
-        given = data.clocks.get(scope.clock)
-        # a clock that images and logs share tells when they were written, motion when they were taken
-        offsets: list[float | None] = [] if given is not None and given.source == "given" else [None]
-        offsets += [] if given is None else [given.seconds]
-        why = ""
-        for offset in offsets:
-            try:
-                registration = register_with_laparoscope(
-                    sfm.world_from_camera, self._times(sfm), scope, offset, self.settings
-                )
-            except NeecoError as error:
-                why = why or str(error)
-                continue
-            if why:
-                data.note(f"the clock {scope.clock!r} is taken as {given.source if given else 'given'}: {why}")
-            data.clocks[scope.clock] = given if why and given is not None else registration.clock
-            return registration
-        data.note(f"not registered, instrument poses stay in the tracker's frame: {why}")
-        return None
+        frames = self.selected[sfm.indices]
+        return register(self.data, sfm.world_from_camera, self._times(sfm), frames, self.settings)
 
     def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
         def load(row: int) -> np.ndarray:
             return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
 
-        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view())
+        episodes = self._episodes()[sfm.indices]
+        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view(), episodes)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
-        unknown = {log.clock: log for log in self.data.poses.values() if log.clock not in self.data.clocks}
-        if not unknown:
-            return
-        self.progress("finding the instrument's clock", 0, 0)
-        moved = self._residual_flow(sfm, pinhole).fastest_motion()
-        for clock, log in unknown.items():
-            try:
-                self.data.clocks[clock] = offset_from_instrument(moved, self._times(sfm), log)
-            except NeecoError as error:
-                self.data.note(str(error))
+        if unknown_clocks(self.data):
+            self.progress("finding the instrument's clock", 0, 0)
+            flow, frames = self._residual_flow(sfm, pinhole), self.selected[sfm.indices]
+            find_instrument_clocks(self.data, flow, self._times(sfm), frames)
 
     def _find_instruments(
         self, sfm: SfmResult, pinhole: Lens, registration: Registration | None
@@ -371,7 +381,7 @@ class _Ingest:
             self.dropped[int(frame)] = "beside an unseen frame"
         capture_frames = tuple(
             Frame(
-                self.folder / "raw" / f"{frames[i]:06d}.png",
+                self._named_image(int(frames[i])),
                 pinhole.camera(cameras[i]),
                 _state(states, i, float(times[i])),
                 splits[i],
@@ -402,14 +412,14 @@ class _Ingest:
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []
         return IngestResult(
             output,
-            str(self.recording.path),
+            ", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
             len(data.times),
             float(1 / np.median(np.diff(data.times))),
             self.size,
             frames[chosen],
             times[chosen],
             tuple(sorted(self.dropped.items())),
-            data.clocks,
+            data.found_clocks,
             registration,
             np.array(registered_rows),
             None if tissue is not None else sfm.reprojection_px,
@@ -423,12 +433,18 @@ class _Ingest:
             self.moving,
             registered,
             self.bases,
+            data.ranges,
         )
+
+    def _named_image(self, frame: int) -> Path:
+        """The image of a frame, under the name that it has in the capture."""
+        image = self.folder / "raw" / f"{frame:06d}.png"  # until now by number: SfM orders images by name
+        return image.rename(image.with_name(f"{self.data.frame_name(frame)}.png"))
 
     def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """`IngestResult.unregistered`, of the `chosen` of frames at times [M] s."""
         assert self.data.scope is not None
-        sensors, _ = self.data.logged_poses(self.data.scope, times[chosen])
+        sensors = self.data.logged_scope(times[chosen])
         return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in states.items()}
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:
@@ -457,9 +473,13 @@ class _Ingest:
             joints = owner
         rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
         readings = {joint: values[usable] for joint, values in joints.items()}
-        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule)
+        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, self.data.ranges)
         if "train" not in assigned:
             raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
+        for name in rule.test_episodes + rule.unseen_episodes:
+            first, last = self.data.ranges[name]
+            if not ((frames[usable] >= first) & (frames[usable] <= last)).any():
+                self.data.note(f"splits: no frame of the episode {name} is in the capture")
         for kind, ranges in (("test", rule.test), ("unseen", rule.unseen)):
             if ranges and kind not in assigned:
                 self.data.note(

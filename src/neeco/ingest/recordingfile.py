@@ -34,6 +34,8 @@ from neeco.ingest.recording import (
 from neeco.ingest.sections import LARGEST, RecordingLoader, Section, close_match
 
 BASE_KEY = "camera_from_base"
+MOST_EPISODES = 500  # of one capture
+_SPLIT_EPISODES = ("test_episodes", "unseen_episodes")
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
 
@@ -46,6 +48,7 @@ def read_recording(path: Path) -> Recording:
         "images",
         "camera",
         "stereo",
+        "episodes",
         "intrinsics",
         "instruments",
         BASE_KEY,
@@ -68,7 +71,7 @@ def read_recording(path: Path) -> Recording:
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
         top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
-        camera, _stereo(top),
+        camera, _stereo(top), _episodes(top),
     )  # fmt: skip
 
 
@@ -258,6 +261,19 @@ def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree |
     return tree
 
 
+def _episodes(top: Section) -> tuple[int, ...]:
+    """The numbers under `episodes`: a list of numbers and ranges such as "3-7"."""
+    ranges = top.ranges("episodes")
+    count = sum(last + 1 - first for first, last in ranges)
+    if count > MOST_EPISODES:
+        raise top.error("episodes", f"{count} are too many for one capture; list {MOST_EPISODES} at most")
+    numbers = [number for first, last in ranges for number in range(first, last + 1)]
+    twice = next((number for number in numbers if numbers.count(number) > 1), None)
+    if twice is not None:
+        raise top.error("episodes", f"{twice} is listed twice; list each once")
+    return tuple(numbers)
+
+
 def _joints_of(section: Section) -> dict[str, Any]:
     value = section.value.get("joints")
     if value is None:
@@ -405,7 +421,14 @@ def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | N
     fraction, every = section.number("unseen_fraction", least=0.0, below=0.9), section.integer("test_every", 0)
     given: dict[str, Any] = {} if fraction is None else {"unseen_fraction": fraction}
     given |= {} if every is None else {"test_every": every}
+    episodes = {key: section.names(key, tuple(range(1, MOST_EPISODES + 1))) or () for key in _SPLIT_EPISODES}
+    given |= {key: tuple(_episode_name(name) for name in names) for key, names in episodes.items()}
     return Splits(unseen_by=by, test=section.ranges("test"), unseen=section.ranges("unseen"), **given)
+
+
+def _episode_name(name: str) -> str:
+    """An episode of a data set may be named by its number alone."""
+    return f"episode_{name}" if name.isdecimal() else name
 
 
 def _settings(top: Section) -> IngestSettings:

@@ -5,7 +5,7 @@ The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,10 +59,15 @@ class RightCamera:
 
 
 def read_right_camera(
-    partner: StereoPartner, selected: np.ndarray, times: np.ndarray, folder: Path, progress: StageProgress
+    partner: StereoPartner,
+    selected: np.ndarray,
+    times: np.ndarray,
+    stems: Sequence[str],
+    folder: Path,
+    progress: StageProgress,
 ) -> RightCamera:
-    """Write the right camera's images at the `selected` [K] video frames, undistorted, into `folder`. times [V] s: of
-    the left video's frames. The two videos begin together. Raises NeecoError."""
+    """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
+    `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
     _, lens, right_from_left = read_stereo(partner.calibration)
     video = partner.open()
     lens.check_size(video.size, partner.calibration)
@@ -73,7 +78,7 @@ def read_right_camera(
             f"{video.path}: {len(video.times)} frames, the left video has {len(times)}: they show {len(rows)} of the "
             f"{len(selected)} chosen moments together; give the videos of one recording"
         )
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
         image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), BORDER_SAMPLES)])
@@ -86,7 +91,7 @@ def read_right_camera(
     for done, (frame, image) in enumerate(video.read(sample)):
         progress("writing the right camera's frames", done, len(rows))
         row = rows[frame]
-        names[row] = f"{int(selected[row]):06d}_right.png"
+        names[row] = f"{stems[row]}_right.png"
         write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
     return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, visible, mask)
 
