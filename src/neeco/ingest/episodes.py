@@ -380,7 +380,7 @@ def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
     if mine.kinematics != theirs.kinematics:
         return "kinematics are"
     if not same_base(mine.base, theirs.base):
-        return "camera_from_base is"
+        return "the place of its base is"
     return None
 
 

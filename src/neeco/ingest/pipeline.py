@@ -21,10 +21,11 @@ from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.episodes import Episodes, separate
-from neeco.ingest.find_bases import place_bases
+from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
+from neeco.ingest.passing import passing_masks
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
 from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
@@ -77,8 +78,7 @@ class _Ingest:
         """Find cameras, registration and states, and write the capture."""
         if self._is_still():
             return self._run_still(output)
-        self._refuse_camera_frames()
-        self._refuse_bases()
+        refuse_frames(self.data, moving=True)
         self.motion = StructureFromMotion(
             self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
             self.visible, self.settings, self._episodes(),
@@ -96,6 +96,7 @@ class _Ingest:
             self._write_visible()
         registration = self._register(sfm)
         self._find_instrument_clocks(sfm, self.pinhole)
+        self._place_bases_seen_from(sfm, self.pinhole, registration)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
         return self._finish(output, sfm, self.pinhole, self._register(sfm), shapes)
@@ -128,15 +129,6 @@ class _Ingest:
         """uint8 [H, W, 3], one of the chosen frames."""
         return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
 
-    def _refuse_camera_frames(self) -> None:
-        """Raise NeecoError for poses in the frame of a camera that moves."""
-        for name, log in self.data.poses.items():
-            if log.frame == CAMERA:
-                raise NeecoError(
-                    f"{self.recording.path}: instruments: {name}: poses in the camera's frame need a scope that stands "
-                    "still, and this one moves; give poses in a frame that stays, and the scope's own (laparoscope)"
-                )
-
     def _run_still(self, output: Path) -> IngestResult:
         """The same for a scope that stands still: its frame is the world."""
         data, pinhole = self.data, self.pinhole
@@ -149,6 +141,7 @@ class _Ingest:
             data.note(
                 "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
             )
+        refuse_frames(self.data, moving=False)
         self._refuse_other_places()
         right = self._right_camera()
         cameras = still_cameras(len(self.names))
@@ -184,25 +177,42 @@ class _Ingest:
         for name, log in data.poses.items():
             if log.frame == CAMERA:
                 data.world_from_base[name] = np.eye(4)
-        if any(item.base is not None for item in self.recording.instruments):
-            self.progress("finding the robot's base", 0, 0)
-            placed = place_bases(
-                data, self._times(cameras), cameras.world_from_camera, pinhole,
-                lambda rows: moving_masks(self._load, len(self.names), rows, visible),
-                None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255,
-            )  # fmt: skip
-            for name, base in placed.items():
-                data.world_from_base[name] = base.world_from_base
-                if base.clock is not None:
-                    data.move_clock(data.poses[name].clock, base.clock)
-                if base.found is not None:
-                    self.bases[name] = base.found
+        self._find_bases(
+            cameras.world_from_camera, self._times(cameras), pinhole,
+            lambda rows: moving_masks(self._load, len(self.names), rows, visible),
+        )  # fmt: skip
         unplaced = [name for name in data.poses if name not in data.world_from_base]
         if unplaced:
             data.note(
                 f"nothing says how the poses of {', '.join(unplaced)} stand to the camera (poses: {{frame: camera}}, "
                 "or camera_from_base): they stay in their own frame (unregistered)"
             )
+
+    def _place_bases_seen_from(self, sfm: SfmResult, pinhole: Lens, registration: Registration | None) -> None:
+        """The same for a scope that moves, whose tracker's frame is the world. Raises NeecoError where nothing ties the
+        cameras to it."""
+        if registration is None:
+            require_no_base(self.data)
+            return
+        flow, rows = self._residual_flow(sfm, pinhole), sfm.indices
+        self._find_bases(
+            registration.cameras(sfm.world_from_camera), self._times(sfm), pinhole,
+            lambda some: passing_masks(self._loader(rows), flow, some, self.settings.moving_px, self._field_of_view()),
+        )  # fmt: skip
+
+    def _find_bases(
+        self,
+        cameras: np.ndarray,
+        times: np.ndarray,
+        pinhole: Lens,
+        moving: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        """Take the bases as stated, or find them from what moves; see `place_bases`."""
+        if any(item.base is not None for item in self.recording.instruments):
+            self.progress("finding the robot's base", 0, 0)
+            visible = self._field_of_view()
+            hidden = None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255
+            self.bases = take_bases(self.data, times, cameras, pinhole, moving, hidden)
 
     def _right_camera(self) -> RightCamera | None:
         if self.recording.stereo is None:
@@ -218,15 +228,6 @@ class _Ingest:
             )  # fmt: skip
             cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
         return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})
-
-    def _refuse_bases(self) -> None:
-        """Raise NeecoError for a base that is stated to the camera of a scope that moves."""
-        for item in self.recording.instruments:
-            if item.base is not None:
-                raise NeecoError(
-                    f"{self.recording.path}: camera_from_base: the base of {item.name} stands still to the camera only "
-                    "if the scope stands still; leave it out and give the poses in the laparoscope's frame"
-                )
 
     def _read_lens(self) -> Lens | None:
         """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""

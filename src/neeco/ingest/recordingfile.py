@@ -33,7 +33,7 @@ from neeco.ingest.recording import (
 )
 from neeco.ingest.sections import LARGEST, RecordingLoader, Section, close_match
 
-BASE_KEY = "camera_from_base"
+BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
 MOST_EPISODES = 500  # of one capture
 _SPLIT_EPISODES = ("test_episodes", "unseen_episodes")
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
@@ -52,6 +52,7 @@ def read_recording(path: Path) -> Recording:
         "intrinsics",
         "instruments",
         BASE_KEY,
+        WORLD_KEY,
         "laparoscope",
         "sync",
         "frames",
@@ -187,7 +188,7 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
     if not isinstance(value, list):
         raise top.error("instruments", "must be a list; begin each instrument with `- name:`")
     sections = [
-        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY))
+        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY, WORLD_KEY))
         for i, item in enumerate(value)
     ]
     names = [section.text("name", required=True) for section in sections]
@@ -202,7 +203,8 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
-        base = _base(section if section.node.has(BASE_KEY) else top, columns)
+        own = section.node.has(BASE_KEY) or section.node.has(WORLD_KEY)
+        base = _base(section if own else top, columns)
         found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints)), base))
     return tuple(found)
 
@@ -227,13 +229,17 @@ def _check_one_clock(
 
 def _base(section: Section, poses: PoseColumns | None) -> StatedBase | None:
     """What an instrument, or the whole recording, says of the base."""
-    if poses is None or not section.node.has(BASE_KEY):
+    given = [key for key in (BASE_KEY, WORLD_KEY) if section.node.has(key)]
+    if poses is None or not given:
         return None
+    if len(given) > 1:
+        raise section.error(WORLD_KEY, f"{BASE_KEY} is given, too; keep the one that it stands still to")
     if poses.frame == named.CAMERA:
         if section.place:
-            raise section.error(BASE_KEY, "its poses are in the camera's frame already; leave out one of the two")
+            raise section.error(given[0], "its poses are in the camera's frame already; leave out one of the two")
         return None
-    return parse_base(section.node.child(BASE_KEY), section.file.parent)
+    base = parse_base(section.node.child(given[0]), section.file.parent)
+    return replace(base, to_world=given[0] == WORLD_KEY)
 
 
 def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:
