@@ -77,7 +77,7 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0, to_world=True))
     cameras = np.linalg.inv(world.camera_from_world)
     placed = place_bases(data, world.times, cameras, LENS, lambda rows: world.masks[rows])["psm1"]
-    assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 0.8
+    assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
