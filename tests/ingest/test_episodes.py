@@ -180,8 +180,8 @@ def test_a_recording_that_does_not_join_the_others_is_named(recorded, tmp_path: 
 def test_several_recordings_are_given_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = still_recordings(tmp_path, (1, 1))
     assert run(Ingest(tuple(paths), output=tmp_path / "capture")) == 0
-    told = capsys.readouterr().out
-    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in told
+    printed = capsys.readouterr().out
+    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in printed
     assert (tmp_path / "capture" / "ingest.html").is_file()
 
 

@@ -218,8 +218,8 @@ def _print(result: IngestResult) -> None:
     numbers = result.as_json()
     print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
     for name, (first, last) in result.episodes.items():
-        kept = int(((result.selected >= first) & (result.selected <= last)).sum())
-        print(f"episode {name}: {kept} of {last + 1 - first} frames kept")
+        count = int(((result.selected >= first) & (result.selected <= last)).sum())
+        print(f"episode {name}: {count} of {last + 1 - first} frames kept")
     if result.still:
         print(f"still scope: the world is its camera's frame; the tissue's depth is {result.tissue}")
     if not result.registered:

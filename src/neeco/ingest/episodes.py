@@ -69,9 +69,9 @@ class Episodes:
         """What was lost or assumed, one sentence each; what is of one episode names it."""
         if self.single:
             return self.parts[0].notes
-        told = [(name, note) for name, part in zip(self.names, self.parts, strict=True) for note in part.notes]
-        everywhere = {note for _, note in told if all(note in part.notes for part in self.parts)}
-        own = [note if note in everywhere else f"{name}: {note}" for name, note in told]
+        named = [(name, note) for name, part in zip(self.names, self.parts, strict=True) for note in part.notes]
+        everywhere = {note for _, note in named if all(note in part.notes for part in self.parts)}
+        own = [note if note in everywhere else f"{name}: {note}" for name, note in named]
         return list(dict.fromkeys([*own, *self._notes]))
 
     def note(self, note: str, episode: int | None = None) -> None:

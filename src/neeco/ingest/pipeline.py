@@ -31,7 +31,7 @@ from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
 from neeco.ingest.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
-from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
+from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
 from neeco.ingest.synchronized import States
 
 
@@ -391,7 +391,7 @@ class _Ingest:
             for i in chosen.tolist()
         )
         if right is not None:  # one camera more to learn from; what is tested stays one
-            capture_frames += _seen_by(right, capture_frames, sfm.indices[chosen].tolist())
+            capture_frames += seen_by(right, capture_frames, sfm.indices[chosen].tolist())
         reliable = sfm.reliable_points()
         if not reliable.any():
             reliable = np.ones(len(sfm.points), dtype=bool)
@@ -490,16 +490,6 @@ class _Ingest:
         splits = np.full(len(frames), LEFT_OUT, dtype=object)
         splits[usable] = assigned
         return splits, words
-
-
-def _seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
-    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
-    camera = right.pinhole.camera(right.world_from_camera)
-    return tuple(
-        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
-        for frame, row in zip(frames, rows, strict=True)
-        if frame.split == "train" and row in right.names
-    )
 
 
 def _state(states: States, row: int, time: float) -> State:

@@ -51,8 +51,8 @@ def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
     stay = []
     for step in {1, len(grey) // 3, len(grey) // 2, 2 * len(grey) // 3} - {0}:
         stay += [_share_in_place(first, second) for first, second in zip(grey, grey[step:], strict=False)]
-    told = np.array([share for share in stay if share is not None])
-    return len(told) > 0 and float(np.mean(told > STILL_SHARE)) > STILL_PAIRS
+    shares = np.array([share for share in stay if share is not None])
+    return len(shares) > 0 and float(np.mean(shares > STILL_SHARE)) > STILL_PAIRS
 
 
 def same_place(first: np.ndarray, second: np.ndarray) -> float | None:

@@ -6,7 +6,7 @@ The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,7 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Lens
-from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import STEP, RoughShape, carve_shape, project_mask
@@ -94,6 +94,16 @@ def read_right_camera(
         names[row] = f"{stems[row]}_right.png"
         write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
     return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, visible, mask)
+
+
+def seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
+    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
+    camera = right.pinhole.camera(right.world_from_camera)
+    return tuple(
+        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
+        for frame, row in zip(frames, rows, strict=True)
+        if frame.split == "train" and row in right.names
+    )
 
 
 def _nearest(right: np.ndarray, left: np.ndarray, frame: int, count: int) -> int:
