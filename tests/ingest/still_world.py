@@ -50,7 +50,7 @@ class Theatre:
 
     def write(self, **changes: object) -> Path:
         """recording.yaml with everything it names; `changes` to its keys (None: left out)."""
-        for name, right in (("left", False), ("right", True)):
+        for name, right in (("left", False), ("right", True))[: 2 if "stereo" in changes else 1]:
             for number in range(FRAMES):
                 pixels = torch.from_numpy(self.image(number, right).astype(np.float32) / 255)
                 write_image(self.folder / name / f"{number:03d}.png", pixels)

@@ -12,9 +12,10 @@ from rendered_truth import benchmarks  # noqa: F401
 
 from neeco.capture import Capture, read_capture
 from neeco.capture.check import inspect_capture
-from neeco.cli.ingest import Ingest, run
+from neeco.cli.ingest import Ingest, print_result, recordings_of, run
 from neeco.errors import NeecoError
 from neeco.ingest.episodes import PAUSE_S, Episodes, episode_names, separate
+from neeco.ingest.frame_selection import assign_splits
 from neeco.ingest.interpolate import poses_at
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recording import Recording
@@ -51,8 +52,13 @@ def ingested(paths: list[Path], output: Path) -> Capture:
     return read_capture(ingest([read_recording(path) for path in paths], output, silent).capture)
 
 
-def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(tmp_path: Path) -> None:
-    capture = ingested(still_recordings(tmp_path), tmp_path / "capture")
+def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = ingest([read_recording(path) for path in still_recordings(tmp_path, (1, 1))], tmp_path / "capture", silent)
+    print_result(result)
+    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in capsys.readouterr().out
+    capture = read_capture(result.capture)
     assert capture.still
     assert capture.registered
     theatre = Theatre(tmp_path)
@@ -64,18 +70,20 @@ def test_recordings_of_a_still_scope_become_one_capture_with_every_pose_in_its_p
         assert frame.state.time == pytest.approx(episode * length + number / RATE)
         place = frame.state.instruments["bar"].pose[:3, 3].numpy()
         assert np.abs(place - theatre.place(BEGINS[episode] + number / RATE)).max() < 0.05
-        assert frame.split == ("test" if episode == 2 else "train")  # it never turns: nothing is unseen
+        assert frame.split == ("test" if episode == 1 else "train")  # it never turns: nothing is unseen
         seen.add(episode)
-    assert seen == {0, 1, 2}
+    assert seen == {0, 1}
     assert not inspect_capture(tmp_path / "capture").problems
 
 
 def test_the_recording_names_whole_episodes_to_test(tmp_path: Path) -> None:
-    paths = still_recordings(tmp_path, splits={"test_episodes": ["take_0"], "unseen_episodes": ["take_1"]})
-    capture = ingested(paths, tmp_path / "capture")
-    assert {(frame.name[:6], frame.split) for frame in capture.frames} == {
-        ("take_0", "test"), ("take_1", "unseen"), ("take_2", "train"),
-    }  # fmt: skip
+    splits = {"test_episodes": ["take_0"], "unseen_episodes": ["take_1"]}
+    data = Episodes([read_recording(path) for path in still_recordings(tmp_path, splits=splits)], silent)
+    frames, rule = np.arange(len(data.times)), data.recording.splits
+    assert rule is not None
+    names, words = assign_splits(frames, np.tile(np.eye(4), (len(frames), 1, 1)), {}, rule, data.ranges)
+    assert names.tolist() == ["test"] * FRAMES + ["unseen"] * FRAMES + ["train"] * FRAMES
+    assert words == "test: the recording take_0; unseen: the recording take_1"
 
 
 def test_the_right_camera_of_every_recording_is_one_view_more(tmp_path: Path) -> None:
@@ -158,7 +166,7 @@ def test_logs_on_the_joint_timeline_say_what_each_says_on_its_own(tmp_path: Path
 def test_recordings_of_a_moving_scope_are_registered_together_each_by_its_own_clock(recorded, tmp_path: Path) -> None:
     path = recorded.folder / "recording.yaml"
     text = path.read_text().replace("sync: sync.json\n", "sync: {jaw_angle: -0.01}\n")
-    path.write_text(text.replace("registration_steps: 1", "registration_steps: 15"))
+    path.write_text(text.replace("registration_steps: 1", "registration_steps: 8"))
     one, length = recorded.cameras, recorded.frames / 25
     recorded.cameras = lambda times: one(np.mod(times + 1e-9, length))  # the second shows the same again
     result = ingest([read_recording(path)] * 2, tmp_path / "capture", silent)
@@ -177,12 +185,17 @@ def test_a_recording_that_does_not_join_the_others_is_named(recorded, tmp_path: 
         ingest([read_recording(path)] * 2, tmp_path / "capture", silent)
 
 
-def test_several_recordings_are_given_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_recordings_are_given_on_the_command_line(tmp_path: Path) -> None:
     paths = still_recordings(tmp_path, (1, 1))
-    assert run(Ingest(tuple(paths), output=tmp_path / "capture")) == 0
-    printed = capsys.readouterr().out
-    assert f"episode take_1: {FRAMES} of {FRAMES} frames kept" in printed
-    assert (tmp_path / "capture" / "ingest.html").is_file()
+    assert [recording.path for recording in recordings_of(Ingest(tuple(paths)))] == paths
+    for sources, words in [
+        ((paths[0], tmp_path), "is a folder; of several recordings give each recording.yaml"),
+        ((paths[0], paths[1].parent), "holds a recording; give the file"),
+    ]:
+        with pytest.raises(NeecoError, match=words):
+            run(Ingest(sources, output=tmp_path / "capture"))
+    with pytest.raises(NeecoError, match="--init: looks at one folder or file"):
+        run(Ingest(tuple(paths), init=True))
 
 
 class TestEpisodesOfADataSet:

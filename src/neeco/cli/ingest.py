@@ -88,7 +88,7 @@ def run(args: Ingest) -> int:
                 raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
             _refuse_beside(args, f"{source}: a folder in another format", keep=("output",))
             return _convert(source, output)
-    return _ingest(_recordings(args), output, args.rrd, args.json)
+    return _ingest(recordings_of(args), output, args.rrd, args.json)
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
@@ -138,7 +138,8 @@ def _convert(folder: Path, output: Path) -> int:
     return 0
 
 
-def _recordings(args: Ingest) -> list[Recording]:
+def recordings_of(args: Ingest) -> list[Recording]:
+    """The recordings that the words name. Raises NeecoError naming the option."""
     from neeco.errors import NeecoError
     from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
 
@@ -204,7 +205,7 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
     if as_json:
         print(json.dumps(result.as_json(), indent=2))
         return 0
-    _print(result)
+    print_result(result)
     for problem in errors_only(problems):
         print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
@@ -214,7 +215,8 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
     return 0
 
 
-def _print(result: IngestResult) -> None:
+def print_result(result: IngestResult) -> None:
+    """What an ingest found, in lines."""
     numbers = result.as_json()
     print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
     for name, (first, last) in result.episodes.items():
