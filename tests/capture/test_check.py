@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import shutil
@@ -247,6 +248,25 @@ def test_missing_or_backward_time_is_only_a_warning(folder, time_):
     folder.edit(_frame(3, "time", time_))
     assert problems(folder) == []
     assert any("time" in problem.message for problem in problems(folder, "warning"))
+
+
+def _seen_again(document, shift_mm, later_mm=0.0):
+    """Every frame once more, after all others, by a camera `shift_mm` beside; the instrument `later_mm` on."""
+    for frame in copy.deepcopy(document["frames"]):
+        frame["file_path"] = frame["file_path"].replace(".png", "_again.png")
+        frame["transform_matrix"][0][3] += shift_mm
+        frame["instruments"][0]["pose"][0][3] += later_mm
+        document["frames"].append(frame)
+
+
+@pytest.mark.parametrize(("shift_mm", "later_mm", "warned"), [(4.0, 0.0, False), (0.0, 0.0, True), (4.0, 1.0, True)])
+def test_time_does_not_go_back_where_another_camera_sees_the_same_instants(folder, shift_mm, later_mm, warned):
+    for image in sorted((folder.root / "images").glob("*.png")):
+        pixels = np.asarray(Image.open(image)).copy()
+        pixels[0, 0] ^= 1
+        Image.fromarray(pixels).save(image.with_name(f"{image.stem}_again.png"))
+    folder.edit(lambda document: _seen_again(document, shift_mm, later_mm))
+    assert warned == any("time goes backwards" in problem.message for problem in problems(folder, "warning"))
 
 
 def test_bad_points_are_errors_and_few_a_warning(folder):

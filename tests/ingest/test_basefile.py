@@ -31,9 +31,9 @@ def _recording(tmp_path, base=None, default=None, frame=None):
 def test_a_rough_base_has_a_transform_and_how_far_it_may_be_off(tmp_path):
     rough = {"transform": MILLIMETRES, "sd_mm": 8, "sd_deg": 5}
     first, second = _recording(tmp_path, rough, "unknown")
-    assert np.array_equal(first.base.camera_from_base, MILLIMETRES)
+    assert np.array_equal(first.base.matrix, MILLIMETRES)
     assert (first.base.sd_mm, first.base.sd_deg, first.base.exact) == (8, 5, False)
-    assert second.base.camera_from_base is None  # what stands at the top holds for all that say nothing
+    assert second.base.matrix is None  # what stands at the top holds for all that say nothing
 
 
 def test_a_transform_alone_is_exact(tmp_path):
@@ -50,9 +50,9 @@ def test_a_registration_of_the_dvrk_is_in_metres_and_one_in_its_own_axes_is_turn
     (tmp_path / "PSM1-registration-open-cv.json").write_text('{\n"base-frame": ' + json.dumps(FRAME) + "\n}\n")
     (tmp_path / "PSM1-registration-dVRK.json").write_text('"base-frame": ' + json.dumps(FRAME) + "\n")
     base = _recording(tmp_path, "PSM1-registration-open-cv.json")[0].base
-    assert np.allclose(base.camera_from_base, MILLIMETRES)
+    assert np.allclose(base.matrix, MILLIMETRES)
     assert (base.sd_mm, base.sd_deg) == (8.0, 5.0)
-    turned = read_dvrk_registration(tmp_path / "PSM1-registration-dVRK.json").camera_from_base
+    turned = read_dvrk_registration(tmp_path / "PSM1-registration-dVRK.json").matrix
     assert np.allclose(np.diag([-1, -1, 1, 1]) @ turned, MILLIMETRES)
 
 

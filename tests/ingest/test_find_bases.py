@@ -69,3 +69,19 @@ def test_what_shows_no_shaft_names_the_recording():
     with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
         place_bases(data, world.times, STILL, LENS, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
     assert LENS.intrinsics == INTRINSICS
+
+
+@pytest.mark.slow
+def test_a_rough_base_is_found_before_a_scope_that_moves():
+    world = make_world(44, moving_camera=True)
+    data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0, to_world=True))
+    cameras = np.linalg.inv(world.camera_from_world)
+    placed = place_bases(data, world.times, cameras, LENS, lambda rows: world.masks[rows])["psm1"]
+    assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
+
+
+def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
+    world = make_world(44, moving_camera=True)
+    data = _data(world, StatedBase(WORLD_FROM_BASE, to_world=True))
+    placed = place_bases(data, world.times, np.linalg.inv(world.camera_from_world), LENS, _no_masks)["psm1"]
+    assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)

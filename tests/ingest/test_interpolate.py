@@ -116,3 +116,28 @@ def test_constant_readings_stay():
     log = ReadingLog(Path("log.csv"), "jaw", np.arange(100) / 50, np.full(100, 0.4))
     values, _ = readings_at(log, np.linspace(0, 1.9, 33))
     np.testing.assert_allclose(values, 0.4, atol=1e-9)
+
+
+def test_a_log_too_coarse_for_its_motion_is_taken_as_it_is():
+    times = np.arange(60) / 5.0
+    truth = lambda seconds: 0.6 + 0.5 * np.sin(5 * seconds)  # noqa: E731 a jaw that opens within three samples
+    noise = np.random.default_rng(0).normal(0, 0.003, len(times))
+    log = ReadingLog(Path("jaw.csv"), "jaw", times, truth(times) + noise)
+    assert reading_smoothing(log).position_s == 0
+    np.testing.assert_allclose(readings_at(log, times)[0], log.values, atol=1e-12)
+    queries = np.linspace(0.5, 11.2, 200)
+    off = np.abs(readings_at(log, queries)[0] - truth(queries))
+    assert off.mean() < 0.3 * np.abs(np.interp(queries, times, log.values) - truth(queries)).mean()
+
+
+def test_turns_of_a_coarse_log_are_followed_through_its_samples():
+    times = np.arange(50) / 5.0
+
+    def turns(seconds):
+        return Rotation.from_euler("XYZ", np.stack([np.sin(3 * seconds), 0.6 * np.cos(2 * seconds), seconds], 1))
+
+    log = PoseLog(Path("log.csv"), "em", times, np.zeros((50, 3)), turns(times).as_quat()[:, [3, 0, 1, 2]])
+    assert pose_smoothing(log).rotation_s == 0
+    queries = np.linspace(0.5, 9.0, 100)
+    off = (Rotation.from_matrix(poses_at(log, queries)[0][:, :3, :3]).inv() * turns(queries)).magnitude()
+    assert off.max() < 0.02

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from neeco.errors import NeecoError
 from neeco.ingest.columns import CAMERA as CAMERA_FRAME
 from neeco.ingest.columns import PoseColumns, Units
+from neeco.ingest.episodes import separate
 from neeco.ingest.formats import format_of, read_table
 from neeco.ingest.logs import read_pose_log
 from neeco.ingest.recordingfile import read_recording
@@ -220,6 +221,8 @@ def test_a_template_names_every_arm_with_its_jaw(plain):
     assert first.form == "quaternion_wxyz"
     assert [dict(item.joints)["jaw"].value for item in recording.instruments] == ["psm1_jaw", "psm2_jaw"]
     assert {log.clock for log in (first, second)} == {"video"}
+    place.write_text(text.replace('# episodes: ["0-', 'episodes: ["0-'))
+    assert [item.episode for item in separate([read_recording(place)])] == [f"episode_{n}" for n in range(3)]
     assert "# frame: camera   # or base" in text
     with pytest.raises(NeecoError, match="frame: nothing says"):
         read_pose_log(first)

@@ -170,3 +170,49 @@ def test_logs_that_never_meet_the_video_are_refused_before_any_work(recording: P
     recording.write_text(yaml.safe_dump(document))
     with pytest.raises(NeecoError, match=r"jaw\.csv: its times .* do not meet the video's"):
         ingest(read_recording(recording), tmp_path / "capture", silent)
+
+
+def test_an_arm_in_another_base_than_the_scopes_is_where_it_would_be_in_the_same(recorded, tmp_path):
+    plain = read_capture(ingest(read_recording(recorded.folder / "recording.yaml"), tmp_path / "one", silent).capture)
+    base = np.eye(4)  # world_from_base
+    base[:3, :3], base[:3, 3] = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), [30, -200, 90]
+    _restate(recorded, np.linalg.inv(base), {"world_from_base": {"transform": base.tolist()}})
+    other = read_capture(ingest(read_recording(recorded.folder / "recording.yaml"), tmp_path / "two", silent).capture)
+    assert other.registered
+    held = {frame.name: frame.state.instruments["grasper"].pose for frame in plain.frames}
+    both = [frame for frame in other.frames if frame.name in held]
+    assert len(both) > 0.9 * len(plain.frames)
+    for frame in both:
+        np.testing.assert_allclose(frame.state.instruments["grasper"].pose, held[frame.name], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"camera_from_base": {"transform": np.eye(4).tolist()}}, "camera_from_base: the scope moves, and the base of"),
+        ({"world_from_base": "unknown", "laparoscope": None}, "world_from_base: where the base of grasper stands can"),
+        (
+            {"world_from_base": {"transform": np.eye(4).tolist()}, "camera": "still", "laparoscope": None},
+            "world_from_base: the scope stands still; state the base of grasper to its camera",
+        ),
+        ({"world_from_base": "unknown", "camera_from_base": "unknown"}, "world_from_base: camera_from_base is given"),
+    ],
+)
+def test_a_base_is_stated_to_what_stands_still(recorded, tmp_path, keys, words):
+    _restate(recorded, np.eye(4), keys)
+    with pytest.raises(NeecoError, match=words):
+        ingest(read_recording(recorded.folder / "recording.yaml"), tmp_path / "capture", silent)
+    assert not (tmp_path / "capture").exists()
+
+
+def _restate(recorded, base_from_world, keys):
+    """The instrument's log in another base, and more keys in the recording (None: without them)."""
+    log = recorded.folder / "instrument.csv"
+    header, *lines = log.read_text().splitlines()
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines])
+    turns = Rotation.from_matrix(base_from_world[:3, :3]) * Rotation.from_quat(rows[:, 4:], scalar_first=True)
+    places = rows[:, 1:4] @ base_from_world[:3, :3].T + base_from_world[:3, 3]
+    recorded.world.write(header, np.column_stack([rows[:, 0], places, turns.as_quat(scalar_first=True)]), log.name)
+    path = recorded.folder / "recording.yaml"
+    document = yaml.safe_load(path.read_text()) | keys
+    path.write_text(yaml.safe_dump({key: value for key, value in document.items() if value is not None}))

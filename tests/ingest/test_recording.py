@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from ingest.conftest import POSE_HEADER
 from PIL import Image
 
 from neeco.errors import NeecoError
@@ -84,6 +85,24 @@ def test_init_asks_for_what_no_header_says(world):
     assert instrument.name == "aurora tool"
     assert list(instrument.joints) == ["gripper_angle"]
     assert instrument.poses.rate_hz == 40
+
+
+def test_inits_lines_on_a_still_scope_and_its_second_camera_are_right_once_they_count(world):
+    for name in ("left.mp4", "right.mp4"):
+        (world.folder / name).write_bytes(b"film")
+    world.text("calibration", "stereo.yaml")
+    world.write(POSE_HEADER, world.rows(), "tool.csv")
+    lines = write_template(world.folder).splitlines()
+    counting = [
+        line.removeprefix("# ") if line.startswith(("# camera: still", "# stereo:")) else line for line in lines
+    ]
+    assert counting != lines
+    (world.folder / "recording.yaml").write_text("\n".join(counting).replace("intrinsics: stereo.yaml", ""))
+    recording = read_recording(world.folder / "recording.yaml")
+    assert recording.camera == "still"
+    assert recording.video == world.folder / "left.mp4"
+    assert recording.stereo.video == world.folder / "right.mp4"
+    assert recording.stereo.calibration == world.folder / "stereo.yaml"
 
 
 def test_init_of_images_alone(world):
@@ -186,7 +205,7 @@ def test_links_that_are_none_are_told_with_their_key(world, folder, words, messa
 def test_a_recording_without_settings_or_rules_has_the_usual_ones(world, folder):
     recording = read_recording(world.text("video: video.mp4\nsplits: {test: [3]}\n", "recording.yaml"))
     assert recording.settings == IngestSettings()
-    assert recording.splits == Splits(8, 0.15, None, ((3, 3),))
+    assert recording.splits == Splits(None, 0.15, None, ((3, 3),))
 
 
 @pytest.mark.parametrize(

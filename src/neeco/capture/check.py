@@ -27,6 +27,7 @@ from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentSta
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.statefile import passes_limits
 from neeco.errors import NeecoError
+from neeco.raster.types import Camera
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
@@ -137,10 +138,15 @@ def _check_frames(parsed: Parsed) -> None:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
     latest: dict[str, float] = {}
     back = []
+    instants: dict[tuple[object, ...], Camera] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
-        if frame.state.time < latest.get(place.file, frame.state.time):
+        time, poses = frame.state.time, [state.pose.numpy().tobytes() for state in frame.state.instruments.values()]
+        seen_by = instants.setdefault((place.file, time, *poses), frame.camera)
+        if seen_by is not frame.camera and not _same_view(seen_by, frame.camera):
+            continue  # another camera saw the instant
+        if time < latest.get(place.file, time):
             back.append(place)
-        latest[place.file] = frame.state.time
+        latest[place.file] = time
     if not parsed.timed:
         frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
     elif back:
@@ -326,6 +332,11 @@ def _check_coupling(parsed: Parsed, name: str, known: Sequence[str], states: Seq
         if explained > COUPLED:
             message = f"joint {printable(joint)} of {name} follows from the others ({explained:.1%} of its variance)"
             parsed.header("instruments").warning(message, "move joints one by one, too, or their axes mix")
+
+
+def _same_view(one: Camera, other: Camera) -> bool:
+    intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in (one, other)]
+    return intrinsics[0] == intrinsics[1] and torch.equal(one.world_from_camera, other.world_from_camera)
 
 
 def _check_still(parsed: Parsed) -> None:

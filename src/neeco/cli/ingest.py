@@ -25,9 +25,9 @@ CHOICES = "recording_choices.png"
 class Ingest:
     """Make a capture from a recording: video and tracker logs; says how good it is in CAPTURE/ingest.html."""
 
-    source: Annotated[Path | None, tyro.conf.Positional] = None
-    """recording.yaml, or a folder in another format to convert (nerfstudio, Blender, COLMAP, EndoNeRF); with --init, a
-    recording's folder or file."""
+    source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """recording.yaml, or several of one instrument for one capture; or a folder in another format to convert
+    (nerfstudio, Blender, COLMAP, EndoNeRF); with --init, a recording's folder or file."""
     output: Path | None = None
     """Folder of the capture to write; must not exist."""
     video: Path | None = None
@@ -69,21 +69,26 @@ def run(args: Ingest) -> int:
         return _list_formats()
     if args.init:
         _refuse_beside(args, "--init", keep=())
-        return _init(args.source or Path())
+        if len(args.source) > 1:
+            raise NeecoError("--init: looks at one folder or file; give one")
+        return _init(args.source[0] if args.source else Path())
     output = args.output and Path(os.path.normpath(args.output))  # a/../b is b, whatever a is
     if output is None:
         raise NeecoError("--output: give the folder of the capture to write")
-    if args.source is not None and (known := format_of(args.source)) is not None and args.source.exists():
-        raise NeecoError(
-            f"{args.source}: is in a recording's format ({known.format}) but says not what is what in it; write that "
-            f"down first: neeco ingest --init {args.source}"
-        )
-    if args.source is not None and args.source.is_dir():
-        if (args.source / RECORDING).is_file():
-            raise NeecoError(f"{args.source}: holds a recording; give the file: {args.source / RECORDING}")
-        _refuse_beside(args, f"{args.source}: a folder in another format", keep=("output",))
-        return _convert(args.source, output)
-    return _ingest(_recording(args), output, args.rrd, args.json)
+    for source in args.source:
+        if (known := format_of(source)) is not None and source.exists():
+            raise NeecoError(
+                f"{source}: is in a recording's format ({known.format}) but says not what is what in it; write that "
+                f"down first: neeco ingest --init {source}"
+            )
+        if source.is_dir():
+            if (source / RECORDING).is_file():
+                raise NeecoError(f"{source}: holds a recording; give the file: {source / RECORDING}")
+            if len(args.source) > 1:
+                raise NeecoError(f"{source}: is a folder; of several recordings give each recording.yaml")
+            _refuse_beside(args, f"{source}: a folder in another format", keep=("output",))
+            return _convert(source, output)
+    return _ingest(recordings_of(args), output, args.rrd, args.json)
 
 
 def _refuse_beside(args: Ingest, what: str, keep: tuple[str, ...]) -> None:
@@ -133,20 +138,21 @@ def _convert(folder: Path, output: Path) -> int:
     return 0
 
 
-def _recording(args: Ingest) -> Recording:
+def recordings_of(args: Ingest) -> list[Recording]:
+    """The recordings that the words name. Raises NeecoError naming the option."""
     from neeco.errors import NeecoError
     from neeco.ingest.recordingfile import check_frames, read_recording, recording_from_flags
 
-    if args.source is not None:
-        _refuse_beside(args, f"{args.source}: says what was recorded", keep=("output", "frames", "rrd", "json"))
+    if args.source:
+        _refuse_beside(args, f"{args.source[0]}: says what was recorded", keep=("output", "frames", "rrd", "json"))
         check_frames(args.frames)
-        recording = read_recording(args.source)
-        return recording if args.frames is None else replace(recording, frames=args.frames)
+        recordings = [read_recording(source) for source in args.source]
+        return [item if args.frames is None else replace(item, frames=args.frames) for item in recordings]
     if args.video is None:
         raise NeecoError("--video: give the video (or images' folder), or a recording.yaml (`neeco ingest --init`)")
     if args.intrinsics is not None and args.calibration is not None:
         raise NeecoError("--calibration: given beside --intrinsics; give one of them")
-    return recording_from_flags(
+    recording = recording_from_flags(
         args.video,
         args.instrument,
         args.laparoscope,
@@ -156,9 +162,10 @@ def _recording(args: Ingest) -> Recording:
         args.frames,
         args.fps,
     )
+    return [recording]
 
 
-def _ingest(recording: Recording, output: Path, rrd: Path | None, as_json: bool) -> int:
+def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> int:
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
     from neeco.ingest.pipeline import ingest
@@ -192,13 +199,13 @@ def _ingest(recording: Recording, output: Path, rrd: Path | None, as_json: bool)
                 write_rrd(result, capture, rrd)
 
         try:
-            result = ingest(recording, output, report, complete)
+            result = ingest(recordings, output, report, complete)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
     if as_json:
         print(json.dumps(result.as_json(), indent=2))
         return 0
-    _print(result)
+    print_result(result)
     for problem in errors_only(problems):
         print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
@@ -208,9 +215,13 @@ def _ingest(recording: Recording, output: Path, rrd: Path | None, as_json: bool)
     return 0
 
 
-def _print(result: IngestResult) -> None:
+def print_result(result: IngestResult) -> None:
+    """What an ingest found, in lines."""
     numbers = result.as_json()
     print(f"{numbers['kept']} of {numbers['video_frames']} video frames kept, {numbers['points']} points")
+    for name, (first, last) in result.episodes.items():
+        count = int(((result.selected >= first) & (result.selected <= last)).sum())
+        print(f"episode {name}: {count} of {last + 1 - first} frames kept")
     if result.still:
         print(f"still scope: the world is its camera's frame; the tissue's depth is {result.tissue}")
     if not result.registered:

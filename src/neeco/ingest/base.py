@@ -99,7 +99,7 @@ class BaseRegistration:
             return [float(value) if np.isfinite(value) else None for value in values]
 
         return {
-            "camera_from_base": self.world_from_base.tolist(),
+            "world_from_base": self.world_from_base.tolist(),
             "sd_mm": known(self.sd_mm),
             "sd_deg": known(self.sd_deg),
             "scale": self.scale,

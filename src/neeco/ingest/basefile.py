@@ -1,4 +1,5 @@
-"""What a recording says of where an instrument's base stands to the camera (`camera_from_base`)."""
+"""What a recording says of where an instrument's base stands: to a still camera, or to the scope's tracker
+(`camera_from_base`, `world_from_base`)."""
 
 from __future__ import annotations
 
@@ -22,16 +23,27 @@ _OPENCV_FROM_DVRK = np.diag([-1.0, -1.0, 1.0, 1.0])  # its cameras look along z,
 
 @dataclass(frozen=True, eq=False)
 class StatedBase:
-    """camera_from_base [4, 4] mm, OpenCV axes (None: unknown), and its standard deviations: mm at the instrument and
-    degrees (None: exact)."""
+    """Where a base stands: camera_from_base [4, 4] mm, OpenCV axes, or, where it is `to_world`, the same to the frame
+    of the laparoscope's poses (None: unknown); and its standard deviations: mm at the instrument and degrees (None:
+    exact)."""
 
-    camera_from_base: np.ndarray | None = None
+    matrix: np.ndarray | None = None
     sd_mm: float | None = None
     sd_deg: float | None = None
+    to_world: bool = False
 
     @property
     def exact(self) -> bool:
-        return self.camera_from_base is not None and self.sd_mm is None
+        return self.matrix is not None and self.sd_mm is None
+
+
+def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
+    """Whether two recordings say the same of a base."""
+    if one is None or other is None:
+        return one is other
+    mine, theirs = one.matrix, other.matrix
+    alike = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
+    return alike and (one.sd_mm, one.sd_deg, one.to_world) == (other.sd_mm, other.sd_deg, other.to_world)
 
 
 def read_dvrk_registration(path: Path) -> StatedBase:

@@ -13,13 +13,13 @@ from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration, find_base
 from neeco.ingest.basefile import StatedBase
 from neeco.ingest.columns import CAMERA
+from neeco.ingest.episodes import Episodes
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.recording import InstrumentLogs
 from neeco.ingest.registration import ClockOffset
-from neeco.ingest.synchronized import SynchronizedRecording
 
 FRAMES = 140  # looked at, evenly spaced
-GIVEN, FOUND = "given", "found with the base"
+KNOWN, FOUND = ("given", "scope motion"), "found with the base"  # sources of clocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,19 +32,71 @@ class PlacedBase:
     found: BaseRegistration | None = None
 
 
+def refuse_frames(data: Episodes, *, moving: bool) -> None:
+    """Raise NeecoError for poses, or bases, that are stated to what does not stand still. moving: does the scope?"""
+    path = data.recording.path
+    for name, log in data.poses.items():
+        if moving and log.frame == CAMERA:
+            raise NeecoError(
+                f"{path}: instruments: {name}: poses in the camera's frame need a scope that stands still, and this "
+                "one moves; give poses in a frame that stays, and the scope's own (laparoscope)"
+            )
+    for item in data.recording.instruments:
+        if item.base is None or item.base.matrix is None or item.base.to_world == moving:
+            continue
+        if moving:
+            raise NeecoError(
+                f"{path}: camera_from_base: the scope moves, and the base of {item.name} not with it; state it to the "
+                "frame of the laparoscope's poses, as world_from_base, or write unknown"
+            )
+        raise NeecoError(
+            f"{path}: world_from_base: the scope stands still; state the base of {item.name} to its camera, as "
+            "camera_from_base, or write unknown"
+        )
+
+
+def require_no_base(data: Episodes) -> None:
+    """Raise NeecoError for a base before a scope that moves and is not registered."""
+    for item in data.recording.instruments:
+        if item.base is not None:
+            raise NeecoError(
+                f"{data.recording.path}: world_from_base: where the base of {item.name} stands can be told only to a "
+                "scope whose own poses are recorded (laparoscope) and move enough to register it; leave it out"
+            )
+
+
+def take_bases(
+    data: Episodes,
+    times: np.ndarray,
+    cameras: np.ndarray,
+    pinhole: Lens,
+    moving: Callable[[np.ndarray], np.ndarray],
+    hidden: np.ndarray | None,
+) -> dict[str, BaseRegistration]:
+    """`place_bases`, and from then on all poses and clocks are as these say. Returns those found."""
+    found = {}
+    for name, base in place_bases(data, times, cameras, pinhole, moving, hidden).items():
+        data.world_from_base[name] = base.world_from_base
+        if base.clock is not None:
+            data.move_clock(data.poses[name].clock, base.clock)
+        if base.found is not None:
+            found[name] = base.found
+    return found
+
+
 def place_bases(
-    data: SynchronizedRecording,
+    data: Episodes,
     times: np.ndarray,
     cameras: np.ndarray,
     pinhole: Lens,
     moving: Callable[[np.ndarray], np.ndarray],
     hidden: np.ndarray | None = None,
-    metric: bool = False,
 ) -> dict[str, PlacedBase]:
     """The bases of all instruments that say something of theirs.
 
     times [M] s of the frames, cameras [M, 4, 4] world_from_camera; moving(rows): masks bool [R, h, w] of what moves in
-    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. A base is stated to the first camera.
+    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. Lengths
+    of a robot are taken as they are.
     Notes what was found, how sure it is and what is open. Raises NeecoError where nothing moves with an instrument.
     """
     placed: dict[str, PlacedBase] = {}
@@ -53,8 +105,7 @@ def place_bases(
         if item.base is None or item.name not in data.poses or data.poses[item.name].frame == CAMERA:
             continue
         if item.base.exact:
-            assert item.base.camera_from_base is not None
-            placed[item.name] = PlacedBase(cameras[0] @ item.base.camera_from_base)
+            placed[item.name] = PlacedBase(_in_world(item.base, cameras))
         else:
             unknown.append(item)
     if not unknown:
@@ -64,14 +115,14 @@ def place_bases(
     lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
     for item in unknown:
         assert item.base is not None
-        registration, clock = _find(data, item, item.base, masks, lens, times[rows], cameras[rows], hidden, metric)
+        registration, clock = _find(data, item, item.base, masks, lens, times[rows], cameras[rows], hidden)
         placed[item.name] = PlacedBase(registration.world_from_base, clock, registration)
         data.note(describe(item.name, registration))
     return placed
 
 
 def _find(
-    data: SynchronizedRecording,
+    data: Episodes,
     item: InstrumentLogs,
     stated: StatedBase,
     masks: np.ndarray,
@@ -79,7 +130,6 @@ def _find(
     times: np.ndarray,
     cameras: np.ndarray,
     hidden: np.ndarray | None,
-    metric: bool,
 ) -> tuple[BaseRegistration, ClockOffset]:
     log = data.poses[item.name]
     clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), "assumed equal to the video's"))
@@ -99,21 +149,27 @@ def _find(
         return np.stack(roots)
 
     prior = None
-    if stated.camera_from_base is not None:
+    if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
-        prior = (cameras[0] @ stated.camera_from_base, stated.sd_mm, stated.sd_deg)
+        prior = (_in_world(stated, cameras), stated.sd_mm, stated.sd_deg)
     try:
         found = find_base(
             item.name, masks, lens.intrinsics, np.linalg.inv(cameras), base_from_shaft, times, prior,
             readings=np.stack(list(readings.values()), -1) if readings else None, hidden=hidden,
-            clock_known=clock.source == GIVEN, metric=metric,
+            clock_known=clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: {error}") from error
-    if clock.source != GIVEN:
+    if clock.source not in KNOWN:
         clock = ClockOffset(clock.seconds + found.clock_s, found.clock_sd_s, FOUND)
     return found, clock
+
+
+def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
+    """[4, 4] world_from_base: as stated, to the world or to the cameras, which then are all in one place."""
+    assert stated.matrix is not None
+    return stated.matrix if stated.to_world else np.asarray(cameras[0] @ stated.matrix)
 
 
 def describe(name: str, found: BaseRegistration) -> str:

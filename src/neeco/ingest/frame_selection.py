@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +18,7 @@ STILL_MM, STILL_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
 THUMBNAIL = 64  # px, width
 UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
 MIN_RANGE = 0.1  # rad a joint's readings must span to be split by
+TEST_EVERY = 8  # frames, or episodes, of which one tests unless the recording says otherwise
 LEFT_OUT = "left out"  # split of a frame too close to an unseen one to train on
 
 
@@ -101,19 +102,35 @@ def _farthest_points(rows: np.ndarray, count: int) -> np.ndarray:
 
 
 def assign_splits(
-    frames: np.ndarray, poses: np.ndarray, joints: dict[str, np.ndarray], rule: Splits
+    frames: np.ndarray,
+    poses: np.ndarray,
+    joints: dict[str, np.ndarray],
+    rule: Splits,
+    episodes: Mapping[str, tuple[int, int]] | None = None,
 ) -> tuple[np.ndarray, str]:
     """Splits [N] (LEFT_OUT: too close to an unseen frame to train on) of video frames [N] (their numbers), and the rule
-    in words. poses [N, 4, 4] of the instrument and readings [N] rad per joint: what unseen frames are chosen by."""
+    in words. poses [N, 4, 4] of the instrument and readings [N] rad per joint: what unseen frames are chosen by;
+    episodes: the frames (first, last) of each, where there are several."""
+    episodes = episodes or {}
+    whole = rule.test_episodes
+    if episodes and not (whole or rule.test or rule.test_every is not None):
+        whole = tuple(episodes)[-max(1, len(episodes) // TEST_EVERY) :]
+    every = TEST_EVERY if rule.test_every is None else rule.test_every
     splits = np.full(len(frames), "train", dtype=object)
-    if rule.test:
+    if whole:
+        splits[_inside(frames, tuple(episodes[name] for name in whole))] = "test"
+        words = f"test: {_listed(whole)}"
+    elif rule.test:
         splits[_inside(frames, rule.test)] = "test"
         words = "test: video frames " + _ranges(rule.test)
-    elif every := rule.test_every:
+    elif every:
         splits[frames % every == every // 2] = "test"
         words = f"test: video frames whose number leaves {every // 2} when divided by {every}"
     else:
         words = "test: none"
+    if rule.unseen_episodes:
+        splits[_inside(frames, tuple(episodes[name] for name in rule.unseen_episodes))] = "unseen"
+        return splits, f"{words}; unseen: {_listed(rule.unseen_episodes)}"
     if rule.unseen:
         splits[_inside(frames, rule.unseen)] = "unseen"
         return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
@@ -130,6 +147,10 @@ def assign_splits(
 
 def _inside(frames: np.ndarray, ranges: tuple[tuple[int, int], ...]) -> np.ndarray:
     return np.any([(frames >= first) & (frames <= last) for first, last in ranges], axis=0)
+
+
+def _listed(episodes: tuple[str, ...]) -> str:
+    return f"the recording{'s' * (len(episodes) > 1)} {', '.join(episodes)}"
 
 
 def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:

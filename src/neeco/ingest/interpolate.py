@@ -3,6 +3,8 @@
 At each time a quadratic is fitted to the samples around it, weighted by nearness (tricube) and again by how well they
 fit (bisquare). Rotations are fitted as rotation vectors about their local mean. The window's width is the one that best
 predicts each sample from its neighbours. (Slerp and RotationSpline of scipy go through every sample, noise and all.)
+Where a cubic through the four samples around predicts better than any window, motion between samples is larger than
+their noise, as in logs of few samples a second: then nothing is smoothed, and cubics go through all samples.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ CHUNK = 300_000  # window samples worked on at once
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Half widths s of the windows for positions (or readings) and rotations; 0: linear between samples. noise: what
+    """Half widths s of the windows for positions (or readings) and rotations; 0: through the samples. noise: what
     one sample is off its neighbours' fit, mm (or rad) per axis and rad per axis."""
 
     position_s: float
@@ -39,7 +41,7 @@ class Smoothing:
 def poses_at(log: PoseLog, times: np.ndarray, smooth_s: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Poses [N, 4, 4] (mm) at times [N] on the log's clock, and bool [N] where the log has any.
 
-    smooth_s: half width of the window, s; None: as the log's own noise asks (`pose_smoothing`); 0: linear.
+    smooth_s: half width of the window, s; None: as the log's own noise asks (`pose_smoothing`); 0: through the samples.
     Outside the log and inside its gaps poses are NaN.
     """
     times = np.asarray(times, dtype=np.float64)
@@ -102,14 +104,20 @@ class _Series:
 
     def fit(self, times: np.ndarray, width: float, leave_out: np.ndarray | None = None) -> np.ndarray:
         """Values [N, D] at covered times [N]: local quadratics of half width `width` s where that has samples enough,
-        linear elsewhere. leave_out [N]: a sample per time that must not be used."""
+        linear elsewhere; without a width, cubics through the two samples on each side where there are so many.
+        leave_out [N]: a sample per time that must not be used."""
         left, right = self._around(times) if leave_out is None else (leave_out - 1, leave_out + 1)
         span = self.times[right] - self.times[left]
         share = np.where(span > 0, (times - self.times[left]) / np.where(span > 0, span, 1), 0.0)
         if not len(times):
             return np.zeros((0, self.values.shape[1]))
         result = self._between(left, right, share[:, None])
-        if width > 0:
+        if width == 0:
+            outer = np.stack([left - 1, left, right, right + 1], axis=-1)  # [N, 4]
+            rows = np.flatnonzero((left < right) & (outer[:, 0] >= self.first[left]) & (outer[:, 3] < self.last[left]))
+            if len(rows):
+                result[rows] = self._combined(outer[rows], _lagrange(self.times[outer[rows]], times[rows]))
+        else:
             noise = _noise(self._flat())
             for rows, index, used, offsets in self._windows(times, width, leave_out):
                 result[rows] = self._local_fit(index, used, offsets, noise)
@@ -133,6 +141,10 @@ class _Series:
 
     def _between(self, left: np.ndarray, right: np.ndarray, share: np.ndarray) -> np.ndarray:
         return self.values[left] + share * (self.values[right] - self.values[left])
+
+    def _combined(self, index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Samples [N, K] by weights [N, K] that add up to 1."""
+        return np.asarray((self.values[index] * weights[..., None]).sum(axis=1))
 
     def _flat(self) -> np.ndarray:
         """[T, D] whose second differences show the noise."""
@@ -181,6 +193,13 @@ class _RotationSeries(_Series):
         step = (start.inv() * _rotation(self.values[right])).as_rotvec()
         return (start * Rotation.from_rotvec(step * share)).as_quat(scalar_first=True)
 
+    def _combined(self, index: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        count, size = index.shape
+        center = _rotation(self.values[index[:, size // 2]])
+        turns = center[np.repeat(np.arange(count), size)].inv() * _rotation(self.values[index].reshape(-1, 4))
+        vector = (turns.as_rotvec().reshape(count, size, 3) * weights[..., None]).sum(axis=1)
+        return np.asarray((center * Rotation.from_rotvec(vector)).as_quat(scalar_first=True))
+
     def _flat(self) -> np.ndarray:
         """Turns [T, 3] rad summed up from sample to sample, each in its own axes."""
         steps = (_rotation(self.values[:-1]).inv() * _rotation(self.values[1:])).as_rotvec()
@@ -227,6 +246,16 @@ def _local_polynomial(offsets: np.ndarray, used: np.ndarray, values: np.ndarray,
         distrusting = (weights > 0).sum(axis=1) < MIN_SAMPLES
         weights[distrusting] = near[distrusting]
     return coefficients[:, 0]
+
+
+def _lagrange(samples: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """[N, K] weights of the values at samples [N, K] s in the polynomial through them, at times [N] s."""
+    weights = np.ones_like(samples)
+    for one in range(samples.shape[1]):
+        for other in range(samples.shape[1]):
+            if other != one:
+                weights[:, one] *= (times - samples[:, other]) / (samples[:, one] - samples[:, other])
+    return weights
 
 
 def _noise(values: np.ndarray) -> float:

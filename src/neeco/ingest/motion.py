@@ -50,7 +50,8 @@ class ResidualFlow:
     Frames are reduced to REFERENCE_PIXELS: one pixel is as much of the scene whatever was recorded.
 
     load(row): image [H, W, 3] uint8 of a row of `sfm`, as `pinhole` sees it; times [M] s of the rows; visible: bool
-    [H, W], the field of view, where it has a border. `self.pinhole` is that of the reduced images.
+    [H, W], the field of view, where it has a border; episodes [M]: which of several recordings each row is of: those of
+    one are compared. `self.pinhole` is that of the reduced images.
     """
 
     def __init__(
@@ -60,7 +61,9 @@ class ResidualFlow:
         times: np.ndarray,
         pinhole: Lens,
         visible: np.ndarray | None = None,
+        episodes: np.ndarray | None = None,
     ) -> None:
+        self.episodes = np.zeros(len(times)) if episodes is None else episodes
         camera = pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS)
         self.sfm, self.pinhole = sfm, Lens.of(camera)
         self.estimator: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # its stub asks for a flow
@@ -87,6 +90,7 @@ class ResidualFlow:
         for row in rows.tolist():
             near = [row + steps * self.step for steps in (-2, -1, 1, 2)]
             others = [other for other in near if 0 <= other < len(self.sfm.indices)]
+            others = [other for other in others if self.episodes[other] == self.episodes[row]]
             moved = sum((motion > moving_px for motion in self._residuals(row, others)), np.zeros(self.u.shape))
             evidence.append(np.where(self.hidden, np.nan, moved / max(len(others), 1)))
         return np.stack(evidence)
@@ -96,7 +100,7 @@ class ResidualFlow:
         shown = ~self.hidden
         patch = max(1, round(PATCH * shown.sum()))
         motion = np.zeros(len(self.sfm.indices) - 1)
-        for row in range(len(motion)):
+        for row in np.flatnonzero(self.episodes[1:] == self.episodes[:-1]).tolist():
             (residual,) = self._residuals(row, [row + 1])
             motion[row] = np.sort(residual[shown])[-patch:].mean()
         return motion

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,34 +17,38 @@ from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, Poi
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
+from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
-from neeco.ingest.find_bases import place_bases
+from neeco.ingest.episodes import Episodes, separate
+from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
+from neeco.ingest.passing import passing_masks
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
-from neeco.ingest.registration import Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
-from neeco.ingest.still import moving_masks, reduced, stands_still
-from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, still_cameras
-from neeco.ingest.synchronized import States, SynchronizedRecording
+from neeco.ingest.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
+from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
+from neeco.ingest.synchronized import States
 
 
 def ingest(
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     output: Path,
     progress: StageProgress,
     complete: Callable[[IngestResult, Path], None] = lambda result, folder: None,
 ) -> IngestResult:
-    """Make the capture `output` from a recording and say how good it is.
+    """Make the capture `output` from a recording, or from several of one instrument, and say how good it is.
 
     Nothing appears at `output` before the capture is whole: `complete` may add files to its `folder` before. Raises
     NeecoError for unusable input: file, row or key, and what to do.
     """
+    recordings = separate([recording] if isinstance(recording, Recording) else recording)
     with staged(output) as folder:
-        result = _Ingest(recording, folder, progress).run(output)
+        result = _Ingest(recordings, folder, progress).run(output)
         complete(result, folder / "capture")
         return result
 
@@ -52,10 +56,11 @@ def ingest(
 class _Ingest:
     """One ingest under way, with a folder for everything temporary."""
 
-    def __init__(self, recording: Recording, folder: Path, progress: StageProgress) -> None:
-        self.recording, self.folder, self.progress = recording, folder, progress
-        self.settings = recording.settings
-        self.data = SynchronizedRecording(recording, progress)
+    def __init__(self, recordings: Sequence[Recording], folder: Path, progress: StageProgress) -> None:
+        self.folder, self.progress = folder, progress
+        self.data = Episodes(recordings, progress)
+        self.recording = self.data.recording
+        self.settings = self.recording.settings
         self.size = self.data.video.size
         self.lens = self._read_lens()
         self.bases: dict[str, BaseRegistration] = {}  # by instrument, of those found
@@ -73,13 +78,13 @@ class _Ingest:
         """Find cameras, registration and states, and write the capture."""
         if self._is_still():
             return self._run_still(output)
-        self._refuse_camera_frames()
-        self._refuse_bases()
+        refuse_frames(self.data, moving=True)
         self.motion = StructureFromMotion(
             self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
-            self.visible, self.settings,
+            self.visible, self.settings, self._episodes(),
         )  # fmt: skip
         sfm = self.motion.reconstruct(self.progress)
+        self.data.refuse_alone(self.selected[sfm.indices])
         if self.pinhole is None:
             assert sfm.lens is not None
             self.lens, self.pinhole = sfm.lens, sfm.lens.pinhole(self.size)
@@ -91,6 +96,7 @@ class _Ingest:
             self._write_visible()
         registration = self._register(sfm)
         self._find_instrument_clocks(sfm, self.pinhole)
+        self._place_bases_seen_from(sfm, self.pinhole, registration)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
         return self._finish(output, sfm, self.pinhole, self._register(sfm), shapes)
@@ -102,23 +108,26 @@ class _Ingest:
         if self.recording.stereo is not None:
             return True
         self.progress("looking whether the scope moves", 0, 0)
-        still = stands_still(self._load, len(self.names))
+        still = all(stands_still(self._loader(rows), len(rows)) for rows in self._rows_by_episode())
         if still:
             self.data.note("the scope stands still: nothing but what passes before it moves in the images")
         return still
 
+    def _episodes(self) -> np.ndarray:
+        """[K] the episode of every chosen frame."""
+        return self.data.episode_of(self.selected)
+
+    def _rows_by_episode(self) -> list[np.ndarray]:
+        """Rows of the chosen frames, of every episode that has some."""
+        return [np.flatnonzero(self._episodes() == episode) for episode in np.unique(self._episodes())]
+
+    def _loader(self, rows: np.ndarray) -> Callable[[int], np.ndarray]:
+        """`_load`, of some rows alone."""
+        return lambda place: self._load(int(rows[place]))
+
     def _load(self, row: int) -> np.ndarray:
         """uint8 [H, W, 3], one of the chosen frames."""
         return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
-
-    def _refuse_camera_frames(self) -> None:
-        """Raise NeecoError for poses in the frame of a camera that moves."""
-        for name, log in self.data.poses.items():
-            if log.frame == CAMERA:
-                raise NeecoError(
-                    f"{self.recording.path}: instruments: {name}: poses in the camera's frame need a scope that stands "
-                    "still, and this one moves; give poses in a frame that stays, and the scope's own (laparoscope)"
-                )
 
     def _run_still(self, output: Path) -> IngestResult:
         """The same for a scope that stands still: its frame is the world."""
@@ -132,6 +141,8 @@ class _Ingest:
             data.note(
                 "the scope stands still: the laparoscope's log tells nothing that its images do not, and is ignored"
             )
+        refuse_frames(self.data, moving=False)
+        self._refuse_other_places()
         right = self._right_camera()
         cameras = still_cameras(len(self.names))
         self._find_instrument_clocks(cameras, pinhole)
@@ -145,6 +156,19 @@ class _Ingest:
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
         return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
 
+    def _refuse_other_places(self) -> None:
+        """Raise NeecoError when a still scope looked at something else in one episode than in another."""
+        if self.data.single:
+            return
+        self.progress("comparing what the recordings show", 0, 0)
+        backgrounds, episodes = [], []
+        for rows in self._rows_by_episode():
+            load = self._loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
+            found = find_background(load, min(len(rows), LOOKED_AT))
+            backgrounds.append(np.clip(found.colors, 0, 255).astype(np.uint8))
+            episodes.append(int(self._episodes()[rows[0]]))
+        self.data.refuse_elsewhere(backgrounds, episodes)
+
     def _place_bases(self, cameras: SfmResult, pinhole: Lens) -> None:
         """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as
         that is known (`SynchronizedRecording.world_from_base`): it is the camera's, is stated, or is found from what
@@ -153,19 +177,10 @@ class _Ingest:
         for name, log in data.poses.items():
             if log.frame == CAMERA:
                 data.world_from_base[name] = np.eye(4)
-        if any(item.base is not None for item in self.recording.instruments):
-            self.progress("finding the robot's base", 0, 0)
-            placed = place_bases(
-                data, self._times(cameras), cameras.world_from_camera, pinhole,
-                lambda rows: moving_masks(self._load, len(self.names), rows, visible),
-                None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255,
-            )  # fmt: skip
-            for name, base in placed.items():
-                data.world_from_base[name] = base.world_from_base
-                if base.clock is not None:
-                    data.clocks[data.poses[name].clock] = base.clock
-                if base.found is not None:
-                    self.bases[name] = base.found
+        self._find_bases(
+            cameras.world_from_camera, self._times(cameras), pinhole,
+            lambda rows: moving_masks(self._load, len(self.names), rows, visible),
+        )  # fmt: skip
         unplaced = [name for name in data.poses if name not in data.world_from_base]
         if unplaced:
             data.note(
@@ -173,20 +188,46 @@ class _Ingest:
                 "or camera_from_base): they stay in their own frame (unregistered)"
             )
 
-    def _right_camera(self) -> RightCamera | None:
-        partner = self.recording.stereo
-        if partner is None:
-            return None
-        return read_right_camera(partner, self.selected, self.data.times, self.folder / "right", self.progress)
+    def _place_bases_seen_from(self, sfm: SfmResult, pinhole: Lens, registration: Registration | None) -> None:
+        """The same for a scope that moves, whose tracker's frame is the world. Raises NeecoError where nothing ties the
+        cameras to it."""
+        if registration is None:
+            require_no_base(self.data)
+            return
+        flow, rows = self._residual_flow(sfm, pinhole), sfm.indices
+        self._find_bases(
+            registration.cameras(sfm.world_from_camera), self._times(sfm), pinhole,
+            lambda some: passing_masks(self._loader(rows), flow, some, self.settings.moving_px, self._field_of_view()),
+        )  # fmt: skip
 
-    def _refuse_bases(self) -> None:
-        """Raise NeecoError for a base that is stated to the camera of a scope that moves."""
-        for item in self.recording.instruments:
-            if item.base is not None:
-                raise NeecoError(
-                    f"{self.recording.path}: camera_from_base: the base of {item.name} stands still to the camera only "
-                    "if the scope stands still; leave it out and give the poses in the laparoscope's frame"
-                )
+    def _find_bases(
+        self,
+        cameras: np.ndarray,
+        times: np.ndarray,
+        pinhole: Lens,
+        moving: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        """Take the bases as stated, or find them from what moves; see `place_bases`."""
+        if any(item.base is not None for item in self.recording.instruments):
+            self.progress("finding the robot's base", 0, 0)
+            visible = self._field_of_view()
+            hidden = None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255
+            self.bases = take_bases(self.data, times, cameras, pinhole, moving, hidden)
+
+    def _right_camera(self) -> RightCamera | None:
+        if self.recording.stereo is None:
+            return None
+        names = [self.data.frame_name(int(frame)) for frame in self.selected]
+        cameras = []
+        for episode, part in enumerate(self.data.parts):
+            rows = np.flatnonzero(self._episodes() == episode)
+            assert part.recording.stereo is not None
+            found = read_right_camera(
+                part.recording.stereo, self.selected[rows] - self.data.first[episode], part.times,
+                [names[row] for row in rows], self.folder / "right", self.progress,
+            )  # fmt: skip
+            cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
+        return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})
 
     def _read_lens(self) -> Lens | None:
         """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
@@ -268,52 +309,22 @@ class _Ingest:
 
     def _register(self, sfm: SfmResult) -> Registration | None:
         """SfM's frame to the tracker's, where the scope was tracked and moved enough; else None, with a note why."""
-        data, scope = self.data, self.data.scope
-        if scope is None:
-            data.note(
-                "the laparoscope was not tracked: "
-                + ("instrument poses stay in the tracker's frame (unregistered), and " if data.poses else "")
-                + f"lengths are scaled as if the tissue were {self.settings.scene_distance_mm:g} mm away"
-            )
-            return None
-        given = data.clocks.get(scope.clock)
-        # a clock that images and logs share tells when they were written, motion when they were taken
-        offsets: list[float | None] = [] if given is not None and given.source == "given" else [None]
-        offsets += [] if given is None else [given.seconds]
-        why = ""
-        for offset in offsets:
-            try:
-                registration = register_with_laparoscope(
-                    sfm.world_from_camera, self._times(sfm), scope, offset, self.settings
-                )
-            except NeecoError as error:
-                why = why or str(error)
-                continue
-            if why:
-                data.note(f"the clock {scope.clock!r} is taken as {given.source if given else 'given'}: {why}")
-            data.clocks[scope.clock] = given if why and given is not None else registration.clock
-            return registration
-        data.note(f"not registered, instrument poses stay in the tracker's frame: {why}")
-        return None
+        frames = self.selected[sfm.indices]
+        return register(self.data, sfm.world_from_camera, self._times(sfm), frames, self.settings)
 
     def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
         def load(row: int) -> np.ndarray:
             return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
 
-        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view())
+        episodes = self._episodes()[sfm.indices]
+        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view(), episodes)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
-        unknown = {log.clock: log for log in self.data.poses.values() if log.clock not in self.data.clocks}
-        if not unknown:
-            return
-        self.progress("finding the instrument's clock", 0, 0)
-        moved = self._residual_flow(sfm, pinhole).fastest_motion()
-        for clock, log in unknown.items():
-            try:
-                self.data.clocks[clock] = offset_from_instrument(moved, self._times(sfm), log)
-            except NeecoError as error:
-                self.data.note(str(error))
+        if unknown_clocks(self.data):
+            self.progress("finding the instrument's clock", 0, 0)
+            flow, frames = self._residual_flow(sfm, pinhole), self.selected[sfm.indices]
+            find_instrument_clocks(self.data, flow, self._times(sfm), frames)
 
     def _find_instruments(
         self, sfm: SfmResult, pinhole: Lens, registration: Registration | None
@@ -371,7 +382,7 @@ class _Ingest:
             self.dropped[int(frame)] = "beside an unseen frame"
         capture_frames = tuple(
             Frame(
-                self.folder / "raw" / f"{frames[i]:06d}.png",
+                self._named_image(int(frames[i])),
                 pinhole.camera(cameras[i]),
                 _state(states, i, float(times[i])),
                 splits[i],
@@ -380,7 +391,7 @@ class _Ingest:
             for i in chosen.tolist()
         )
         if right is not None:  # one camera more to learn from; what is tested stays one
-            capture_frames += _seen_by(right, capture_frames, sfm.indices[chosen].tolist())
+            capture_frames += seen_by(right, capture_frames, sfm.indices[chosen].tolist())
         reliable = sfm.reliable_points()
         if not reliable.any():
             reliable = np.ones(len(sfm.points), dtype=bool)
@@ -402,14 +413,14 @@ class _Ingest:
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []
         return IngestResult(
             output,
-            str(self.recording.path),
+            ", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
             len(data.times),
             float(1 / np.median(np.diff(data.times))),
             self.size,
             frames[chosen],
             times[chosen],
             tuple(sorted(self.dropped.items())),
-            data.clocks,
+            data.found_clocks,
             registration,
             np.array(registered_rows),
             None if tissue is not None else sfm.reprojection_px,
@@ -423,12 +434,18 @@ class _Ingest:
             self.moving,
             registered,
             self.bases,
+            data.ranges,
         )
+
+    def _named_image(self, frame: int) -> Path:
+        """The image of a frame, under the name that it has in the capture."""
+        image = self.folder / "raw" / f"{frame:06d}.png"  # until now by number: SfM orders images by name
+        return image.rename(image.with_name(f"{self.data.frame_name(frame)}.png"))
 
     def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """`IngestResult.unregistered`, of the `chosen` of frames at times [M] s."""
         assert self.data.scope is not None
-        sensors, _ = self.data.logged_poses(self.data.scope, times[chosen])
+        sensors = self.data.logged_scope(times[chosen])
         return {name: np.linalg.inv(sensors) @ poses[chosen] for name, (poses, _) in states.items()}
 
     def _placed(self, sfm: SfmResult, registration: Registration | None) -> tuple[np.ndarray, np.ndarray]:
@@ -457,9 +474,13 @@ class _Ingest:
             joints = owner
         rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
         readings = {joint: values[usable] for joint, values in joints.items()}
-        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule)
+        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, self.data.ranges)
         if "train" not in assigned:
             raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
+        for name in rule.test_episodes + rule.unseen_episodes:
+            first, last = self.data.ranges[name]
+            if not ((frames[usable] >= first) & (frames[usable] <= last)).any():
+                self.data.note(f"splits: no frame of the episode {name} is in the capture")
         for kind, ranges in (("test", rule.test), ("unseen", rule.unseen)):
             if ranges and kind not in assigned:
                 self.data.note(
@@ -469,16 +490,6 @@ class _Ingest:
         splits = np.full(len(frames), LEFT_OUT, dtype=object)
         splits[usable] = assigned
         return splits, words
-
-
-def _seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
-    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
-    camera = right.pinhole.camera(right.world_from_camera)
-    return tuple(
-        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
-        for frame, row in zip(frames, rows, strict=True)
-        if frame.split == "train" and row in right.names
-    )
 
 
 def _state(states: States, row: int, time: float) -> State:

@@ -34,14 +34,17 @@ class InstrumentLogs:
 
 @dataclass(frozen=True)
 class Splits:
-    """How frames are split. test_every: every n-th (0: none); unseen_fraction: of the frames (0: none), the extreme of
-    `unseen_by` (a joint; None: of the whole state); or given: ranges (first, last) of video frames."""
+    """How frames are split. test_every: every n-th (0: none; None: every eighth, of several episodes the last
+    ones); unseen_fraction: of the frames (0: none), the extreme of `unseen_by` (a joint; None: of the whole state); or
+    given: ranges (first, last) of video frames, or names of whole episodes."""
 
-    test_every: int = 8
+    test_every: int | None = None
     unseen_fraction: float = 0.15
     unseen_by: str | None = None
     test: tuple[tuple[int, int], ...] = ()
     unseen: tuple[tuple[int, int], ...] = ()
+    test_episodes: tuple[str, ...] = ()
+    unseen_episodes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,9 @@ class Recording:
     """What was recorded. path: the file that said so (for messages). One of video and images is given; stream: which,
     where `video` holds several; fps: overrides a video's own times; times: a CSV of the images' times; intrinsics: a
     calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s
-    of each clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be noticed)."""
+    of each clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be noticed); episodes: by
+    number, those of its data set that are meant instead of the one that its streams name; episode: what this one of
+    several is called, where the file says it."""
 
     path: Path
     video: Path | None = None
@@ -101,6 +106,8 @@ class Recording:
     stream: str | None = None
     camera: str | None = None
     stereo: StereoPartner | None = None
+    episodes: tuple[int, ...] = ()
+    episode: str = ""
 
     @property
     def clocks(self) -> tuple[str, ...]:

@@ -33,7 +33,9 @@ from neeco.ingest.recording import (
 )
 from neeco.ingest.sections import LARGEST, RecordingLoader, Section, close_match
 
-BASE_KEY = "camera_from_base"
+BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
+MOST_EPISODES = 500  # of one capture
+_SPLIT_EPISODES = ("test_episodes", "unseen_episodes")
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
 _EULER = re.compile(r"(?!.?(.)\1)(?:[xyz]{3}|[XYZ]{3})")  # no axis twice in a row
 
@@ -46,9 +48,11 @@ def read_recording(path: Path) -> Recording:
         "images",
         "camera",
         "stereo",
+        "episodes",
         "intrinsics",
         "instruments",
         BASE_KEY,
+        WORLD_KEY,
         "laparoscope",
         "sync",
         "frames",
@@ -68,7 +72,7 @@ def read_recording(path: Path) -> Recording:
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
         top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
-        camera, _stereo(top),
+        camera, _stereo(top), _episodes(top),
     )  # fmt: skip
 
 
@@ -184,7 +188,7 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
     if not isinstance(value, list):
         raise top.error("instruments", "must be a list; begin each instrument with `- name:`")
     sections = [
-        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY))
+        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY, WORLD_KEY))
         for i, item in enumerate(value)
     ]
     names = [section.text("name", required=True) for section in sections]
@@ -199,7 +203,8 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
         for joint, item in _joints_of(section).items():
             clock = joint if joint_names.count(joint) == 1 else f"{name}.{joint}"
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
-        base = _base(section if section.node.has(BASE_KEY) else top, columns)
+        own = section.node.has(BASE_KEY) or section.node.has(WORLD_KEY)
+        base = _base(section if own else top, columns)
         found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints)), base))
     return tuple(found)
 
@@ -224,13 +229,17 @@ def _check_one_clock(
 
 def _base(section: Section, poses: PoseColumns | None) -> StatedBase | None:
     """What an instrument, or the whole recording, says of the base."""
-    if poses is None or not section.node.has(BASE_KEY):
+    given = [key for key in (BASE_KEY, WORLD_KEY) if section.node.has(key)]
+    if poses is None or not given:
         return None
+    if len(given) > 1:
+        raise section.error(WORLD_KEY, f"{BASE_KEY} is given, too; keep the one that it stands still to")
     if poses.frame == named.CAMERA:
         if section.place:
-            raise section.error(BASE_KEY, "its poses are in the camera's frame already; leave out one of the two")
+            raise section.error(given[0], "its poses are in the camera's frame already; leave out one of the two")
         return None
-    return parse_base(section.node.child(BASE_KEY), section.file.parent)
+    base = parse_base(section.node.child(given[0]), section.file.parent)
+    return replace(base, to_world=given[0] == WORLD_KEY)
 
 
 def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree | None:
@@ -256,6 +265,19 @@ def _kinematics(instrument: Section, joints: tuple[str, ...]) -> KinematicTree |
         message = f"{printable(missing[0])} is no joint of it; name the recorded ones ({', '.join(joints) or 'none'})"
         raise instrument.error("kinematics", message)
     return tree
+
+
+def _episodes(top: Section) -> tuple[int, ...]:
+    """The numbers under `episodes`: a list of numbers and ranges such as "3-7"."""
+    ranges = top.ranges("episodes")
+    count = sum(last + 1 - first for first, last in ranges)
+    if count > MOST_EPISODES:
+        raise top.error("episodes", f"{count} are too many for one capture; list {MOST_EPISODES} at most")
+    numbers = [number for first, last in ranges for number in range(first, last + 1)]
+    twice = next((number for number in numbers if numbers.count(number) > 1), None)
+    if twice is not None:
+        raise top.error("episodes", f"{twice} is listed twice; list each once")
+    return tuple(numbers)
 
 
 def _joints_of(section: Section) -> dict[str, Any]:
@@ -405,7 +427,14 @@ def _splits(top: Section, instruments: tuple[InstrumentLogs, ...]) -> Splits | N
     fraction, every = section.number("unseen_fraction", least=0.0, below=0.9), section.integer("test_every", 0)
     given: dict[str, Any] = {} if fraction is None else {"unseen_fraction": fraction}
     given |= {} if every is None else {"test_every": every}
+    episodes = {key: section.names(key, tuple(range(1, MOST_EPISODES + 1))) or () for key in _SPLIT_EPISODES}
+    given |= {key: tuple(_episode_name(name) for name in names) for key, names in episodes.items()}
     return Splits(unseen_by=by, test=section.ranges("test"), unseen=section.ranges("unseen"), **given)
+
+
+def _episode_name(name: str) -> str:
+    """An episode of a data set may be named by its number alone."""
+    return f"episode_{name}" if name.isdecimal() else name
 
 
 def _settings(top: Section) -> IngestSettings:

@@ -42,11 +42,19 @@ class IngestResult:
     moving: dict[int, np.ndarray] = field(default_factory=dict)
     registered: bool = True  # instrument poses are in the cameras' world
     bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
+    episodes: dict[str, tuple[int, int]] = field(default_factory=dict)  # frames (first, last) of several recordings
 
     @property
     def still(self) -> bool:
         """Whether the scope stood still, so that cameras were not looked for."""
         return self.tissue is not None
+
+    def frame_words(self, frame: int) -> str:
+        """What a video frame is called: its number, and of several recordings which is meant."""
+        for name, (first, last) in self.episodes.items():
+            if first <= frame <= last:
+                return f"{name}: video frame {frame - first}"
+        return f"video frame {frame}"
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""
@@ -76,6 +84,7 @@ class IngestResult:
             "points": self.points,
             "still": self.still,
             "registered": self.registered,
+            "episodes": {name: {"first": first, "last": last} for name, (first, last) in self.episodes.items()},
             "bases": {name: base.as_json() for name, base in self.bases.items()},
             "tissue_depth": self.tissue,
             "split_rule": self.split_rule,

@@ -61,12 +61,18 @@ class SfmResult:
         return (self.lengths >= length) & (self.errors < error)
 
 
-def image_pairs(count: int, keys: Sequence[int]) -> list[tuple[int, int]]:
+def image_pairs(count: int, keys: Sequence[int], episodes: np.ndarray | None = None) -> list[tuple[int, int]]:
     """Which of `count` images to match: keyframes `keys` with keyframes near in time, sparser farther off and in loops;
-    every other frame with the keyframes around it and the frame before."""
+    every other frame with the keyframes around it and the frame before. episodes [count]: which of several recordings
+    each is of; half of all pairs of keyframes of two of them are matched."""
     pairs = {(keys[i], keys[i + step]) for step in KEY_NEIGHBOURS for i in range(len(keys) - step)}
     anchors = keys[::LOOP_STRIDE]
     pairs |= {(a, b) for a in anchors for b in anchors if a < b}
+    if episodes is not None:
+        numbered = list(enumerate(keys))
+        pairs |= {
+            (a, b) for i, a in numbered for j, b in numbered[i + 1 :] if episodes[a] != episodes[b] and (i + j) % 2 == 0
+        }
     stride = keys[1] - keys[0] if len(keys) > 1 else 1
     for frame in range(count):
         place = frame // stride
@@ -83,7 +89,8 @@ class StructureFromMotion:
 
     source: the recording's video or images, for messages. folder: holds its images `names` (in time order), `size`
     (width, height) px. pinhole: None to estimate focal length and distortion. masks: a folder of `<name>.png`, black
-    where no feature may lie. Raises NeecoError when pycolmap is not installed.
+    where no feature may lie; episodes: which of several recordings each image is of. Raises NeecoError when pycolmap
+    is not installed.
     """
 
     def __init__(
@@ -96,10 +103,11 @@ class StructureFromMotion:
         pinhole: Lens | None,
         masks: Path | None,
         settings: IngestSettings,
+        episodes: np.ndarray | None = None,
     ) -> None:
         require_installed("pycolmap")
         self.work, self.source, self.names, self.size, self.settings = work, source, list(names), size, settings
-        self.pinhole, self.masks = pinhole, masks
+        self.pinhole, self.masks, self.episodes = pinhole, masks, episodes
         self.attempts: list[Attempt] = []  # in the order tried
         self.stopped = False  # the time was up before all strategies were tried
         self.seconds = 0.0  # of processor time used so far
@@ -115,6 +123,7 @@ class StructureFromMotion:
         }
         count = len(self.names)
         self.keys = range(0, count, max(1, count // settings.sfm_keyframes))
+        self.pairs = image_pairs(count, self.keys, episodes)
 
     def reconstruct(self, progress: StageProgress) -> SfmResult:
         """Cameras and points, not yet adjusted together. Raises NeecoError when too few images get a camera."""
@@ -194,7 +203,7 @@ class StructureFromMotion:
 
     def _match(self, strategy: Strategy, progress: StageProgress) -> None:
         """Features and matches of all frames, into the database that strategies like this one share."""
-        pairs = [(self.names[a], self.names[b]) for a, b in image_pairs(len(self.names), self.keys)]
+        pairs = [(self.names[a], self.names[b]) for a, b in self.pairs]
         features = self.settings.sfm_features
         job = {"task": "match", "pairs": pairs, "features": features, "peak": PEAK} | self._parameters(strategy)
         if strategy.dense:
@@ -214,9 +223,7 @@ class StructureFromMotion:
         """Why no strategy was of use, and what to do."""
         apart = max(1, len(self.keys) // MOTION_PAIRS)
         pairs = [(self.keys[i], self.keys[i + step]) for step in (2, 8) for i in range(0, len(self.keys) - step, apart)]
-        names = [
-            (self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(image_pairs(len(self.names), self.keys))
-        ]
+        names = [(self.names[a], self.names[b]) for a, b in pairs if (a, b) in set(self.pairs)]
         self._work(self.job | {"task": "matches", "pairs": names, "database": str(self.work / "database.db")}, progress)
         with np.load(self.work / "matches.npz") as saved:
             fault = motion_fault(saved["matches"], self.size[0])

@@ -48,19 +48,30 @@ def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
     are not on something that moves are where they were in every other frame looked at."""
     rows = evenly_spaced(count, LOOKED_AT)
     grey = [_even_light(cv2.cvtColor(reduced(load(row)), cv2.COLOR_RGB2GRAY)) for row in rows]
-    reach = IN_PLACE * grey[0].shape[1]
     stay = []
     for step in {1, len(grey) // 3, len(grey) // 2, 2 * len(grey) // 3} - {0}:
-        for first, second in zip(grey, grey[step:], strict=False):
-            found = _features(first)
-            if len(found) < FEW_FEATURES:
-                continue
-            there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, found, found.copy(), **FOLLOWING)
-            back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), **FOLLOWING)
-            returns = np.linalg.norm(back - found, axis=-1)[:, 0] < RETURNS
-            near = np.linalg.norm(there - found, axis=-1)[:, 0] < reach
-            stay.append((returns & near & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)).mean())
-    return bool(stay) and float(np.mean(np.array(stay) > STILL_SHARE)) > STILL_PAIRS
+        stay += [_share_in_place(first, second) for first, second in zip(grey, grey[step:], strict=False)]
+    shares = np.array([share for share in stay if share is not None])
+    return len(shares) > 0 and float(np.mean(shares > STILL_SHARE)) > STILL_PAIRS
+
+
+def same_place(first: np.ndarray, second: np.ndarray) -> float | None:
+    """The share of the features of a background uint8 [H, W, 3] that are where they were in a second; None: it has too
+    few."""
+    grey = [_even_light(cv2.cvtColor(reduced(image), cv2.COLOR_RGB2GRAY)) for image in (first, second)]
+    return _share_in_place(*grey)
+
+
+def _share_in_place(first: np.ndarray, second: np.ndarray) -> float | None:
+    """`same_place` of images [H, W] in even light."""
+    found = _features(first)
+    if len(found) < FEW_FEATURES:
+        return None
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(first, second, found, found.copy(), **FOLLOWING)
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), **FOLLOWING)
+    returns = np.linalg.norm(back - found, axis=-1)[:, 0] < RETURNS
+    near = np.linalg.norm(there - found, axis=-1)[:, 0] < IN_PLACE * first.shape[1]
+    return float((returns & near & (seen[:, 0] > 0) & (seen_back[:, 0] > 0)).mean())
 
 
 def _even_light(grey: np.ndarray) -> np.ndarray:

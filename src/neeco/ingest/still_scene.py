@@ -5,8 +5,8 @@ The world is the scope's own frame (OpenCV axes, mm), which for a stereo scope i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,7 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Lens
-from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.capture.model import REFERENCE_PIXELS, Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import STEP, RoughShape, carve_shape, project_mask
@@ -59,10 +59,15 @@ class RightCamera:
 
 
 def read_right_camera(
-    partner: StereoPartner, selected: np.ndarray, times: np.ndarray, folder: Path, progress: StageProgress
+    partner: StereoPartner,
+    selected: np.ndarray,
+    times: np.ndarray,
+    stems: Sequence[str],
+    folder: Path,
+    progress: StageProgress,
 ) -> RightCamera:
-    """Write the right camera's images at the `selected` [K] video frames, undistorted, into `folder`. times [V] s: of
-    the left video's frames. The two videos begin together. Raises NeecoError."""
+    """Write the right camera's images at the `selected` [K] video frames, called as `stems`, undistorted, into
+    `folder`. times [V] s: of the left video's frames. The two videos begin together. Raises NeecoError."""
     _, lens, right_from_left = read_stereo(partner.calibration)
     video = partner.open()
     lens.check_size(video.size, partner.calibration)
@@ -73,7 +78,7 @@ def read_right_camera(
             f"{video.path}: {len(video.times)} frames, the left video has {len(times)}: they show {len(rows)} of the "
             f"{len(selected)} chosen moments together; give the videos of one recording"
         )
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     sample = sorted(rows)
     border = find_border(
         image for _, image in video.read([sample[i] for i in evenly_spaced(len(rows), BORDER_SAMPLES)])
@@ -86,9 +91,19 @@ def read_right_camera(
     for done, (frame, image) in enumerate(video.read(sample)):
         progress("writing the right camera's frames", done, len(rows))
         row = rows[frame]
-        names[row] = f"{int(selected[row]):06d}_right.png"
+        names[row] = f"{stems[row]}_right.png"
         write_image(folder / names[row], torch.from_numpy(lens.undistort(image).astype(np.float32) / 255))
     return RightCamera(lens.pinhole(video.size), np.linalg.inv(right_from_left), folder, names, visible, mask)
+
+
+def seen_by(right: RightCamera, frames: tuple[Frame, ...], rows: list[int]) -> tuple[Frame, ...]:
+    """The training frames among `frames`, rows of the chosen ones, as the right camera saw them."""
+    camera = right.pinhole.camera(right.world_from_camera)
+    return tuple(
+        replace(frame, image_path=right.folder / right.names[row], camera=camera, mask_path=right.mask)
+        for frame, row in zip(frames, rows, strict=True)
+        if frame.split == "train" and row in right.names
+    )
 
 
 def _nearest(right: np.ndarray, left: np.ndarray, frame: int, count: int) -> int:

@@ -116,11 +116,13 @@ class SynchronizedRecording:
         """Raise NeecoError where the scope's poses and an instrument's are stated in bases of different names: nothing
         would register them."""
         scope = None if self.scope is None else self.scope.stated_in
+        placed = {item.name for item in self.recording.instruments if item.base is not None}
         for name, log in self.poses.items():
-            if scope is not None and log.stated_in not in (None, scope) and log.frame == BASE:
+            if scope is not None and name not in placed and log.stated_in not in (None, scope) and log.frame == BASE:
                 raise NeecoError(
                     f"{self.recording.path}: laparoscope: its poses are stated in {scope}, those of {name} in "
-                    f"{log.stated_in}; leave it out, or where these are one frame say `frame: base` for both"
+                    f"{log.stated_in}; where these are one frame say `frame: base` for both, else say how they stand "
+                    "(world_from_base)"
                 )
 
     def _check_video(self) -> None:

@@ -35,6 +35,7 @@ MAX_FILES = 400  # looked at; a folder with more is not one recording
 MIN_IMAGES = 10  # in a folder of frames
 MAX_CALIBRATION_ROWS = 200
 MAX_OTHERS = 60  # listed as not used
+_EPISODES = re.compile(r"episodes (\d+) to (\d+)")
 _SCOPE = re.compile(r"camera|scope|laparo|endo|(^|[_\-])(cam|ecm|lens)([_\-]|$)", re.IGNORECASE)
 
 
@@ -80,6 +81,7 @@ class _FolderFiles:
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
+    episodes: str | None = None  # of a data set that holds several, "0-9"
 
 
 def write_template(source: Path) -> str:
@@ -122,6 +124,8 @@ def write_template(source: Path) -> str:
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
         others=found.others[:MAX_OTHERS],
+        episodes=found.episodes,
+        partner=next((line for line in frames[1:] if line.startswith(("video:", "images:"))), "video: right.mp4"),
     )
 
 
@@ -179,6 +183,8 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
             found.others.append(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+            if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
+                found.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
 
 

@@ -98,7 +98,7 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
             (
                 figures.posed_picture(frame, poses, result.shapes, axes, length),
                 figures.posed_picture(frame, before, result.shapes, axes, length) if before else "",
-                frame.name if row is None else f"video frame {result.selected[row]}",
+                frame.name if row is None else result.frame_words(int(result.selected[row])),
                 f"{frame.state.time - start:.2f}",
                 frame.split,
             )

@@ -45,7 +45,7 @@ def write_rrd(result: IngestResult, capture: Capture, path: Path) -> None:
         seconds = frame.state.time
         stream.set_time(VIDEO_CLOCK, duration=seconds)
         for name, clock in result.clocks.items():
-            if name != VIDEO_CLOCK:
+            if name != VIDEO_CLOCK and not result.episodes:  # of several recordings, each has clocks of its own
                 stream.set_time(name, duration=seconds + clock.seconds)
         _log_frame(rerun, stream, frame, capture.registered)
         number = numbers.get(round(seconds, 6))

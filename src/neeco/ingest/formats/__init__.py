@@ -145,6 +145,10 @@ class RecordingFormat(ABC):
         """What the times of a stream count from: streams of the same share a clock."""
         return ""
 
+    def of_episode(self, stream: str, episode: int) -> str | None:
+        """The same stream in another episode; None: the format's files hold one."""
+        return None
+
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         """The lens that the images of `stream` were taken through, where the file says it."""
         return None

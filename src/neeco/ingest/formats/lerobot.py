@@ -121,6 +121,10 @@ class LeRobot(RecordingFormat):
         match = None if stream is None else _NAME.fullmatch(stream)
         return "" if match is None else f"episode {int(match[1])}"
 
+    def of_episode(self, stream: str, episode: int) -> str | None:
+        match = _NAME.fullmatch(stream)
+        return f"episode {episode}/{match[2] if match else stream}"
+
     def _data_set(self, path: Path) -> DataSet:
         self.require_package(path)
         from neeco.ingest.formats._lerobotfiles import read_data_set
