@@ -80,6 +80,14 @@ def test_a_tree_is_written_as_it_is_read() -> None:
         assert np.array_equal(pose, again.poses(readings)[name])
 
 
+@given(axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda axis: math.hypot(*axis) > 0.1))
+def test_an_axis_keeps_its_bits_however_often_it_is_read(axis: tuple[float, float, float]) -> None:
+    given_tree = {"links": [{"name": "shaft"}, {"name": "wrist", "parent": "shaft", "type": "revolute", "axis": axis,
+                                                "value": {"pitch": 1}}]}  # fmt: skip
+    once = kinematics_of(json.loads(json.dumps(given_tree)), "transforms.json").to_json()
+    assert kinematics_of(json.loads(json.dumps(once)), "transforms.json").to_json() == once
+
+
 def test_a_tool_of_the_dvrk_stands_as_denavit_and_hartenberg_say(tmp_path: Path) -> None:
     file = tmp_path / "LARGE_NEEDLE_DRIVER_400006.json"
     file.write_text(TOOL)

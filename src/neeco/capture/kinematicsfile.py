@@ -17,6 +17,7 @@ from neeco.errors import NeecoError
 
 MOST_MM = 1e4  # no instrument is as long
 MOST_GAIN = 1e3
+UNIT = 1e-12  # how far from 1 the length of a unit vector of float64 may be
 
 
 def parse_kinematics(node: Node) -> KinematicTree | None:
@@ -95,6 +96,8 @@ def _axis(node: Node) -> Array | None:
     if not 1e-6 < length < 1e6:
         node.error("is no direction", "give three numbers that are not all 0")
         return None
+    if abs(length - 1) < UNIT:  # as written by us: divided again, its last digits would change with every reading
+        return np.array(given)
     return np.array(given) / length
 
 
