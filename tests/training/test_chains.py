@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -86,6 +87,7 @@ def search_in(
     session = SimpleNamespace(
         config=SimpleNamespace(search=SearchConfig(seeds=300), seed=0),
         report=told.append,
+        searching=nullcontext,
         scene=SimpleNamespace(instruments=(Instrument("tool", dict.fromkeys(names)),), diagnostics={}),
         views=SimpleNamespace(frames=evidence.frames),
     )

@@ -63,8 +63,7 @@ def _with_trees(capture: Capture, scene: Scene, views: TrainingViews, config: Tr
     if config.joints is not None or not getattr(config.deformation, "kinematics", False):
         return scene
     session = new_session(scene.to(views.device), views, config, report)
-    with session.searching():
-        found = find_trees(session)
+    found = find_trees(session)
     if found is None:
         return scene
     again = initial_scene(replace(capture, instruments=found), views.frames, config, lambda text: None)

@@ -15,7 +15,7 @@ from neeco.capture.model import Instrument
 from neeco.training.instruments.chain_search import ChainFound, find_chain
 from neeco.training.instruments.chain_volume import ChainEvidence
 from neeco.training.instruments.color_evidence import clear_by_color
-from neeco.training.instruments.discovery import fit_tissue, tissue_evidence
+from neeco.training.instruments.discovery import DENSITY_START, fit_tissue, tissue_evidence
 from neeco.training.instruments.evidence import (
     POSSIBLE,
     CarvedShape,
@@ -33,7 +33,6 @@ ROOT = "shaft"
 UNITS = ("_rad", "_deg", "_mm", "_angle")  # endings of readings that links' names do without
 MAX_OFF = 0.1  # of the distance to the tissue: the trocar's line may pass the carved shape at most so far
 MASKED, MARGIN = 0.3, 3  # evidence from which a pixel, and those so many px about it, are no tissue
-DENSITY_START = 200  # steps of the longer fit
 WELL_SEEN = 0.4  # of the shaft's length, before which no joint is looked for: it is seen too rarely
 
 
@@ -48,10 +47,11 @@ def find_trees(session: GaussianSession) -> tuple[Instrument, ...] | None:
         return None
     names = ", ".join(instrument.name for instrument in instruments if _is_unknown(instrument))
     session.report(f"{names}: several joints and no kinematics: looking for the joints' axes in the images")
-    evidence = tissue_evidence(session.scene, session.views, session.config)
-    evidence = clear_by_color(evidence, session.views)
-    evidence = clear_by_color(_fitted_again(session, evidence), session.views)
-    return tuple(_with_tree(session, evidence, item) if _is_unknown(item) else item for item in instruments)
+    with session.searching():
+        evidence = tissue_evidence(session.scene, session.views, session.config)
+        evidence = clear_by_color(evidence, session.views)
+        evidence = clear_by_color(_fitted_again(session, evidence), session.views)
+        return tuple(_with_tree(session, evidence, item) if _is_unknown(item) else item for item in instruments)
 
 
 def _fitted_again(session: GaussianSession, evidence: Evidence) -> Evidence:

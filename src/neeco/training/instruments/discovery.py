@@ -32,6 +32,7 @@ from neeco.training.instruments.link_seeds import along_links, readings_of, star
 from neeco.training.instruments.reading_doubts import doubt_readings
 from neeco.training.session import GaussianSession, new_session
 
+DENSITY_START = 200  # steps of a longer fit of the tissue before it adds Gaussians
 MIN_SHARE_INSIDE = 0.01  # of the Gaussians in a bounded volume: with fewer the network cannot form an instrument
 SEED_SPREAD = (
     0.05  # of the distance to the tissue: standard deviation of seeds about the tracked frame, without a shape
@@ -176,7 +177,7 @@ def tissue_evidence(scene: Scene, views: TrainingViews, config: TrainConfig, tis
     if float(evidence.hits.mean()) <= config.search.max_evidence:
         return evidence
     breathing = tissue.deformation.breathing if isinstance(tissue.deformation, BreathingTissue) else None
-    longer = fit_tissue(scene, views, config, config.search.long_tissue_steps, 200, breathing)
+    longer = fit_tissue(scene, views, config, config.search.long_tissue_steps, DENSITY_START, breathing)
     return gather_evidence(longer, views, config.search)
 
 
