@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.episodes import GIVEN, Episodes
+from neeco.ingest.episodes import Episodes
 from neeco.ingest.motion import ResidualFlow
 from neeco.ingest.recording import IngestSettings
-from neeco.ingest.registration import Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import GIVEN, Registration, offset_from_instrument, register_with_laparoscope
 
 
 def register(

@@ -20,13 +20,12 @@ from neeco.ingest.basefile import same_base
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.logs import PoseLog, ReadingLog
 from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
-from neeco.ingest.registration import ClockOffset
+from neeco.ingest.registration import GIVEN, ClockOffset
 from neeco.ingest.sfm import StageProgress
 from neeco.ingest.still import STILL_SHARE, same_place
 from neeco.ingest.synchronized import States, SynchronizedRecording
 
 PAUSE_S = 2.0  # longer than anything that is smooth in time looks beyond an instant
-GIVEN = "given"
 MOSTLY_ALIKE = 0.7  # of the features of one episode's background in place in another's: less is worth a note
 Log = TypeVar("Log", PoseLog, ReadingLog)
 

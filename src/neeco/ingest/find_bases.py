@@ -16,10 +16,10 @@ from neeco.ingest.columns import CAMERA
 from neeco.ingest.episodes import Episodes
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.recording import InstrumentLogs
-from neeco.ingest.registration import ClockOffset
+from neeco.ingest.registration import GIVEN, SCOPE_MOTION, ClockOffset
 
 FRAMES = 140  # looked at, evenly spaced
-KNOWN, FOUND = ("given", "scope motion"), "found with the base"  # sources of clocks
+KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +95,7 @@ def place_bases(
     """The bases of all instruments that say something of theirs.
 
     times [M] s of the frames, cameras [M, 4, 4] world_from_camera; moving(rows): masks bool [R, h, w] of what moves in
-    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. Lengths
-    of a robot are taken as they are.
+    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. Lengths of a robot are taken as they are.
     Notes what was found, how sure it is and what is open. Raises NeecoError where nothing moves with an instrument.
     """
     placed: dict[str, PlacedBase] = {}

@@ -15,11 +15,7 @@ from scipy.ndimage import gaussian_filter
 from neeco.ingest.motion import ResidualFlow
 from neeco.ingest.still import reduced
 
-SUSPECT, SURE, TISSUE = (
-    0.3,
-    0.7,
-    0.2,
-)  # share of the neighbours in time against which a pixel moves: may, does, does not
+SUSPECT, SURE, TISSUE = 0.3, 0.7, 0.2  # share of neighbours in time against which a pixel moves: may, does, does not
 REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is
 LEVELS = 20  # of each colour, that are told apart
 BLUR = 0.7  # levels: colours alike

@@ -313,10 +313,7 @@ class _Ingest:
         return register(self.data, sfm.world_from_camera, self._times(sfm), frames, self.settings)
 
     def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
-        def load(row: int) -> np.ndarray:
-            return np.asarray(open_image(self.folder / "raw" / self.names[int(sfm.indices[row])]).convert("RGB"))
-
-        episodes = self._episodes()[sfm.indices]
+        load, episodes = self._loader(sfm.indices), self._episodes()[sfm.indices]
         return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view(), episodes)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:

@@ -33,6 +33,7 @@ MIN_FRAMES = 12
 MIN_TURN = 0.05  # rad, spread of the scope's directions below which the hand-eye rotation is not determined
 MIN_TRAVEL = 3.0  # mm, spread of the scope's positions below which the scale is not determined
 DRIFT_KNOT = 2.5  # s between the knots of the tracker's drift
+GIVEN, SCOPE_MOTION = "given", "scope motion"  # sources of clocks
 UNKNOWNS = 14  # beside the drift: scale, rotation, origin, hand-eye rotation, lever, clock
 
 
@@ -251,9 +252,9 @@ def register_with_laparoscope(
     sd = np.sqrt(np.maximum(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)), 0.0))
     camera_from_sensor = np.eye(4)
     camera_from_sensor[:3, :3], camera_from_sensor[:3, 3] = hand.as_matrix(), lever
-    found = ClockOffset(offset, 0.0, "given")
+    found = ClockOffset(offset, 0.0, GIVEN)
     if known_offset is None:
-        found = ClockOffset(offset + clock, float(sd[13]), "scope motion")
+        found = ClockOffset(offset + clock, float(sd[13]), SCOPE_MOTION)
     return Registration(
         scale,
         rotation.as_matrix(),

@@ -9,7 +9,7 @@ from neeco.ingest.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
-from neeco.ingest.registration import LONGEST, ClockOffset
+from neeco.ingest.registration import GIVEN, LONGEST, ClockOffset
 from neeco.ingest.sfm import StageProgress
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
@@ -48,7 +48,7 @@ class SynchronizedRecording:
         if not self.poses:
             self.note("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
         self._check_video()
-        self.clocks = {name: ClockOffset(float(seconds), 0.0, "given") for name, seconds in recording.sync.items()}
+        self.clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
         if VIDEO_CLOCK in recording.clocks:
             self.clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
         self._assume_joint_clocks()
