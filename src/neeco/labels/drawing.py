@@ -167,17 +167,19 @@ def without_part_islands(parts: np.ndarray, ids: Sequence[int], share: float) ->
     smallest = share * np.isin(parts, ids).sum()
     cleaned = parts.copy()
     for part in ids:
-        _, components, statistics, _ = cv2.connectedComponentsWithStats(
-            (parts == part).astype(np.uint8), connectivity=4
-        )
+        mask = (parts == part).astype(np.uint8)
+        _, components, statistics, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
         areas = statistics[1:, cv2.CC_STAT_AREA]
-        for k in np.flatnonzero(areas < smallest) + 1:
+        small = areas < smallest
+        if small.any():
+            small[areas.argmax()] = False
+        for k in np.flatnonzero(small) + 1:
             x, y, width, height = statistics[k, : cv2.CC_STAT_AREA]
             around = slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1)
             island = components[around] == k
             beside = cleaned[around][cv2.dilate(island.astype(np.uint8), TOUCHING).astype(bool) & ~island]
             beside = beside[np.isin(beside, ids)]
-            if len(beside) and k != areas.argmax() + 1:
+            if len(beside):
                 cleaned[around][island] = np.bincount(beside).argmax()
     return cleaned
 
