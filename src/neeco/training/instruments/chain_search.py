@@ -213,8 +213,9 @@ class _Search:
         """What a joint explains beyond the chain, and beyond chance."""
         evidence = self.evidence
         points = evidence.box(self._first_pivot(joint), BEHIND, BEYOND)
-        known = evidence.explained(self.chain, points, evidence.volume(evidence.still, points))
-        base = evidence.explained(before, points, evidence.volume(evidence.still, points))
+        unmoved = evidence.volume(evidence.still, points)
+        known = evidence.explained(self.chain, points, unmoved)
+        base = known if before is self.chain else evidence.explained(before, points, unmoved)
         carrier = evidence.carrier(before)
 
         def more(shift: int) -> float:
