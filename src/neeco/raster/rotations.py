@@ -118,6 +118,14 @@ def axis_angle_quat(axis: Tensor, angle: Tensor) -> Tensor:
     return torch.cat([half.cos(), half.sin() * axis], -1)
 
 
+def spread_directions(count: int) -> Tensor:
+    """[count, 3] float64 unit directions, evenly spread (a spiral by the golden angle)."""
+    k = torch.arange(count, dtype=torch.float64)
+    z, turn = 1 - (2 * k + 1) / count, k * torch.pi * (3 - 5**0.5)
+    ring = (1 - z * z).sqrt()
+    return torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)
+
+
 def rotation_error(matrices: np.ndarray) -> np.ndarray:
     """How far matrices [..., 3, 3] are from orthonormal: the largest entry of R^T R - I, [...]."""
     return np.abs(np.swapaxes(matrices, -1, -2) @ matrices - np.eye(3)).max(axis=(-2, -1))

@@ -23,7 +23,7 @@ from neeco.errors import NeecoError
 from neeco.files import write_atomically
 from neeco.raster import rasterize
 from neeco.raster.reference import brightened, headlight_factor, sh_basis
-from neeco.raster.rotations import quat_to_matrix
+from neeco.raster.rotations import quat_to_matrix, spread_directions
 from neeco.raster.shadow import shadowed
 from neeco.raster.types import Gaussians
 
@@ -136,17 +136,9 @@ def _in_world(posed: Gaussians) -> Tensor:
     count = posed.sh.shape[1]
     if posed.sh_frames is None or count == 1:
         return posed.sh
-    directions = _spread_directions(DIRECTIONS).to(posed.sh)  # [D, 3]
+    directions = spread_directions(DIRECTIONS).to(posed.sh)  # [D, 3]
     back = torch.linalg.pinv(sh_basis(directions, count))  # [K, D]
     frames, which = torch.unique(posed.sh_frames, dim=0, return_inverse=True)  # most stand still, all alike
     local = torch.einsum("fij,di->fdj", quat_to_matrix(frames), directions)  # [F, D, 3]
     turned = back @ sh_basis(local.reshape(-1, 3), count).reshape(*local.shape[:2], count)  # [F, K, K]
     return torch.einsum("nkl,nlc->nkc", turned[which], posed.sh)
-
-
-def _spread_directions(count: int) -> Tensor:
-    """[count, 3] unit directions, evenly spread (a spiral by the golden angle)."""
-    k = torch.arange(count, dtype=torch.float64)
-    z, turn = 1 - (2 * k + 1) / count, k * torch.pi * (3 - 5**0.5)
-    ring = (1 - z * z).sqrt()
-    return torch.stack([ring * turn.cos(), ring * turn.sin(), z], 1)

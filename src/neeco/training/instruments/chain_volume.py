@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neeco.raster.rotations import axis_angle_quat, quat_to_matrix, rigid
 from neeco.training.instruments.evidence import Evidence, score_points
 
 SURE = 0.8  # mean evidence from which a point counts; with less, what lies beside the links does, too
@@ -32,16 +33,11 @@ class ChainJoint:
 
     def motion(self, values: Tensor) -> Tensor:
         """[F, 4, 4] of what it turns by `values` [F] rad, or slides by so many mm."""
-        moved = torch.eye(4, device=values.device).repeat(len(values), 1, 1)
         if self.slides:
-            moved[:, :3, 3] = values[:, None] * self.axis
-            return moved
-        x, y, z = self.axis.tolist()
-        cross = values.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        sine, versine = values.sin()[:, None, None], (1 - values.cos())[:, None, None]
-        turn = torch.eye(3, device=values.device) + sine * cross + versine * (cross @ cross)
-        moved[:, :3, :3], moved[:, :3, 3] = turn, self.pivot - turn @ self.pivot
-        return moved
+            still = torch.eye(3, device=values.device).expand(len(values), 3, 3)
+            return rigid(still, values[:, None] * self.axis)
+        turn = quat_to_matrix(axis_angle_quat(self.axis, values))
+        return rigid(turn, self.pivot - turn @ self.pivot)
 
 
 Chain = tuple[ChainJoint, ...]

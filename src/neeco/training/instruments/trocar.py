@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from neeco.raster.rotations import spread_directions
+
 Array = NDArray[np.float64]
 
 STARTS = 6  # directions from which the fit begins
@@ -50,7 +52,7 @@ def trocar_line(poses: Array) -> TrocarLine | None:
 
     best: Array | None = None
     least = np.inf
-    for direction in _spread_directions(STARTS):
+    for direction in spread_directions(STARTS).numpy():
         trocar = (rotations @ (FAR * direction) + positions).mean(0)
         found = least_squares(apart, np.concatenate([trocar, direction, FAR * direction]), loss="soft_l1")
         if found.cost < least:
@@ -63,12 +65,3 @@ def trocar_line(poses: Array) -> TrocarLine | None:
     point: Array = np.round(best[6:] + along.mean() * direction, 4)
     direction = np.asarray(np.round(direction, 6), np.float64)
     return TrocarLine(point, direction, off, float(np.ptp(along)))
-
-
-def _spread_directions(count: int) -> Array:
-    """[count, 3] unit, evenly over the sphere (Fibonacci's lattice)."""
-    steps = np.arange(count) + 0.5
-    height = 1 - 2 * steps / count
-    around = np.pi * (1 + np.sqrt(5)) * steps
-    across = np.sqrt(1 - height**2)
-    return np.column_stack([across * np.cos(around), across * np.sin(around), height])
