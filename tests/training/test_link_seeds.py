@@ -15,6 +15,7 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.raster.rotations import rotate_about
 from neeco.scene.articulation.stated import StatedLinks
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig, SearchConfig
@@ -141,6 +142,36 @@ def test_links_of_a_joint_that_nobody_recorded_are_seeded_on_their_sides(carved:
         own = seeds[owners == link]
         assert len(own) > 80
         assert float((-sense * own[:, 1]).quantile(0.02)) > -0.5 * carved[1].radius
+
+
+HEADING = 0.8  # rad
+
+
+def closed_driver(rng: np.random.Generator) -> tuple[dict[str, float], Tensor]:
+    """A driver that stays closed, its jaws not where the tree has them at rest: the zero of the yaw is another."""
+    readings = {"pitch": float(rng.uniform(-0.7, 0.7)), "jaw": 0.0}
+    links = StatedLinks(driver_tree()).requires_grad_(False)
+    pivot, axis = torch.tensor([0, 0, YAW_AT]), torch.tensor([1.0, 0, 0])
+    shapes = [resting(name) for name in links.part_names]
+    shapes[2:] = [rotate_about(shape, axis, pivot, torch.full((len(shape),), HEADING)) for shape in shapes[2:]]
+    return readings, torch.cat([links.place(shape, k, readings) for k, shape in enumerate(shapes)])
+
+
+def test_links_that_nobody_recorded_open_from_where_they_are_closed() -> None:
+    evidence = make_evidence(torch.eye(4, dtype=torch.float64), 60, instrument=closed_driver)
+    shape = carve(evidence, "tool", torch.Generator().manual_seed(0), SEARCH)
+    assert shape is not None
+    asked, links = session(evidence, ("jaw",)), started((evidence, shape))
+    seeds, logits = start_links(asked, links, evidence, "tool", shape, 4, torch.Generator().manual_seed(0))
+    found = readings_of(asked, evidence, "tool")[0]["jaw"]
+    assert found < 0.3  # of 1.6; half way is 0.8
+    ahead = torch.tensor([0, -np.sin(HEADING), np.cos(HEADING)]).float()
+    across = torch.tensor([0, np.cos(HEADING), np.sin(HEADING)]).float()
+    for link, sense in ((2, -1.0), (3, 1.0)):
+        own = seeds[logits.argmax(1) == link] - torch.tensor([0, 0, YAW_AT])
+        assert float((own @ ahead).quantile(0.02)) > -0.5 * RADIUS  # the wrist, which moves alike, is behind
+        assert float((own @ ahead).quantile(0.75)) > 6  # mm, of 16
+        assert float((sense * own @ across).quantile(0.02)) > -0.5 * RADIUS
 
 
 @pytest.mark.parametrize(

@@ -193,20 +193,25 @@ class StatedLinks(Articulation):
         half = torch.stack([(pivots[own] - pivots[j]).norm() / 2 + beside for j in beyond])
         return middle, half
 
+    def opened_by(self, reading: str) -> dict[int, tuple[int, float]]:
+        """{link: (joint, sense)} of links that a reading turns about one axis, some one way, some the other."""
+        found: dict[int, tuple[int, float]] = {}
+        for joint, own in enumerate(self.gains[:, :, self.reading_names.index(reading)]):  # [L - 1]
+            if bool((own > 0).any()) and bool((own < 0).any()) and not self.slides[joint]:
+                found |= {k + 1: (joint, 1.0 if gain > 0 else -1.0) for k, gain in enumerate(own.tolist()) if gain}
+        return found
+
     @torch.no_grad()
-    def opens_to(self, link: int, unrecorded: Sequence[str]) -> tuple[Tensor, Tensor] | None:
-        """(its pivot [3] mm, unit direction [3]) at rest: to which side a link turns as one of the `unrecorded`
-        readings grows that turns another about the same axis the other way; None where there is none."""
+    def plane_between(self, joint: int, heading: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+        """(the pivot [3] mm, unit directions [3] of the links beyond and of positive turns) at rest, of links that lie
+        turned by `heading` (rad) about the joint's axis from the line of those before."""
         pivots, axes = self.axes()
         line = self.rest_line()
         along = self.shaft()[1] if line is None else line[1]
-        for name in unrecorded:
-            gains = self.gains[:, :, self.reading_names.index(name)]  # [J, L - 1]
-            for joint, own in enumerate(gains):
-                if own[link - 1] != 0 and bool((own * own[link - 1] < 0).any()) and not self.slides[joint]:
-                    towards = torch.linalg.cross(axes[joint], along) * own[link - 1].sign()
-                    return pivots[joint], nn.functional.normalize(towards, dim=0)
-        return None
+        turn = along.new_tensor([heading])
+        ahead = rotate_about(along[None], axes[joint], torch.zeros_like(along), turn)[0]
+        towards = torch.linalg.cross(axes[joint], ahead)
+        return pivots[joint], nn.functional.normalize(ahead, dim=0), nn.functional.normalize(towards, dim=0)
 
     def joint_points(self, readings: Mapping[str, float]) -> dict[str, Tensor]:
         """The pivot of every joint, `pivot_` and the name of what it moves, and the tip of every link that none

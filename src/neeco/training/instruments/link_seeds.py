@@ -13,9 +13,11 @@ from neeco.training.instruments.evidence import (
     CarvedShape,
     Evidence,
     PosedViews,
+    camera_from_instrument,
     carve_along,
     frame_along,
     posed_views,
+    score_points,
 )
 from neeco.training.session import GaussianSession
 
@@ -30,8 +32,14 @@ MIN_COSINE = 0.85
 MAX_OFF_RADII, MAX_OFF_MM = 1.5, 4.0
 NEAR_BEST = 0.85  # of the best evidence that a point of a link has: stated axes may be off, and all points with them
 MIN_RADIUS = 0.33  # of the shaft, of the distance between the first pivots
-ACROSS_RADII = 0.3  # how far on the other side of its pivot a link may lie that opens to one side
+ACROSS_RADII = 0.3  # how far on another side of its pivot a link may lie that is looked for on one
 MIN_SEEN = 0.05  # share of the frames that must see a seed
+# where links lie that open as nobody recorded: openings (of the limits' range) and headings (rad) that are tried, and
+# what must be evident beside the plane between them, in radii from the pivot, along the axis and from the plane
+OPENINGS = torch.linspace(0, 1, 9)
+HEADINGS = torch.linspace(-1.2, 1.2, 13)
+HEADING_SIGMA, HEADING_WEIGHT = 0.5, 0.02  # rad; of evidence, by which a stated heading may be less likely
+BESIDE_PLANE = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
 
 
 @torch.no_grad()
@@ -80,7 +88,7 @@ def start_links(
     open, each is looked for on the side to which it does: mirrored they would look as well.
     """
     search = session.config.search
-    instrument = next(item for item in session.scene.instruments if item.name == name)
+    sides = _open_links(session, links, evidence, name, shape.radius)
     links.wrist_start.fill_(float(links.first_joint()) - shape.radius)
     moved = link_motions(links, readings_of(session, evidence, name))  # [F, L, 4, 4]
     views = [posed_views(evidence, name, search, moved[:, k]) for k in range(links.link_count)]
@@ -91,13 +99,73 @@ def start_links(
     seeds, owners = [of_shaft[chosen]], [torch.zeros(count, dtype=torch.long)]
     each = (search.seeds - count) // max(links.link_count - 1, 1)
     for link in range(1, links.link_count):
-        side = links.opens_to(link, instrument.unrecorded)
-        found = _on_link(views, links, link, shape.radius, each, generator, side)
+        found = _on_link(views, links, link, shape.radius, each, generator, sides.get(link))
         seeds.append(found)
         owners.append(torch.full((len(found),), link))
     points, owner = torch.cat(seeds), torch.cat(owners).to(shape.seeds.device)
     logits = 0.3 * torch.randn(len(points), columns, generator=generator).to(points)
     return points, logits + LINK_LOGIT * nn.functional.one_hot(owner, columns)
+
+
+def _open_links(
+    session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float
+) -> dict[int, tuple[Tensor, Tensor]]:
+    """(place [3] mm, unit directions [2, 3]) at rest, to which sides of it each link lies that opens as nobody
+    recorded: beyond its pivot, and where it opens to.
+
+    Tools are held closed, or open by the same angle, for much of a recording, and the zero of what turns both is not
+    learned. So the opening and the heading are taken at which both links have most evidence beside the plane between
+    them; the reading is found from that opening on. Where nothing is evident, half way and straight on.
+    """
+    instrument = next(item for item in session.scene.instruments if item.name == name)
+    sides: dict[int, tuple[Tensor, Tensor]] = {}
+    for reading in instrument.unrecorded:
+        opening = links.opened_by(reading)
+        if not opening:
+            continue
+        low, high = instrument.joints[reading] or (0.0, 0.0)
+        values, turned = low + (high - low) * OPENINGS, 0.0
+        recorded = readings_of(session, evidence, name)
+        scores = torch.stack(
+            [
+                _beside_plane(links, evidence, name, radius, opening, [given | {reading: value} for given in recorded])
+                for value in values.tolist()
+            ]
+        )  # [openings, headings]
+        likely = scores - HEADING_WEIGHT * (HEADINGS / HEADING_SIGMA).square()
+        best, heading = divmod(int(likely.argmax()), len(HEADINGS))
+        if float(scores[best, heading]) > POSSIBLE:
+            turned = float(HEADINGS[heading])
+            column = session.refinement.readings.index((name, reading))
+            session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
+        for link, (joint, sense) in opening.items():
+            pivot, ahead, towards = links.plane_between(joint, turned)
+            sides[link] = (pivot, torch.stack([ahead, sense * towards]))
+    return sides
+
+
+def _beside_plane(
+    links: StatedLinks,
+    evidence: Evidence,
+    name: str,
+    radius: float,
+    opening: dict[int, tuple[int, float]],
+    readings: list[dict[str, float]],
+) -> Tensor:
+    """[headings] mean evidence of links that open, each beside the plane between them."""
+    moved = link_motions(links, readings)  # [F, L, 4, 4]
+    own = camera_from_instrument(evidence, name)
+    far, along_axis, aside = (radius * BESIDE_PLANE.to(own)).split(1, 1)  # [P, 1] each
+    scores = []
+    for link, (joint, sense) in opening.items():
+        points = []
+        for heading in HEADINGS.tolist():
+            pivot, ahead, towards = (part.to(own) for part in links.plane_between(joint, heading))
+            axis = torch.linalg.cross(ahead, towards)
+            points.append(pivot + far * ahead + along_axis * axis + sense * aside * towards)
+        found, _ = score_points(evidence, own @ moved[:, link], torch.cat(points))
+        scores.append(found.reshape(len(HEADINGS), -1).mean(1))
+    return torch.stack(scores).mean(0).cpu()
 
 
 def readings_of(session: GaussianSession, evidence: Evidence, name: str) -> list[dict[str, float]]:
@@ -131,7 +199,7 @@ def _on_link(
     side: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
     """[count, 3] mm at rest: points that stay on evidence when moved with a link, and better than with any other; on
-    the `side` of a place (mm, unit direction) where that is given."""
+    the sides of a place (mm, unit directions) where such are given."""
     device = links.points.device
     centers, reaches = (part.to(device) for part in links.where(link, REACH_RADII * radius, BESIDE_RADII * radius))
     total = CANDIDATES * count
@@ -139,9 +207,9 @@ def _on_link(
     which = (random[:, 3] * len(centers)).long().clamp_max(len(centers) - 1)
     points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
     if side is not None:
-        place, direction = (part.to(device) for part in side)
-        across = (points - place) @ direction + ACROSS_RADII * radius
-        points = points - 2 * across.clamp_max(0)[:, None] * direction  # mirrored into it
+        place, directions = (part.to(device) for part in side)
+        outside = ((points - place) @ directions.T + ACROSS_RADII * radius).clamp_max(0)  # [Q, 2]
+        points = points - 2 * outside @ directions  # mirrored into it
     own, seen = views[link].scores(points)
     likely = torch.nonzero((own > 0.5 * POSSIBLE) & (seen > MIN_SEEN))[:, 0]
     others = torch.stack([view.scores(points[likely])[0] for k, view in enumerate(views) if k != link]).amax(0)
