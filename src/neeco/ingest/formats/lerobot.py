@@ -70,7 +70,7 @@ class LeRobot(RecordingFormat):
         count, first, last = data.episodes()
         found = self._episode_streams(data, data.episode(first))
         if count > 1:
-            found = (*found, Stream(f"episodes {first} to {last}", OTHER, "the same streams in each", count))
+            found = (*found, Stream(f"episodes {first} to {last}", OTHER, "episodes with the same streams", count))
         return found
 
     def read(self, path: Path, stream: str | None = None) -> Table:
