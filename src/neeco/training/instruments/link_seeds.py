@@ -39,6 +39,7 @@ MIN_SEEN = 0.05  # share of the frames that must see a seed
 OPENINGS = torch.linspace(0, 1, 9)
 HEADINGS = torch.linspace(-1.2, 1.2, 13)
 HEADING_SIGMA, HEADING_WEIGHT = 0.5, 0.02  # rad; of evidence, by which a stated heading may be less likely
+CLEARLY_MORE = 0.25  # evidence than half way open and straight on: where jaws move, any opening has some
 BESIDE_PLANE = torch.cartesian_prod(torch.linspace(1, 4, 7), torch.linspace(-0.3, 0.3, 3), torch.linspace(0.1, 0.3, 3))
 
 
@@ -115,7 +116,7 @@ def _open_links(
 
     Tools are held closed, or open by the same angle, for much of a recording, and the zero of what turns both is not
     learned. So the opening and the heading are taken at which both links have most evidence beside the plane between
-    them; the reading is found from that opening on. Where nothing is evident, half way and straight on.
+    them; the reading is found from that opening on. Where none has clearly more, half way and straight on.
     """
     instrument = next(item for item in session.scene.instruments if item.name == name)
     sides: dict[int, tuple[Tensor, Tensor]] = {}
@@ -134,7 +135,7 @@ def _open_links(
         )  # [openings, headings]
         likely = scores - HEADING_WEIGHT * (HEADINGS / HEADING_SIGMA).square()
         best, heading = divmod(int(likely.argmax()), len(HEADINGS))
-        if float(scores[best, heading]) > POSSIBLE:
+        if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > CLEARLY_MORE:
             turned = float(HEADINGS[heading])
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
