@@ -1,10 +1,15 @@
 """Scores what `neeco track` found against the truth of a rendered capture.
 
-    python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--first-state]
+    python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--from N] [--first-state]
+        [--effect smoke=0.4 shot_noise=0.05 lens_blur_px=1.5] [--rod] [--window LEFT TOP RIGHT BOTTOM]
     python benchmarks/tracking.py score RUN CAPTURE TRACKED
+    python benchmarks/tracking.py single RUN CAPTURE [--splits test] [--every N]
 
 `footage` makes a capture of CAPTURE's images and cameras whose instruments' states are withheld (`--first-state`: all
-but that of the first frame). `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
+but that of the first frame). `--effect`: camera effects as in docs/camera-effects.md, smoke as of tissue 100 mm away;
+`--rod`: a steel rod goes through the image, before the instrument, every three seconds; `--window`: images cropped, so
+that the instrument leaves and enters. `single` finds the state in each frame for itself, nothing known before.
+`score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
 all frames of its track.json, whether they were trusted or not.
 
 Errors are those of camera_from_instrument, so that the gauge of the cameras does not count. `px` is where a point near
@@ -12,7 +17,8 @@ the tips falls in the image; `deg` the rotation; `joint` deg (mm where it slides
 `IoU` that of the label that RUN draws at the tracked state. Every measure twice: as it is, and without the constant
 offset (one rigid transform and one number a joint, medians over all frames) by which the sensor's frame as learned
 differs from the true one, which no image shows. Lost: tip 10 px or rotation 15 degrees off. Trust: how many of the
-frames that are more than 10 degrees off have less than 0.5, and how many of the others.
+frames that are more than 10 degrees off have less than 0.5, and how many of the others. Frames whose tip is outside
+the image are counted apart.
 """
 
 from __future__ import annotations
@@ -21,6 +27,8 @@ import argparse
 import json
 import math
 import re
+import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,19 +39,30 @@ import torch
 from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
+from neeco.capture.images import write_image
 from neeco.capture.model import State, swap_camera_axes
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.pinhole import project
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.raster.types import Camera
+from neeco.scene.scene import gaussian_scene
+from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
+from neeco.tracking.coordinates import Coordinates
+from neeco.tracking.drawing import InstrumentDrawer, Tissue
+from neeco.tracking.fitting import Fitter
+from neeco.tracking.follow import Follower
+from neeco.tracking.motion import Motion
+from neeco.tracking.search import Search
 from neeco.tracking.track import state_of
+from neeco.tracking.trust import Judge, Reference
 from neeco.training.run import open_run
 
 DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
 LOST_PX, LOST_DEG = 10.0, 15.0
 WRONG_DEG, TOLD = 10.0, 0.5
+ROD_S = 3.0  # s that the rod takes to come and go
 
 
 @dataclass(frozen=True)
@@ -113,7 +132,8 @@ def score(run: Path, root: Path, tracked: Path) -> None:
     """Print tables of errors and of trust."""
     capture, truth = read_capture(root), Truth.read(root)
     frames = {frame.name: frame for frame in capture.frames}
-    records = json.loads((tracked / "track.json").read_text())["frames"]
+    info = json.loads((tracked / "track.json").read_text())
+    records, seen_by = info["frames"], {f.name: f.camera for f in read_capture(Path(info["footage"])).frames}
     found, true, rows = [], [], []
     with open_run(run) as opened:
         for record in records:
@@ -124,6 +144,7 @@ def score(run: Path, root: Path, tracked: Path) -> None:
             true.append(truth.camera_from_instrument[frame.name])
             joints = [given["joints"][j] - value for j, value in truth.joints[frame.name].items()]
             row = {"split": frame.split, "trust": record["trust"]["value"], "how": record["how"], "joints": joints}
+            row["inside"] = tip_is_inside(seen_by[frame.name], true[-1], truth)
             reference, parts = load_reference(capture, frame), draw(opened.scene, state_of(record), frame.camera).parts
             if reference is not None and parts is not None:
                 one, other = parts.numpy() > 0, reference.mask.numpy() > 0
@@ -138,9 +159,19 @@ def score(run: Path, root: Path, tracked: Path) -> None:
             out = kind == "taken out"
             row |= errors(frames[record["frame"]].camera, one @ offset if out else one, other, truth)
             row["joint"] = float(np.abs(np.array(row["joints"]) - (joints if out else 0)).max(initial=0)) / DEG
-        for split in dict.fromkeys(row["split"] for row in rows):
-            print_row([row for row in rows if row["split"] == split], split, kind)
-    print_trust(rows)
+        shown = [row for row in rows if row["inside"]]
+        for split in dict.fromkeys(row["split"] for row in shown):
+            print_row([row for row in shown if row["split"] == split], split, kind)
+    print_trust(shown)
+    if outside := [row["trust"] >= TOLD for row in rows if not row["inside"]]:
+        print(f"tip outside the image: {len(outside)} frames, {100 * np.mean(outside):.1f} % are trusted by {TOLD}")
+
+
+def tip_is_inside(camera: Camera, pose: Tensor, truth: Truth) -> bool:
+    """Whether the point near the tips is in the image, camera_from_instrument [4, 4]."""
+    point = (pose[:3, :3] @ truth.tip + pose[:3, 3])[None]
+    x, y = project(point, camera.fx, camera.fy, camera.cx, camera.cy, nearest=1.0)
+    return bool(0 < x[0] < camera.width and 0 < y[0] < camera.height)
 
 
 def print_row(rows: Sequence[dict[str, Any]], split: str, kind: str) -> None:
@@ -164,17 +195,73 @@ def print_trust(rows: Sequence[dict[str, Any]]) -> None:
         print(f"{name}: {those.sum()} frames, {told}")
 
 
-def footage(root: Path, output: Path, splits: Sequence[str], every: int, first_state: bool) -> None:
+def footage(given: argparse.Namespace) -> None:
     """Write a capture without states."""
-    capture = read_capture(root)
+    capture = read_capture(given.capture)
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    chosen = [frame for frame in frames if not splits or frame.split in splits][::every]
-    bare = [
-        frame if first_state and k == 0 else replace(frame, state=State({}, frame.state.time))
-        for k, frame in enumerate(chosen)
-    ]
-    write_capture(replace(capture, frames=tuple(bare), instruments=capture.instruments if first_state else ()), output)
-    print(f"{output}: {len(bare)} frames without states")
+    chosen = [frame for frame in frames if not given.splits or frame.split in given.splits][given.begin :: given.every]
+    effects = {name: float(value) for name, value in (pair.split("=") for pair in given.effect)}
+    rng, bare = np.random.default_rng(0), []
+    with tempfile.TemporaryDirectory() as scratch:
+        for k, frame in enumerate(chosen):
+            spoilt = frame if given.first_state and k == 0 else replace(frame, state=State({}, frame.state.time))
+            if effects or given.rod or given.window:
+                path = Path(scratch) / frame.image_path.with_suffix(".png").name
+                image = frame.load_image().numpy()
+                if given.rod:
+                    image = with_rod(image, frame.state.time - chosen[0].state.time)
+                if effects:
+                    image = apply_effects(image, np.full(image.shape[:2], SMOKE_MM, np.float32), effects, rng)
+                left, top, right, bottom = given.window or (0, 0, frame.camera.width, frame.camera.height)
+                write_image(path, torch.from_numpy(image[top:bottom, left:right].copy()))
+                camera = replace(frame.camera, cx=frame.camera.cx - left, cy=frame.camera.cy - top)
+                spoilt = replace(
+                    spoilt, image_path=path, camera=replace(camera, width=right - left, height=bottom - top)
+                )
+            bare.append(spoilt)
+        instruments = capture.instruments if given.first_state else ()
+        write_capture(replace(capture, frames=tuple(bare), instruments=instruments), given.output)
+    print(f"{given.output}: {len(bare)} frames without states")
+
+
+def with_rod(image: np.ndarray, seconds: float) -> np.ndarray:
+    """An image [H, W, 3] through which a grey rod goes, as thick as a tenth of the image's height: in from the right
+    and out again every ROD_S."""
+    height, width = image.shape[:2]
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    across = (rows - 0.55 * height - 0.25 * (columns - width / 2)) / (0.05 * height)  # -1 to 1 on the rod
+    end = width * (1 - 0.5 * (1 - math.cos(2 * math.pi * seconds / ROD_S)))
+    light = 0.25 + 0.5 * np.sqrt(np.clip(1 - across**2, 0, 1))
+    return np.where(((np.abs(across) < 1) & (columns > end))[..., None], light[..., None], image).astype(np.float32)
+
+
+def single(given: argparse.Namespace) -> None:
+    """Find the state in each of some frames, nothing known before, and print errors."""
+    capture, truth, rows, seconds = read_capture(given.capture), Truth.read(given.capture), [], 0.0
+    chosen = [frame for frame in capture.frames if not given.splits or frame.split in given.splits][:: given.every]
+    with open_run(given.run) as opened, torch.no_grad():
+        scene = gaussian_scene(opened.scene, "track")
+        fitter = Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
+        motion = Motion.of(fitter.coordinates, scene.recorded.states)
+        search = Search(fitter, motion, scene.recorded)
+        judge = Judge(fitter, search, Reference.of(fitter, opened.capture().split("train")))
+        follower = Follower(chosen, fitter, motion, search, judge)
+        for k, frame in enumerate(chosen):
+            began = time.process_time()
+            step = follower.find(k)
+            seconds += time.process_time() - began
+            state, name = next(iter(step.moving.state.instruments.values())), frame.name
+            found = camera_from_instrument(frame.camera.world_from_camera, state.pose)
+            row: dict[str, Any] = errors(frame.camera, found, truth.camera_from_instrument[name], truth)
+            joints = [abs(state.joints[joint] - value) / DEG for joint, value in truth.joints[name].items()]
+            rows.append(row | {"joint": max(joints, default=0.0), "trust": step.trust.value, "split": frame.split})
+            print(name, {key: round(value, 2) for key, value in rows[-1].items() if key != "split"}, flush=True)
+    print("| split | n | offset | tip px | rotation deg | roll deg | joint deg | IoU | lost |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for split in dict.fromkeys(row["split"] for row in rows):
+        print_row([row for row in rows if row["split"] == split], split, "as it is")
+    print_trust(rows)
+    print(f"{seconds / len(rows):.2f} s of processor time a frame")
 
 
 def main() -> None:
@@ -184,15 +271,25 @@ def main() -> None:
     made = commands.add_parser("footage")
     made.add_argument("capture", type=Path)
     made.add_argument("output", type=Path)
-    made.add_argument("--splits", nargs="*", default=())
-    made.add_argument("--every", type=int, default=1)
     made.add_argument("--first-state", action="store_true")
+    made.add_argument("--from", type=int, default=0, dest="begin")
+    made.add_argument("--effect", nargs="*", default=(), metavar="NAME=VALUE")
+    made.add_argument("--rod", action="store_true")
+    made.add_argument("--window", type=int, nargs=4)
     scored = commands.add_parser("score")
     for name in ("run", "capture", "tracked"):
         scored.add_argument(name, type=Path)
+    alone = commands.add_parser("single")
+    alone.add_argument("run", type=Path)
+    alone.add_argument("capture", type=Path)
+    for command in (made, alone):
+        command.add_argument("--splits", nargs="*", default=())
+        command.add_argument("--every", type=int, default=1)
     given = parser.parse_args()
     if given.command == "footage":
-        footage(given.capture, given.output, given.splits, given.every, given.first_state)
+        footage(given)
+    elif given.command == "single":
+        single(given)
     else:
         score(given.run, given.capture, given.tracked)
 

@@ -12,7 +12,6 @@ from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 Posed = TypeVar("Posed")  # what a drawing is made of, and its finite differences from
 MOST_TRIALS = 3  # steps tried from one linearisation, each damped ten times more
@@ -50,6 +49,7 @@ class Minimum(Generic[Posed]):
     posed: Posed
     image: Tensor  # [h, w, 3]
     information: Tensor | None  # [P, P] of the image alone, at the last linearisation; None: no step was asked for
+    settled: bool  # no step from fresh differences lowers the cost, or the last one was small
 
 
 def minimise(
@@ -60,26 +60,29 @@ def minimise(
     parameters: Tensor,
     steps: int,
     small: Tensor | None = None,
+    linearised_for: int = 1,
 ) -> Minimum[Posed]:
     """A few Levenberg-Marquardt steps from `parameters` [P] float64; every accepted one lowers the cost.
 
     draw: what is posed by parameters, and its image [h, w, 3]. differences: for every parameter in turn the image with
     that one increased, and by how much. precision [P, P]: of the prior, which expects zeros. small [P]: a step of which
-    every entry is smaller is the last.
+    every entry is smaller is the last. linearised_for: how many steps are made with the differences of one state.
     """
 
     def cost_of(image: Tensor, at: Tensor) -> float:
         return observed.cost(image) + 0.5 * float(at @ precision @ at)
 
     posed, image = draw(parameters)
-    cost, damping, information = cost_of(image, parameters), 1e-3, None
-    for _ in range(steps):
+    cost, damping, information, settled = cost_of(image, parameters), 1e-3, None, False
+    for step in range(steps):
         residual = observed.residual(image)
         weight = observed.scale / (residual.abs() / observed.huber).clamp_min(1.0)
-        columns = [
-            smoothed(moved - image, observed.weight).flatten() / step for moved, step in differences(parameters, posed)
-        ]
-        jacobian = torch.stack(columns)  # [P, h * w * 3]
+        if step % linearised_for == 0:
+            columns = [
+                smoothed(moved - image, observed.weight).flatten() / change
+                for moved, change in differences(parameters, posed)
+            ]
+            jacobian = torch.stack(columns)  # [P, h * w * 3]
         weighted = jacobian * weight.flatten()
         information = (weighted @ jacobian.T).double()
         normal = information + precision
@@ -94,17 +97,23 @@ def minimise(
                 break
             damping *= 10
         else:
+            settled = step % linearised_for == 0
             break
         parameters, posed, image, cost = trial, trial_posed, trial_image, trial_cost
         damping = max(damping / 10, 1e-6)
         if small is not None and bool((change.abs() < small).all()):
+            settled = True
             break
-    return Minimum(parameters, cost, posed, image, information)
+    return Minimum(parameters, cost, posed, image, information, settled)
 
 
 def smoothed(difference: Tensor, weight: Tensor) -> Tensor:
     """A 3x3 binomial blur of the counted pixels of [h, w, 3]: an edge's residual stays linear over a larger shift."""
-    taps = difference.new_tensor([0.25, 0.5, 0.25])
-    kernel = (taps[:, None] * taps)[None, None]
-    planes = (difference * weight[..., None]).permute(2, 0, 1)[:, None]
-    return conv2d(planes, kernel, padding=1)[:, 0].permute(1, 2, 0)
+    counted = (difference * weight[..., None]).flatten(1)  # [h, w * 3]
+    down = counted + counted
+    down[1:] += counted[:-1]
+    down[:-1] += counted[1:]
+    across = down + down
+    across[:, 3:] += down[:, :-3]
+    across[:, :-3] += down[:, 3:]
+    return across.mul_(1 / 16).view_as(difference)

@@ -71,9 +71,10 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def select(self, chosen: Tensor) -> Gaussians:
-        """The chosen ones (bool [N])."""
-        chosen = chosen.nonzero()[:, 0]  # asked for once: how many there are, a device has to say
+    def select(self, chosen: Tensor | slice) -> Gaussians:
+        """The chosen ones (bool [N], or rows that follow each other, which are not copied)."""
+        if isinstance(chosen, Tensor):
+            chosen = chosen.nonzero()[:, 0]  # asked for once: how many there are, a device has to say
         light = self.headlight
         if light is not None:
             shadow = None if light.shadow is None else replace(light.shadow, casters=light.shadow.casters[chosen])

@@ -115,6 +115,15 @@ class Coordinates:
             rows += [vector_from_rotation(turn[:3, :3]), shift, joints]
         return torch.cat(rows)
 
+    def inwards(self, state: State, index: int, step: float) -> int:
+        """1, or -1 where number `index` is a joint that a step upwards would lead beyond its bounds."""
+        for item, rows in zip(self.instruments, self.slices, strict=True):
+            joint = index - rows.start - 6
+            if 0 <= joint < len(item.joints):
+                value = state.instruments[item.name].joints[item.joints[joint]]
+                return -1 if value + step > float(item.high[joint]) else 1
+        return 1
+
     def along(self, instrument: int, millimetres: float = 0.0, roll: float = 0.0) -> Tensor:
         """[P] that shifts one instrument along its shaft and rolls it (rad) about it."""
         item, rows = self.instruments[instrument], self.slices[instrument]

@@ -14,7 +14,7 @@ from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project_world
 from neeco.raster.shadow import shadowed
-from neeco.raster.types import Camera
+from neeco.raster.types import Camera, Gaussians
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 
 BLOCK = 8  # px to multiples of which images are trimmed and crops rounded, so that they are halved three times exactly
@@ -33,6 +33,8 @@ class View:
     image: Tensor  # [h, w, 3]
     weight: Tensor  # [h, w], 0 where pixels do not count
     tissue: Tensor  # [h, w, 3]
+    shadow_of: State | None  # whose instruments' shadow falls on it; None: no shadow
+    whole: float  # px, diagonal of the image that it is cropped from
 
     def crop(self, box: Box) -> View:
         """What lies in a box."""
@@ -40,7 +42,7 @@ class View:
         camera = self.camera
         camera = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=right - left, height=bottom - top)
         rows = slice(top, bottom), slice(left, right)
-        return View(camera, self.image[rows], self.weight[rows], self.tissue[rows])
+        return View(camera, self.image[rows], self.weight[rows], self.tissue[rows], self.shadow_of, self.whole)
 
 
 def working_size(camera: Camera, recorded: Recorded) -> Camera:
@@ -64,7 +66,12 @@ def view_of(frame: Frame, camera: Camera, tissue: Tissue, state: State | None) -
         image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
     rows = slice(0, camera.height), slice(0, camera.width)
     weight = torch.where(counted[rows] > 0.99, 1.0, 0.0)
-    return View(camera, image[rows], weight, tissue.draw(camera, state))
+    return View(camera, image[rows], weight, tissue.draw(camera, state), state, math.hypot(camera.width, camera.height))
+
+
+def over(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
+    """[h, w, 3]: a colour that was drawn over black, with its alpha [h, w], over tissue."""
+    return color + (1 - alpha[..., None]) * tissue
 
 
 class InstrumentDrawer:
@@ -79,20 +86,33 @@ class InstrumentDrawer:
         self._black = scene.canonical.means.new_zeros(3)
 
     @torch.no_grad()
-    def draw(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
-        """(colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
-        rendering = rasterize(self.alone.at(state), camera, background=self._black)
+    def pose(self, state: State) -> Gaussians:
+        """The instruments' Gaussians in `state`."""
+        return self.alone.at(state)
+
+    @torch.no_grad()
+    def draw(self, posed: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+        """(colour [h, w, 3] over black, alpha [h, w]) of posed instruments."""
+        rendering = rasterize(posed, camera, background=self._black)
         return rendering.color.cpu(), rendering.alpha.cpu()
 
-    def composed(self, state: State, view: View) -> Tensor:
-        """[h, w, 3]: the instruments in `state` over a view's tissue."""
-        color, alpha = self.draw(state, view.camera)
-        return color + (1 - alpha[..., None]) * view.tissue
+    def composed(self, posed: Gaussians, view: View) -> Tensor:
+        """[h, w, 3]: posed instruments over a view's tissue."""
+        return over(*self.draw(posed, view.camera), view.tissue)
+
+    def moved(self, posed: Gaussians, state: State, other: State, view: View) -> Tensor:
+        """`composed` of `other`, which differs from the `state` of `posed` by the place of the only instrument: what
+        was posed is seen from elsewhere, and need not be posed again."""
+        (name,) = other.instruments
+        was, now = (self.alone.registered(each).instruments[name].pose.double() for each in (state, other))
+        camera = view.camera
+        seen_from = was @ torch.linalg.inv(now) @ camera.world_from_camera.to(now)
+        return self.composed(posed, replace(view, camera=replace(camera, world_from_camera=seen_from.float())))
 
     @torch.no_grad()
     def labelled(self, state: State, view: View) -> LabelledView:
         """The instruments over a view's tissue, with their parts."""
-        posed = self.alone.at(state)
+        posed = self.pose(state)
         unobserved = self.alone.unobserved(posed, view.camera)
         channels = torch.cat([self._channels, unobserved[:, None]], 1)
         drawing = rasterize(posed, view.camera, channels=channels, background=self._black)
@@ -100,13 +120,13 @@ class InstrumentDrawer:
         labels = replace(drawing, channels=drawing.channels[..., :-1])
         parts, _ = composited_labels(labels, self.labeller.threshold)
         color, alpha = drawing.color.cpu(), drawing.alpha.cpu()
-        image = (color + (1 - alpha[..., None]) * view.tissue).clamp(0, 1)
+        image = over(color, alpha, view.tissue).clamp(0, 1)
         return LabelledView(image, parts.cpu(), view.tissue, alpha, drawing.channels[..., -1].cpu())
 
     @torch.no_grad()
     def box(self, state: State, camera: Camera, margin: float) -> Box | None:
         """Where the instruments fall in the image and `margin` px about that; None where they are outside of it."""
-        posed = self.alone.at(state)
+        posed = self.pose(state)
         means = posed.means[posed.opacities > SOLID]
         pixels, depth = project_world(means, camera)
         x, y = pixels.unbind(-1)
@@ -139,7 +159,7 @@ class Tissue:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._rows = ~scene.canonical.of_instruments
+        self._rows = slice(0, scene.canonical.counts[0])
 
     @property
     def shaded(self) -> bool:

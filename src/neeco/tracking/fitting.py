@@ -8,18 +8,22 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
-from neeco.capture.images import area_averaged
 from neeco.capture.model import State
 from neeco.evaluation.photometric_fit import Minimum, Observed, minimise
+from neeco.raster.types import Gaussians
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, LabelledView, Tissue, View
+from neeco.tracking.drawing import InstrumentDrawer, LabelledView, Tissue, View, over
 
 HUBER = 0.05  # colour residual beyond which a pixel pulls linearly
 CORRELATION_PX = 25.0  # neighbouring pixels err together: so many of the full size count as one observation
+BESIDE = (
+    0.015  # of the whole image's diagonal: so close by, an instrument explained badly is seen; not ill-drawn tissue
+)
 MARGIN = 28  # px about the instruments that a fit looks at
-SHADOW_STEPS = 2  # after so many steps the shadow is drawn anew, or a fit would be drawn to where it was
-SMALL = (0.02, 0.02, 0.05, 0.05)  # deg, mm, deg and mm of joints: a smaller step is the last
+STEPS_AT_ONCE = 2  # after so many, differences and the shadow are drawn anew, or a fit would be drawn to where it was
+SMALL = (0.05, 0.05, 0.1, 0.05)  # deg, mm, deg and mm of joints: a smaller step is the last
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,9 @@ class Fit:
     state: State
     cost: float  # of pixels and prior, -log probability
     gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
-    misfit: float  # mean error a pixel of instrument, in squared HUBERs: 1 is as large as HUBER
+    misfit: float  # mean error a pixel of instrument, on it and close by, in squared HUBERs: 1 is as large as HUBER
     information: Tensor  # [P, P] that the pixels give of the increments
+    view: View  # what was looked at, about the instruments, the shadow of `state` in it
 
 
 @dataclass(frozen=True)
@@ -56,43 +61,56 @@ class Fitter:
         increments = torch.zeros(coordinates.size, dtype=torch.float64)
         if start is not None:
             increments = coordinates.between(expected, start)
-        crop, cost, information = view, math.inf, torch.zeros_like(precision)
+        cost, information = math.inf, torch.zeros_like(precision)
         for level, count in zip(levels, steps, strict=True):
-            box = self.drawer.box(coordinates.moved(expected, increments), view.camera, MARGIN)
-            if box is None:
+            crop = self.about(view, coordinates.moved(expected, increments))
+            if crop is None:
                 return None
-            crop = view.crop(box)
             seen = observed(crop, level)
             while count > 0:
                 crop = self.with_shadow(crop, coordinates.moved(expected, increments))
-                many = min(count, SHADOW_STEPS) if self.tissue.shaded else count
-                found = self._descend(crop, level, seen, expected, precision, increments, many)
-                moved, increments, cost = (found.parameters - increments).abs(), found.parameters, found.cost
+                found = self._descend(crop, level, seen, expected, precision, increments, min(count, STEPS_AT_ONCE))
+                increments, cost = found.parameters, found.cost
                 information = information if found.information is None else found.information
-                if not self.tissue.shaded or bool((moved < coordinates.each(*SMALL)).all()):
+                if found.settled:
                     break
-                count -= many
+                count -= STEPS_AT_ONCE
         state = coordinates.moved(expected, increments)
-        gain, misfit = self.explained(crop, state)
-        return Fit(state, cost, gain, misfit, information)
+        crop = self.about(view, state)
+        if crop is None:
+            return None
+        crop = self.with_shadow(crop, state)
+        return Fit(state, cost, *self._explained(crop, state), information, crop)
+
+    def about(self, view: View, state: State, margin: float = MARGIN) -> View | None:
+        """What is about the instruments in `state`; None where they are outside."""
+        box = self.drawer.box(state, view.camera, margin)
+        return None if box is None else view.crop(box)
 
     def with_shadow(self, view: View, state: State) -> View:
-        """The view, in it the shadow of instruments in `state`."""
-        return replace(view, tissue=self.tissue.draw(view.camera, state)) if self.tissue.shaded else view
+        """The view, in it the shadow of instruments in `state`, or of a state that differs from it by less than a
+        finite difference."""
+        if not self.tissue.shaded:
+            return view
+        if view.shadow_of is not None:
+            changed = self.coordinates.between(view.shadow_of, state).abs()
+            if bool((changed < self.coordinates.steps).all()):
+                return view
+        return replace(view, tissue=self.tissue.draw(view.camera, state), shadow_of=state)
 
-    def labelled(self, view: View, state: State) -> LabelledView:
-        """The whole view as the scene draws it in `state`, with its label."""
-        return self.drawer.labelled(state, self.with_shadow(view, state))
+    def labelled(self, fit: Fit) -> LabelledView:
+        """What a fit looked at as the scene draws it, with its label."""
+        return self.drawer.labelled(fit.state, fit.view)
 
-    def explained(self, view: View, state: State) -> tuple[float, float]:
+    def _explained(self, view: View, state: State) -> tuple[float, float]:
         """`gain` and `misfit` (see `Fit`) of a state before a view that holds all of the instruments."""
-        color, alpha = self.drawer.draw(state, view.camera)
-        image = color + (1 - alpha[..., None]) * view.tissue
+        color, alpha = self.drawer.draw(self.drawer.pose(state), view.camera)
         seen = observed(view, 1.0)
-        with_it, without = (float(seen.errors(image).sum()) for image in (image, view.tissue))
+        with_it, without = (seen.errors(image).sum(2) for image in (over(color, alpha, view.tissue), view.tissue))
+        gain = seen.scale * float((without - with_it).sum(dtype=torch.float64))
+        about = widened(alpha > 0.5, round(BESIDE * view.whole))
         pixels = float((alpha * view.weight).sum())
-        gain = seen.scale * (without - with_it)
-        return gain, with_it / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
+        return gain, float(with_it[about].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
 
     def _descend(
         self,
@@ -103,22 +121,44 @@ class Fitter:
         precision: Tensor,
         increments: Tensor,
         steps: int,
-    ) -> Minimum[State]:
+    ) -> Minimum[Gaussians]:
         """`minimise` before the view's tissue as it is, images reduced to `size`."""
-        coordinates = self.coordinates
+        coordinates, drawer = self.coordinates, self.drawer
         changes = (coordinates.steps / size).tolist()
+        places = 6 if len(coordinates.instruments) == 1 else 0  # of increments that move all that is drawn as one
 
-        def draw(at: Tensor) -> tuple[State, Tensor]:
+        def draw(at: Tensor) -> tuple[Gaussians, Tensor]:
+            posed = drawer.pose(coordinates.moved(expected, at))
+            return posed, reduced(drawer.composed(posed, view), size)
+
+        def differences(at: Tensor, posed: Gaussians) -> Iterator[tuple[Tensor, float]]:
             state = coordinates.moved(expected, at)
-            return state, reduced(self.drawer.composed(state, view), size)
-
-        def differences(at: Tensor, state: State) -> Iterator[tuple[Tensor, float]]:
-            for index, change in enumerate(changes):
-                moved = at.clone()
+            for index, step in enumerate(changes):
+                moved, change = at.clone(), step * coordinates.inwards(state, index, step)
                 moved[index] += change
-                yield draw(moved)[1], change
+                if index < places:
+                    other = coordinates.moved(expected, moved)
+                    yield reduced(drawer.moved(posed, state, other, view), size), change
+                else:
+                    yield draw(moved)[1], change
 
-        return minimise(draw, differences, seen, precision, increments, steps, coordinates.each(*SMALL))
+        return minimise(
+            draw,
+            differences,
+            seen,
+            precision,
+            increments,
+            steps,
+            coordinates.each(*SMALL),
+            linearised_for=STEPS_AT_ONCE,
+        )
+
+
+def widened(mask: Tensor, pixels: int) -> Tensor:
+    """A mask bool [h, w] and what lies up to so many pixels beside it, across or down."""
+    given = mask[None, None].float()
+    across = max_pool2d(given, (1, 2 * pixels + 1), 1, (0, pixels))
+    return max_pool2d(across, (2 * pixels + 1, 1), 1, (pixels, 0))[0, 0] > 0
 
 
 def observed(view: View, size: float) -> Observed:
@@ -131,7 +171,12 @@ def observed(view: View, size: float) -> Observed:
 def reduced(image: Tensor, size: float) -> Tensor:
     """An image [h, w, C] at `size` times its size. Drawings are made at full size and then reduced, too: drawn small,
     every Gaussian is widened by as many of the larger pixels, and a fit takes the instrument farther away for it."""
-    return image if size == 1 else area_averaged(image, round(image.shape[1] * size), round(image.shape[0] * size))
+    if size == 1:
+        return image
+    many = round(1 / size)  # crops are multiples of 8 px
+    height, width = image.shape[0] // many, image.shape[1] // many
+    rows = image.reshape(height, many, -1).sum(1)  # [h, W * C]
+    return rows.view(height, width, many, -1).sum(2) / many**2
 
 
 def wide(coordinates: Coordinates, degrees: float, millimetres: float, joints: float) -> Tensor:

@@ -22,7 +22,7 @@ UNUSUAL = 1.3  # times the usual misfit: from there on a fit is doubted
 BETTER = 0.85  # of a doubted fit's misfit: what another has to have
 RECENT = 10  # frames that tell what is usual here
 LOST = 0.5  # of the label's overlap: less, and the instruments are lost
-LOOK_EVERY = 4  # frames between those in which another roll is looked for, doubted or not: drifts look well explained
+LOOK_EVERY = 6  # frames between those in which another roll is looked for, doubted or not: drifts look well explained
 GIVEN = (4.0, 4.0, 8.0)  # deg, mm, deg of joints: how far off a given state may be
 SEARCH_EVERY = 0.2  # s between searches anywhere
 
@@ -112,7 +112,7 @@ class Follower:
         fit = self.fitter.fit(view, given, near, levels=(0.125, 0.25, 0.5, 1.0), steps=(3, 3, 3, 4))
         if fit is None:
             return self._lost(frame, self.motion.begin(given), (), time, time)
-        return self._begun(frame, "begun", view, fit)
+        return self._begun(frame, "begun", fit)
 
     def find(self, frame: int) -> Step:
         """Nothing known."""
@@ -120,7 +120,7 @@ class Follower:
         best = self.search.anywhere(view)
         if best is None:
             return self._lost(frame, self.motion.begin(self.search.bank(view.camera)[0]), (), NEVER, time)
-        return self._begun(frame, "found", view, best)
+        return self._begun(frame, "found", best)
 
     def follow(self, before: Step, frame: int) -> Step:
         """The frame beside that of `before` in time."""
@@ -130,7 +130,7 @@ class Follower:
         moving = self.motion.predict(before.moving, time - before.moving.state.time)
         predicted = replace(moving, state=replace(moving.state, time=time))
         view = self._view(frame, predicted.state)
-        fit = self.fitter.fit(view, predicted.state, self.motion.precision(predicted))
+        fit = self.fitter.fit(view, predicted.state, self.motion.precision(predicted), steps=(2, 4))
         usual = self._usual(before)
         how: How = "followed"
         if fit is None or fit.misfit > UNUSUAL * usual:
@@ -139,7 +139,7 @@ class Follower:
                 fit, how, predicted = other, "beside", self.motion.freed(predicted)
         if fit is None:
             return self._look_again(before, frame, view)
-        trust, other = self.judge.judge(view, fit, before.unlooked >= LOOK_EVERY)
+        trust, other = self.judge.judge(fit, before.unlooked >= LOOK_EVERY)
         if is_lost(trust):
             return self._look_again(before, frame, view)
         unlooked = 0 if trust.single < 1 or other is not None or before.unlooked >= LOOK_EVERY else before.unlooked + 1
@@ -148,7 +148,7 @@ class Follower:
             better = self.fitter.fit(view, other.state, free, levels=(0.5, 1.0), steps=(3, 4))
             if better is not None and better.gain > fit.gain:
                 fit, how, predicted = better, "beside", self.motion.freed(predicted)
-                trust, _ = self.judge.judge(view, fit)
+                trust, _ = self.judge.judge(fit)
         elif unlooked > 0:  # until it is looked for anew
             trust = replace(trust, single=before.trust.single)
         moving = self.motion.update(predicted, fit)
@@ -162,13 +162,13 @@ class Follower:
             return self._lost(frame, before.moving, before.recent, before.seen_at, before.searched_at)
         view = self._view(frame, None) if view is None else view
         best = self.search.anywhere(view)
-        if best is not None and not is_lost(self.judge.judge(view, best)[0]):
-            return self._begun(frame, "found", view, best)
+        if best is not None and not is_lost(self.judge.judge(best)[0]):
+            return self._begun(frame, "found", best)
         return self._lost(frame, before.moving, before.recent, before.seen_at, time)
 
-    def _begun(self, frame: int, how: How, view: View, fit: Fit) -> Step:
+    def _begun(self, frame: int, how: How, fit: Fit) -> Step:
         time = self.frames[frame].state.time
-        trust, _ = self.judge.judge(view, fit)
+        trust, _ = self.judge.judge(fit)
         moving = self.motion.begin(replace(fit.state, time=time))
         if is_lost(trust):
             return self._lost(frame, moving, (), NEVER, time)
@@ -178,8 +178,12 @@ class Follower:
         return Step(frame, "lost", moving, 0.0, 0.0, NONE, recent, seen_at, searched_at)
 
     def _usual(self, before: Step) -> float:
-        reference = self.judge.reference.misfit
-        return max(median(before.recent), reference) if before.recent else reference
+        """Misfit that a followed frame may have: a rise is looked into once, and again when another roll is."""
+        usual = [self.judge.reference.misfit]
+        if before.recent:
+            usual.append(median(before.recent))
+            usual += [before.misfit] if before.unlooked < LOOK_EVERY else []
+        return max(usual)
 
     def _view(self, frame: int, state: State | None) -> View:
         recorded = self.fitter.drawer.scene.recorded

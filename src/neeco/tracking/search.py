@@ -13,7 +13,7 @@ from neeco.raster.types import Camera
 from neeco.scene import Recorded
 from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import View
-from neeco.tracking.fitting import Fit, Fitter, observed, reduced, wide
+from neeco.tracking.fitting import MARGIN, Fit, Fitter, observed, reduced, wide
 from neeco.tracking.motion import Motion, Moving
 
 ALONG_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: teeth, rings and its end hold a fit where it was
@@ -47,9 +47,9 @@ class Search:
 
     def ranked(self, view: View, states: Iterable[State], size: float) -> list[State]:
         """The best first, as they explain a view reduced to `size`."""
-        seen = observed(view, size)
+        seen, drawer = observed(view, size), self.fitter.drawer
         scored = [
-            (float(seen.errors(reduced(self.fitter.drawer.composed(state, view), size)).sum()), k, state)
+            (float(seen.errors(reduced(drawer.composed(drawer.pose(state), view), size)).sum()), k, state)
             for k, state in enumerate(states)
         ]
         return [state for _, _, state in sorted(scored, key=lambda item: item[:2])]
@@ -69,19 +69,18 @@ class Search:
         root = torch.linalg.cholesky(predicted.covariance[:size, :size])
         normal = torch.randn(SAMPLES, size, generator=generator, dtype=torch.float64)
         tried += [coordinates.moved(predicted.state, increments) for increments in normal @ root.T]
-        precision = self.motion.precision(predicted)
+        precision = self.motion.precision(predicted) / SLACK**2
         best: Fit | None = None
-        for start in self.ranked(view, tried, 0.25)[:FOLLOWED]:
-            fit = self.fitter.fit(
-                view, predicted.state, precision / SLACK**2, start, levels=(0.125, 0.25, 0.5), steps=(6, 4, 3)
-            )
+        about = self.fitter.about(view, predicted.state, 2 * MARGIN)
+        for start in self.ranked(view if about is None else about, tried, 0.25)[:FOLLOWED]:
+            fit = self.fitter.fit(view, predicted.state, precision, start, levels=(0.25, 0.5), steps=(4, 4))
             if fit is not None and (best is None or fit.gain > best.gain):
                 best = fit
                 if fit.misfit <= usual:
                     break
         if best is None:
             return None
-        return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(6,))
+        return self.fitter.fit(view, predicted.state, precision, best.state, levels=(1.0,), steps=(4,))
 
     def anywhere(self, view: View) -> Fit | None:
         """The best fit, nothing else known: from recorded states, then from the best one turned and opened otherwise.

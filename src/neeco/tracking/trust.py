@@ -12,30 +12,37 @@ Trust is a product of four shares, each 1 where nothing speaks against the state
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.evaluation.trust import TypicalErrors, estimate_trust, typical_errors_of
-from neeco.tracking.drawing import LabelledView, View, view_of, working_size
+from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.raster.types import Camera
+from neeco.scene import Recorded
+from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
+from neeco.tracking.drawing import LabelledView, view_of, working_size
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.search import Search, differ
 
 REFERENCE_FRAMES = 16  # training frames that tell what is usual
 USUAL = 0.9  # of them have a smaller misfit
-LEAST_MISFIT = 0.2  # about 5 of 255 grey levels: what explains images better is not held against them
+LEAST_MISFIT = 0.08  # about 4 of 255 grey levels: what explains images better is not held against them
 LEAST_ERROR = 0.012  # of a pixel's colour, of 1: the same
-HALF_TRUSTED = 3.0  # times the usual misfit: where `explained` is 1/2
+HALF_TRUSTED = 4.0  # times the usual misfit: where `explained` is 1/2
 STEEPNESS = 4.0
 LEAST_OBSERVED = 0.9  # of what the worst of the reference frames has, is as good as all
 DOUBTED = 0.9  # of trust otherwise, below which another state is looked for
 OTHERS_FITTED = 2
 NEARBY = (20.0, 5.0, 20.0)  # deg, mm, deg of joints: prior of the other state
 OTHER_DEG, OTHER_JOINT_DEG = 10.0, 8.0  # nearer than this a state is the same
-AS_GOOD = (0.9, 1.0)  # of the gain: another state takes no trust, or AMBIGUOUS of it
+AS_GOOD = (1.3, 1.0)  # times the misfit: another state takes no trust, or AMBIGUOUS of it
 AMBIGUOUS = 0.6
 
 
@@ -83,8 +90,8 @@ class Reference:
             fit = fitter.fit(view, start, near)
             if fit is None:
                 continue
-            drawing = fitter.labelled(view, fit.state)
-            judged.append((drawing, view.image, view.weight > 0))
+            drawing = fitter.labelled(fit)
+            judged.append((drawing, fit.view.image, fit.view.weight > 0))
             misfits.append(fit.misfit)
             shares.append(observed_share(drawing))
         if not misfits:
@@ -108,6 +115,40 @@ def observed_share(drawing: LabelledView) -> float:
 
 
 @dataclass(frozen=True)
+class RecordedRange:
+    """From where the instruments were seen in the training frames, and with which joints."""
+
+    coordinates: Coordinates
+    directions: tuple[Tensor, ...]  # of every instrument [M, 3] unit, instrument frame: from its pivot to the camera
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, recorded: Recorded) -> RecordedRange:
+        """Of all recorded frames."""
+        pairs = list(zip(recorded.states, recorded.cameras, strict=True))
+        return cls(
+            coordinates,
+            tuple(
+                torch.stack([_direction(item, state, camera) for state, camera in pairs])
+                for item in coordinates.instruments
+            ),
+        )
+
+    def beyond(self, state: State, camera: Camera) -> float:
+        """deg that the instrument farthest from them is seen from beside all recorded directions."""
+        angles = [
+            float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
+            for item, recorded in zip(self.coordinates.instruments, self.directions, strict=True)
+        ]
+        return max(angles)
+
+
+def _direction(item: TrackedInstrument, state: State, camera: Camera) -> Tensor:
+    """[3] unit, instrument frame, float64."""
+    pose, centre = state.instruments[item.name].pose.double().cpu(), camera.world_from_camera[:3, 3].double().cpu()
+    return torch.nn.functional.normalize(pose[:3, :3].T @ (centre - pose[:3, 3]) - item.pivot, dim=0)
+
+
+@dataclass(frozen=True)
 class Judge:
     """Says how far tracked states are trusted."""
 
@@ -115,25 +156,31 @@ class Judge:
     search: Search
     reference: Reference
 
-    def judge(self, view: View, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
-        """Of a state fitted to a whole view; and, where another was looked for (with `look`, or where the state is
+    @cached_property
+    def range(self) -> RecordedRange:
+        """Of the frames that the scene was learned from."""
+        return RecordedRange.of(self.fitter.coordinates, self.search.recorded)
+
+    def judge(self, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
+        """Of a fitted state; and, where another was looked for (with `look`, or where the state is
         doubted), the best one found that differs."""
-        drawing = self.fitter.labelled(view, fit.state)
-        overlap = estimate_trust(drawing, view.image, view.weight > 0, self.reference.errors).value
+        drawing, about = self.fitter.labelled(fit), fit.view
+        beside = BESIDE * about.whole / math.hypot(about.camera.width, about.camera.height)
+        overlap = estimate_trust(drawing, about.image, about.weight > 0, self.reference.errors, beside).value
         explained = 1 / (1 + (fit.misfit / (HALF_TRUSTED * self.reference.misfit)) ** STEEPNESS)
         observed = min(1.0, observed_share(drawing) / (LEAST_OBSERVED * self.reference.observed))
         trust = TrackTrust(overlap, explained, observed, 1.0)
         if not look and trust.value >= DOUBTED:
             return trust, None
-        other = self._second(view, fit)
-        ratio = 0.0 if other is None else other.gain / max(fit.gain, 1e-9)
-        low, high = AS_GOOD
-        return replace(trust, single=1 - AMBIGUOUS * min(1.0, max(0.0, (ratio - low) / (high - low)))), other
+        other = self._second(fit)
+        none, all_of_it = AS_GOOD
+        ratio = none if other is None else other.misfit / max(fit.misfit, 1e-9)
+        taken = min(1.0, max(0.0, (ratio - none) / (all_of_it - none)))
+        return replace(trust, single=1 - AMBIGUOUS * taken), other
 
-    def _second(self, view: View, fit: Fit) -> Fit | None:
+    def _second(self, fit: Fit) -> Fit | None:
         """The best fit found, at half size, of a state that differs."""
-        coordinates, best = self.fitter.coordinates, None
-        view = self.fitter.with_shadow(view, fit.state)
+        coordinates, best, view = self.fitter.coordinates, None, fit.view
         loose = wide(coordinates, *NEARBY)
         for state in self.search.ranked(view, self.search.turned(fit.state), 0.25)[:OTHERS_FITTED]:
             found = self.fitter.fit(view, state, loose, levels=(0.25, 0.5), steps=(4, 3))
