@@ -1,7 +1,7 @@
 """Scores what `neeco track` found against the truth of a rendered capture.
 
-    python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--from N] [--first-state]
-        [--effect smoke=0.4 shot_noise=0.05 lens_blur_px=1.5] [--rod] [--window LEFT TOP RIGHT BOTTOM]
+    python benchmarks/tracking.py footage CAPTURE OUT [--splits test unseen] [--every N] [--from N] [--count N]
+        [--first-state] [--effect smoke=0.4 shot_noise=0.05 lens_blur_px=1.5] [--rod] [--window LEFT TOP RIGHT BOTTOM]
     python benchmarks/tracking.py score RUN CAPTURE TRACKED
     python benchmarks/tracking.py single RUN CAPTURE [--splits test] [--every N]
 
@@ -199,7 +199,8 @@ def footage(given: argparse.Namespace) -> None:
     """Write a capture without states."""
     capture = read_capture(given.capture)
     frames = sorted(capture.frames, key=lambda frame: frame.state.time)
-    chosen = [frame for frame in frames if not given.splits or frame.split in given.splits][given.begin :: given.every]
+    frames = [frame for frame in frames if not given.splits or frame.split in given.splits]
+    chosen = frames[given.begin :: given.every][: given.count]
     effects = {name: float(value) for name, value in (pair.split("=") for pair in given.effect)}
     rng, bare = np.random.default_rng(0), []
     with tempfile.TemporaryDirectory() as scratch:
@@ -273,6 +274,7 @@ def main() -> None:
     made.add_argument("output", type=Path)
     made.add_argument("--first-state", action="store_true")
     made.add_argument("--from", type=int, default=0, dest="begin")
+    made.add_argument("--count", type=int)
     made.add_argument("--effect", nargs="*", default=(), metavar="NAME=VALUE")
     made.add_argument("--rod", action="store_true")
     made.add_argument("--window", type=int, nargs=4)

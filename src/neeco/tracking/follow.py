@@ -25,6 +25,7 @@ LOST = 0.5  # of the label's overlap: less, and the instruments are lost
 LOOK_EVERY = 6  # frames between those in which another roll is looked for, doubted or not: drifts look well explained
 GIVEN = (4.0, 4.0, 8.0)  # deg, mm, deg of joints: how far off a given state may be
 SEARCH_EVERY = 0.2  # s between searches anywhere
+POOR, POOR_EVERY = 0.5, 0.4  # trust of what is followed, below which it is looked for anywhere, too; s between
 
 NEVER = -1e9  # s
 
@@ -151,9 +152,14 @@ class Follower:
                 trust, _ = self.judge.judge(fit)
         elif unlooked > 0:  # until it is looked for anew
             trust = replace(trust, single=before.trust.single)
-        moving = self.motion.update(predicted, fit)
+        searched_at, moving = before.searched_at, self.motion.update(predicted, fit)
+        if trust.value < POOR and abs(time - searched_at) >= POOR_EVERY:
+            best, searched_at = self.search.anywhere(view), time
+            if best is not None and best.misfit < BETTER * fit.misfit:
+                fit, how, moving = best, "found", self.motion.begin(replace(best.state, time=time))
+                trust, _ = self.judge.judge(fit)
         recent = (*before.recent, fit.misfit)[-RECENT:]
-        return Step(frame, how, moving, fit.misfit, fit.gain, trust, recent, time, before.searched_at, unlooked)
+        return Step(frame, how, moving, fit.misfit, fit.gain, trust, recent, time, searched_at, unlooked)
 
     def _look_again(self, before: Step, frame: int, view: View | None) -> Step:
         """Anywhere, unless that was done a moment ago."""

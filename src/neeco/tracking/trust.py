@@ -183,7 +183,7 @@ class Judge:
         coordinates, best, view = self.fitter.coordinates, None, fit.view
         loose = wide(coordinates, *NEARBY)
         for state in self.search.ranked(view, self.search.turned(fit.state), 0.25)[:OTHERS_FITTED]:
-            found = self.fitter.fit(view, state, loose, levels=(0.25, 0.5), steps=(4, 3))
+            found = self.fitter.fit(view, state, loose, levels=(0.25, 0.5), steps=(4, 2))
             if found is None or not differ(coordinates, found.state, fit.state, OTHER_DEG, OTHER_JOINT_DEG):
                 continue
             if best is None or found.gain > best.gain:
