@@ -40,7 +40,7 @@ from torch import Tensor
 
 from neeco.capture import read_capture, write_capture
 from neeco.capture.images import write_image
-from neeco.capture.model import State, swap_camera_axes
+from neeco.capture.model import Frame, InstrumentState, State, swap_camera_axes
 from neeco.evaluation.mask_folders import load_reference
 from neeco.labels.drawing import draw
 from neeco.raster.pinhole import project
@@ -134,32 +134,45 @@ def score(run: Path, root: Path, tracked: Path) -> None:
     frames = {frame.name: frame for frame in capture.frames}
     info = json.loads((tracked / "track.json").read_text())
     records, seen_by = info["frames"], {f.name: f.camera for f in read_capture(Path(info["footage"])).frames}
-    found, true, rows = [], [], []
+    rows = []
     with open_run(run) as opened:
         for record in records:
             frame = frames[record["frame"]]
-            given = next(iter(record["instruments"].values()))
-            pose = torch.tensor(given["pose"], dtype=torch.float64)
-            found.append(camera_from_instrument(frame.camera.world_from_camera, pose))
-            true.append(truth.camera_from_instrument[frame.name])
-            joints = [given["joints"][j] - value for j, value in truth.joints[frame.name].items()]
-            row = {"split": frame.split, "trust": record["trust"]["value"], "how": record["how"], "joints": joints}
-            row["inside"] = tip_is_inside(seen_by[frame.name], true[-1], truth)
+            row = compared(frame, next(iter(state_of(record).instruments.values())), record["trust"]["value"], truth)
+            row["inside"] = tip_is_inside(seen_by[frame.name], row["true"], truth)
             reference, parts = load_reference(capture, frame), draw(opened.scene, state_of(record), frame.camera).parts
             if reference is not None and parts is not None:
                 one, other = parts.numpy() > 0, reference.mask.numpy() > 0
                 row["iou"] = float((one & other).sum() / max(1, (one | other).sum()))
             rows.append(row)
-    offset = torch.linalg.inv(constant_offset(found, true))
-    joints = np.median([row["joints"] for row in rows], axis=0)
+    print_tables(rows, truth)
+
+
+def compared(frame: Frame, state: InstrumentState, trust: float, truth: Truth) -> dict[str, Any]:
+    """What a frame's errors are made of."""
+    return {
+        "camera": frame.camera,
+        "split": frame.split,
+        "trust": trust,
+        "found": camera_from_instrument(frame.camera.world_from_camera, state.pose),
+        "true": truth.camera_from_instrument[frame.name],
+        "joints": [state.joints[name] - value for name, value in truth.joints[frame.name].items()],
+        "inside": True,
+    }
+
+
+def print_tables(rows: Sequence[dict[str, Any]], truth: Truth) -> None:
+    """Errors of all frames whose tip is inside the image, by split, as they are and the constant offset taken out."""
+    shown = [row for row in rows if row["inside"]]
+    offset = torch.linalg.inv(constant_offset([row["found"] for row in shown], [row["true"] for row in shown]))
+    joints = np.median([row["joints"] for row in shown], axis=0)
     print("| split | n | offset | tip px | rotation deg | roll deg | joint deg | IoU | lost |")
     print("|---|---|---|---|---|---|---|---|---|")
     for kind in ("as it is", "taken out"):
-        for row, record, one, other in zip(rows, records, found, true, strict=True):
+        for row in shown:
             out = kind == "taken out"
-            row |= errors(frames[record["frame"]].camera, one @ offset if out else one, other, truth)
+            row |= errors(row["camera"], row["found"] @ offset if out else row["found"], row["true"], truth)
             row["joint"] = float(np.abs(np.array(row["joints"]) - (joints if out else 0)).max(initial=0)) / DEG
-        shown = [row for row in rows if row["inside"]]
         for split in dict.fromkeys(row["split"] for row in shown):
             print_row([row for row in shown if row["split"] == split], split, kind)
     print_trust(shown)
@@ -251,17 +264,9 @@ def single(given: argparse.Namespace) -> None:
             began = time.process_time()
             step = follower.find(k)
             seconds += time.process_time() - began
-            state, name = next(iter(step.moving.state.instruments.values())), frame.name
-            found = camera_from_instrument(frame.camera.world_from_camera, state.pose)
-            row: dict[str, Any] = errors(frame.camera, found, truth.camera_from_instrument[name], truth)
-            joints = [abs(state.joints[joint] - value) / DEG for joint, value in truth.joints[name].items()]
-            rows.append(row | {"joint": max(joints, default=0.0), "trust": step.trust.value, "split": frame.split})
-            print(name, {key: round(value, 2) for key, value in rows[-1].items() if key != "split"}, flush=True)
-    print("| split | n | offset | tip px | rotation deg | roll deg | joint deg | IoU | lost |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for split in dict.fromkeys(row["split"] for row in rows):
-        print_row([row for row in rows if row["split"] == split], split, "as it is")
-    print_trust(rows)
+            state = next(iter(step.moving.state.instruments.values()))
+            rows.append(compared(frame, state, step.trust.value, truth))
+    print_tables(rows, truth)
     print(f"{seconds / len(rows):.2f} s of processor time a frame")
 
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from neeco.capture.model import State
 from neeco.evaluation.photometric_fit import Minimum, Observed, minimise
@@ -88,13 +89,13 @@ class Fitter:
         return None if box is None else view.crop(box)
 
     def with_shadow(self, view: View, state: State) -> View:
-        """The view, in it the shadow of instruments in `state`, or of a state that differs from it by less than a
-        finite difference."""
+        """The view, in it the shadow of instruments in `state`, or of a state that differs from it by less than two
+        finite differences."""
         if not self.tissue.shaded:
             return view
         if view.shadow_of is not None:
             changed = self.coordinates.between(view.shadow_of, state).abs()
-            if bool((changed < self.coordinates.steps).all()):
+            if bool((changed < 2 * self.coordinates.steps).all()):
                 return view
         return replace(view, tissue=self.tissue.draw(view.camera, state), shadow_of=state)
 
@@ -156,9 +157,8 @@ class Fitter:
 
 def widened(mask: Tensor, pixels: int) -> Tensor:
     """A mask bool [h, w] and what lies up to so many pixels beside it, across or down."""
-    given = mask[None, None].float()
-    across = max_pool2d(given, (1, 2 * pixels + 1), 1, (0, pixels))
-    return max_pool2d(across, (2 * pixels + 1, 1), 1, (pixels, 0))[0, 0] > 0
+    square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy().astype(np.uint8), square) > 0)
 
 
 def observed(view: View, size: float) -> Observed:
