@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.report.track_page import write_track_page
 from neeco.tracking.coordinates import DEG, Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue, view_of
+from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, as_drawn, view_of
 from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.follow import LOOK_EVERY, Step
 from neeco.tracking.motion import Motion
@@ -107,6 +108,41 @@ def test_a_fit_ends_at_the_state_that_was_drawn_at_any_size(tracked_run: Recorde
     assert millimetres < 1.5
     assert jaw < 2.5
     assert fit.gain > 0
+
+
+def test_an_instrument_that_only_changes_its_place_need_not_be_posed_again(tracked_run: RecordedRun) -> None:
+    drawer, one, other = InstrumentDrawer(tracked_run.scene), grasper_state(), grasper_state(2, -1, 68, 0.2, 0.4)
+    view = View(CAMERA, torch.zeros(64, 96, 3), torch.ones(64, 96), torch.full((64, 96, 3), 0.4), None, 115.0)
+    moved = drawer.moved(drawer.pose(one), one, other, view)
+    assert (moved - drawer.composed(drawer.pose(other), view)).abs().max() < 1e-3  # float32, of 1
+    assert (moved - drawer.composed(drawer.pose(one), view)).abs().max() > 0.1
+
+
+def test_a_fit_leaves_the_bound_of_a_joint(tracked_run: RecordedRun) -> None:
+    fitter, true = fitter_of(tracked_run), grasper_state(jaw=0.8)
+    frame = record(tracked_run.scene, tracked_run.path / "at-bound", [true], "new").frames[0]
+    view = view_of(frame, CAMERA, fitter.tissue, None)
+    bound = float(fitter.coordinates.instruments[0].high[0])
+    fit = fitter.fit(view, grasper_state(jaw=bound), wide(fitter.coordinates, 20, 20, 40), levels=(1.0,), steps=(12,))
+    assert fit is not None
+    assert off(fit.state, true)[2] < 2.5
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.6, 0.2), (1.6, 0.0), (1.0, 0.0)])
+def test_smoke_and_exposure_are_taken_out_by_the_tissue(tracked_run: RecordedRun, gain: float, offset: float) -> None:
+    tissue, image = Tissue(tracked_run.scene).draw(CAMERA, None), tracked_run.scene.render(moving(4), CAMERA).color
+    seen = (gain * image.clamp(0, 1) ** 2.2 + offset) ** (1 / 2.2)  # light, stored
+    found = as_drawn(seen, tissue, torch.ones(64, 96))
+    assert (found - image.clamp(0, 1)).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("spoil", [torch.zeros_like, lambda pixels: 1 - pixels, lambda pixels: pixels.flip(0)])
+def test_colours_that_are_not_the_tissues_stay_as_they_are(
+    tracked_run: RecordedRun, spoil: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    tissue = Tissue(tracked_run.scene).draw(CAMERA, None)
+    image = spoil(tissue)
+    assert torch.equal(as_drawn(image, tissue, torch.ones(64, 96)), image)
 
 
 def test_footage_gets_the_states_it_was_drawn_in(tracked: Tracked) -> None:

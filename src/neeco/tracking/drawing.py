@@ -13,7 +13,7 @@ from neeco.capture.model import Frame, State
 from neeco.labels.labellers import CompositedLabels, composited_labels
 from neeco.raster import rasterize
 from neeco.raster.pinhole import project_world
-from neeco.raster.shadow import shadowed
+from neeco.raster.shadow import GAMMA, shadowed
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 
@@ -21,6 +21,11 @@ BLOCK = 8  # px to multiples of which images are trimmed and crops rounded, so t
 MAX_PIXELS = 160_000  # of images worked on, to which larger ones are reduced
 SOLID = 0.2  # opacity of Gaussians that say where the instrument is
 OUTERMOST = 0.002  # share of them at each side that a crop need not hold
+
+TRIMMINGS = 5  # of pixels that a line of colours does not explain: instruments, what is in front
+AGREES = 0.02  # of 1: colours less off are as drawn
+UNEXPLAINED = 0.5  # of what colours vary by
+GAINS = (0.2, 3.0)
 
 Box = tuple[int, int, int, int]  # px: left, top, right, bottom
 
@@ -66,12 +71,47 @@ def view_of(frame: Frame, camera: Camera, tissue: Tissue, state: State | None) -
         image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
     rows = slice(0, camera.height), slice(0, camera.width)
     weight = torch.where(counted[rows] > 0.99, 1.0, 0.0)
-    return View(camera, image[rows], weight, tissue.draw(camera, state), state, math.hypot(camera.width, camera.height))
+    drawn = tissue.draw(camera, state)
+    seen = as_drawn(image[rows], drawn, weight)
+    return View(camera, seen, weight, drawn, state, math.hypot(camera.width, camera.height))
+
+
+def as_drawn(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
+    """An image [h, w, 3] in the colours of the scene: smoke, exposure and white balance make others of them, by a line
+    for each channel of light, which most of the tissue tells. The image itself where they agree, or no line explains
+    it."""
+    small = (reduced(each, 1 / BLOCK).flatten(0, 1) for each in (image, tissue, weight[..., None]))
+    seen, drawn, counted = (each.clamp(0, 1) ** GAMMA for each in small)
+    kept = counted[:, 0] > 0.99
+    for _ in range(TRIMMINGS):
+        if int(kept.sum()) < 8:
+            return image
+        (some, others), spread = (each[kept] for each in (seen, drawn)), drawn[kept].var(0)
+        gain = ((some - some.mean(0)) * (others - others.mean(0))).mean(0) / spread.clamp_min(1e-6)
+        offset = some.mean(0) - gain * others.mean(0)
+        off = (seen - gain * drawn - offset).abs().amax(1)
+        kept = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
+    changed = ((gain - 1) * drawn[kept] + offset).abs().mean()
+    explained = off[kept].mean() < UNEXPLAINED * seen[kept].std(0).mean()
+    if changed < AGREES or not explained or bool(((gain < GAINS[0]) | (gain > GAINS[1])).any()):
+        return image
+    return ((image**GAMMA - offset) / gain).clamp_min(0) ** (1 / GAMMA)
 
 
 def over(color: Tensor, alpha: Tensor, tissue: Tensor) -> Tensor:
     """[h, w, 3]: a colour that was drawn over black, with its alpha [h, w], over tissue."""
     return color + (1 - alpha[..., None]) * tissue
+
+
+def reduced(image: Tensor, size: float) -> Tensor:
+    """An image [h, w, C] at `size` times its size. Drawings are made at full size and then reduced, too: drawn small,
+    every Gaussian is widened by as many of the larger pixels, and a fit takes the instrument farther away for it."""
+    if size == 1:
+        return image
+    many = round(1 / size)  # crops are multiples of 8 px
+    height, width = image.shape[0] // many, image.shape[1] // many
+    rows = image.reshape(height, many, -1).sum(1)  # [h, W * C]
+    return rows.view(height, width, many, -1).sum(2) / many**2
 
 
 class InstrumentDrawer:
@@ -90,15 +130,13 @@ class InstrumentDrawer:
         """The instruments' Gaussians in `state`."""
         return self.alone.at(state)
 
-    @torch.no_grad()
-    def draw(self, posed: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
-        """(colour [h, w, 3] over black, alpha [h, w]) of posed instruments."""
-        rendering = rasterize(posed, camera, background=self._black)
-        return rendering.color.cpu(), rendering.alpha.cpu()
+    def draw(self, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
+        """(colour [h, w, 3] over black, alpha [h, w]) of the instruments in `state`."""
+        return self._draw(self.pose(state), camera)
 
     def composed(self, posed: Gaussians, view: View) -> Tensor:
         """[h, w, 3]: posed instruments over a view's tissue."""
-        return over(*self.draw(posed, view.camera), view.tissue)
+        return over(*self._draw(posed, view.camera), view.tissue)
 
     def moved(self, posed: Gaussians, state: State, other: State, view: View) -> Tensor:
         """`composed` of `other`, which differs from the `state` of `posed` by the place of the only instrument: what
@@ -108,6 +146,11 @@ class InstrumentDrawer:
         camera = view.camera
         seen_from = was @ torch.linalg.inv(now) @ camera.world_from_camera.to(now)
         return self.composed(posed, replace(view, camera=replace(camera, world_from_camera=seen_from.float())))
+
+    @torch.no_grad()
+    def _draw(self, posed: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
+        rendering = rasterize(posed, camera, background=self._black)
+        return rendering.color.cpu(), rendering.alpha.cpu()
 
     @torch.no_grad()
     def labelled(self, state: State, view: View) -> LabelledView:

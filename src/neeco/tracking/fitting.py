@@ -15,7 +15,7 @@ from neeco.capture.model import State
 from neeco.evaluation.photometric_fit import Minimum, Observed, minimise
 from neeco.raster.types import Gaussians
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, LabelledView, Tissue, View, over
+from neeco.tracking.drawing import InstrumentDrawer, LabelledView, Tissue, View, over, reduced
 
 HUBER = 0.05  # colour residual beyond which a pixel pulls linearly
 CORRELATION_PX = 25.0  # neighbouring pixels err together: so many of the full size count as one observation
@@ -105,7 +105,7 @@ class Fitter:
 
     def _explained(self, view: View, state: State) -> tuple[float, float]:
         """`gain` and `misfit` (see `Fit`) of a state before a view that holds all of the instruments."""
-        color, alpha = self.drawer.draw(self.drawer.pose(state), view.camera)
+        color, alpha = self.drawer.draw(state, view.camera)
         seen = observed(view, 1.0)
         with_it, without = (seen.errors(image).sum(2) for image in (over(color, alpha, view.tissue), view.tissue))
         gain = seen.scale * float((without - with_it).sum(dtype=torch.float64))
@@ -166,17 +166,6 @@ def observed(view: View, size: float) -> Observed:
     scale = size**-2 / (HUBER**2 * CORRELATION_PX * 3)
     weight = torch.where(reduced(view.weight[..., None], size)[..., 0] > 0.99, 1.0, 0.0)
     return Observed(reduced(view.image, size), weight, HUBER, scale)
-
-
-def reduced(image: Tensor, size: float) -> Tensor:
-    """An image [h, w, C] at `size` times its size. Drawings are made at full size and then reduced, too: drawn small,
-    every Gaussian is widened by as many of the larger pixels, and a fit takes the instrument farther away for it."""
-    if size == 1:
-        return image
-    many = round(1 / size)  # crops are multiples of 8 px
-    height, width = image.shape[0] // many, image.shape[1] // many
-    rows = image.reshape(height, many, -1).sum(1)  # [h, W * C]
-    return rows.view(height, width, many, -1).sum(2) / many**2
 
 
 def wide(coordinates: Coordinates, degrees: float, millimetres: float, joints: float) -> Tensor:

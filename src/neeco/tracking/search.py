@@ -12,8 +12,8 @@ from neeco.capture.model import InstrumentState, State, evenly_spaced
 from neeco.raster.types import Camera
 from neeco.scene import Recorded
 from neeco.tracking.coordinates import DEG, Coordinates
-from neeco.tracking.drawing import View
-from neeco.tracking.fitting import MARGIN, Fit, Fitter, observed, reduced, wide
+from neeco.tracking.drawing import View, reduced
+from neeco.tracking.fitting import MARGIN, Fit, Fitter, observed, wide
 from neeco.tracking.motion import Motion, Moving
 
 ALONG_MM = (-5.0, -2.5, 0.0, 2.5, 5.0)  # along the shaft: teeth, rings and its end hold a fit where it was

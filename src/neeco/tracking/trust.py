@@ -15,18 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from neeco.capture.model import Frame, State, evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typical_errors_of
-from neeco.raster.types import Camera
-from neeco.scene import Recorded
-from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
 from neeco.tracking.drawing import LabelledView, view_of, working_size
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.search import Search, differ
@@ -115,51 +109,12 @@ def observed_share(drawing: LabelledView) -> float:
 
 
 @dataclass(frozen=True)
-class RecordedRange:
-    """From where the instruments were seen in the training frames, and with which joints."""
-
-    coordinates: Coordinates
-    directions: tuple[Tensor, ...]  # of every instrument [M, 3] unit, instrument frame: from its pivot to the camera
-
-    @classmethod
-    def of(cls, coordinates: Coordinates, recorded: Recorded) -> RecordedRange:
-        """Of all recorded frames."""
-        pairs = list(zip(recorded.states, recorded.cameras, strict=True))
-        return cls(
-            coordinates,
-            tuple(
-                torch.stack([_direction(item, state, camera) for state, camera in pairs])
-                for item in coordinates.instruments
-            ),
-        )
-
-    def beyond(self, state: State, camera: Camera) -> float:
-        """deg that the instrument farthest from them is seen from beside all recorded directions."""
-        angles = [
-            float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
-            for item, recorded in zip(self.coordinates.instruments, self.directions, strict=True)
-        ]
-        return max(angles)
-
-
-def _direction(item: TrackedInstrument, state: State, camera: Camera) -> Tensor:
-    """[3] unit, instrument frame, float64."""
-    pose, centre = state.instruments[item.name].pose.double().cpu(), camera.world_from_camera[:3, 3].double().cpu()
-    return torch.nn.functional.normalize(pose[:3, :3].T @ (centre - pose[:3, 3]) - item.pivot, dim=0)
-
-
-@dataclass(frozen=True)
 class Judge:
     """Says how far tracked states are trusted."""
 
     fitter: Fitter
     search: Search
     reference: Reference
-
-    @cached_property
-    def range(self) -> RecordedRange:
-        """Of the frames that the scene was learned from."""
-        return RecordedRange.of(self.fitter.coordinates, self.search.recorded)
 
     def judge(self, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
         """Of a fitted state; and, where another was looked for (with `look`, or where the state is
