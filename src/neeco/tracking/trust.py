@@ -5,6 +5,7 @@ Trust is a product of four shares, each 1 where nothing speaks against the state
 - `overlap`: the overlap (IoU) of its label that the image supports (`neeco.evaluation.trust`). An instrument turned by
   25 degrees still explains most of its pixels, so the outline alone says nothing of roll and joints;
 - `explained`: how badly pixels are explained, against what is usual for the frames that the scene was learned from;
+  the farther from where it was ever seen, the better they have to be;
 - `observed`: how much of what is seen of the instrument some training frame saw, and from about there. Of sides that
   nobody saw, a scene draws what it likes, and images of them fit wrong rolls as well;
 - `single`: whether another state, turned or opened otherwise, explains the image about as well.
@@ -15,12 +16,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typical_errors_of
+from neeco.raster.types import Camera
+from neeco.scene import Recorded
+from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
 from neeco.tracking.drawing import LabelledView, view_of, working_size
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.search import Search, differ
@@ -31,6 +38,8 @@ LEAST_MISFIT = 0.08  # about 4 of 255 grey levels: what explains images better i
 LEAST_ERROR = 0.012  # of a pixel's colour, of 1: the same
 HALF_TRUSTED = 4.0  # times the usual misfit: where `explained` is 1/2
 STEEPNESS = 4.0
+STRANGE_DEG = 8.0  # so far from where it was ever seen, an instrument has to be explained twice as well: its scene is
+# a guess there, and wrong rolls fit guesses
 LEAST_OBSERVED = 0.9  # of what the worst of the reference frames has, is as good as all
 DOUBTED = 0.9  # of trust otherwise, below which another state is looked for
 OTHERS_FITTED = 2
@@ -109,6 +118,38 @@ def observed_share(drawing: LabelledView) -> float:
 
 
 @dataclass(frozen=True)
+class RecordedRange:
+    """From where the instruments were seen in the frames that were learned from."""
+
+    coordinates: Coordinates
+    directions: tuple[Tensor, ...]  # of every instrument [M, 3] unit, instrument frame: from its pivot to the camera
+
+    @classmethod
+    def of(cls, coordinates: Coordinates, recorded: Recorded) -> RecordedRange:
+        """Of all recorded frames."""
+        pairs = list(zip(recorded.states, recorded.cameras, strict=True))
+        directions = [
+            torch.stack([_direction(item, state, camera) for state, camera in pairs])
+            for item in coordinates.instruments
+        ]
+        return cls(coordinates, tuple(directions))
+
+    def beyond(self, state: State, camera: Camera) -> float:
+        """deg from the nearest direction from which it was seen, of the instrument for which it is farthest."""
+        angles = [
+            float((recorded @ _direction(item, state, camera)).amax().clamp(-1, 1).arccos()) / DEG
+            for item, recorded in zip(self.coordinates.instruments, self.directions, strict=True)
+        ]
+        return max(angles)
+
+
+def _direction(item: TrackedInstrument, state: State, camera: Camera) -> Tensor:
+    """[3] unit, instrument frame, float64."""
+    pose, centre = state.instruments[item.name].pose.double().cpu(), camera.world_from_camera[:3, 3].double().cpu()
+    return torch.nn.functional.normalize(pose[:3, :3].T @ (centre - pose[:3, 3]) - item.pivot, dim=0)
+
+
+@dataclass(frozen=True)
 class Judge:
     """Says how far tracked states are trusted."""
 
@@ -116,13 +157,20 @@ class Judge:
     search: Search
     reference: Reference
 
+    @cached_property
+    def range(self) -> RecordedRange:
+        """Of the frames that the scene was learned from."""
+        return RecordedRange.of(self.fitter.coordinates, self.search.recorded)
+
     def judge(self, fit: Fit, look: bool = False) -> tuple[TrackTrust, Fit | None]:
         """Of a fitted state; and, where another was looked for (with `look`, or where the state is
         doubted), the best one found that differs."""
         drawing, about = self.fitter.labelled(fit), fit.view
         beside = BESIDE * about.whole / math.hypot(about.camera.width, about.camera.height)
         overlap = estimate_trust(drawing, about.image, about.weight > 0, self.reference.errors, beside).value
-        explained = 1 / (1 + (fit.misfit / (HALF_TRUSTED * self.reference.misfit)) ** STEEPNESS)
+        beyond = self.range.beyond(fit.state, about.camera)
+        half = HALF_TRUSTED * self.reference.misfit / (1 + beyond / STRANGE_DEG)
+        explained = 1 / (1 + (fit.misfit / half) ** STEEPNESS)
         observed = min(1.0, observed_share(drawing) / (LEAST_OBSERVED * self.reference.observed))
         trust = TrackTrust(overlap, explained, observed, 1.0)
         if not look and trust.value >= DOUBTED:
