@@ -128,6 +128,22 @@ def test_a_fit_leaves_the_bound_of_a_joint(tracked_run: RecordedRun) -> None:
     assert off(fit.state, true)[2] < 2.5
 
 
+def test_what_is_in_front_is_not_held_against_a_state(tracked_run: RecordedRun) -> None:
+    fitter, true = fitter_of(tracked_run), grasper_state()
+    frame = record(tracked_run.scene, tracked_run.path / "hidden", [true], "new").frames[0]
+    view = view_of(frame, CAMERA, fitter.tissue, None)
+    fit = fitter.fit(view, true, wide(fitter.coordinates, 4, 4, 8))
+    hidden = view.image.clone()
+    hidden[24:44, 24:34] = torch.tensor([0.1, 0.9, 0.1])  # across the shaft
+    behind = fitter.fit(replace(view, image=hidden), true, wide(fitter.coordinates, 4, 4, 8))
+    wrong = fitter.fit(view, grasper_state(roll=0.6, jaw=0.9), wide(fitter.coordinates, 0.01, 0.01, 0.01))
+    assert fit is not None
+    assert behind is not None
+    assert wrong is not None
+    assert behind.misfit < 0.5 * wrong.misfit
+    assert off(behind.state, true)[0] < 2
+
+
 @pytest.mark.parametrize(("gain", "offset"), [(0.6, 0.2), (1.6, 0.0), (1.0, 0.0)])
 def test_smoke_and_exposure_are_taken_out_by_the_tissue(tracked_run: RecordedRun, gain: float, offset: float) -> None:
     tissue, image = Tissue(tracked_run.scene).draw(CAMERA, None), tracked_run.scene.render(moving(4), CAMERA).color

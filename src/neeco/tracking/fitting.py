@@ -22,6 +22,10 @@ CORRELATION_PX = 25.0  # neighbouring pixels err together: so many of the full s
 BESIDE = (
     0.015  # of the whole image's diagonal: so close by, an instrument explained badly is seen; not ill-drawn tissue
 )
+HIDING = 0.02  # of the diagonal: areas as wide that neither instrument nor tissue explains are of what is in front
+UNLIKE = 3 * HUBER * (0.1 - HUBER / 2)  # error of a pixel whose colours are off by 0.1
+MOST_HIDDEN = 0.3  # of an instrument: more, and it is rather somewhere else
+RIM = 5  # px, side of the square by which such areas are widened
 MARGIN = 28  # px about the instruments that a fit looks at
 STEPS_AT_ONCE = 2  # after so many, differences and the shadow are drawn anew, or a fit would be drawn to where it was
 SMALL = (0.05, 0.05, 0.1, 0.05)  # deg, mm, deg and mm of joints: a smaller step is the last
@@ -34,7 +38,8 @@ class Fit:
     state: State
     cost: float  # of pixels and prior, -log probability
     gain: float  # by how much pixels cost less than with the tissue alone; comparable between crops
-    misfit: float  # mean error a pixel of instrument, on it and close by, in squared HUBERs: 1 is as large as HUBER
+    misfit: float  # mean error a pixel of instrument, on it and close by, in squared HUBERs: 1 is as large as HUBER;
+    # what is in front does not count
     information: Tensor  # [P, P] that the pixels give of the increments
     view: View  # what was looked at, about the instruments, the shadow of `state` in it
 
@@ -109,8 +114,12 @@ class Fitter:
         seen = observed(view, 1.0)
         with_it, without = (seen.errors(image).sum(2) for image in (over(color, alpha, view.tissue), view.tissue))
         gain = seen.scale * float((without - with_it).sum(dtype=torch.float64))
-        about = widened(alpha > 0.5, round(BESIDE * view.whole))
-        pixels = float((alpha * view.weight).sum())
+        hidden = wide_areas((with_it > UNLIKE) & (without > UNLIKE), round(HIDING * view.whole))
+        opaque = alpha * view.weight
+        if float(opaque[hidden].sum()) > MOST_HIDDEN * float(opaque.sum()):
+            hidden = torch.zeros_like(hidden)
+        about = widened(alpha > 0.5, round(BESIDE * view.whole)) & ~hidden
+        pixels = float(opaque[~hidden].sum())
         return gain, float(with_it[about].sum()) / (0.5 * HUBER**2 * 3 * max(pixels, 1.0))
 
     def _descend(
@@ -153,6 +162,13 @@ class Fitter:
             coordinates.each(*SMALL),
             linearised_for=STEPS_AT_ONCE,
         )
+
+
+def wide_areas(mask: Tensor, pixels: int) -> Tensor:
+    """Where a mask bool [h, w] holds a square of so many pixels, and their rims."""
+    square = np.ones((pixels, pixels), np.uint8)
+    opened = cv2.morphologyEx(mask.numpy().astype(np.uint8), cv2.MORPH_OPEN, square)
+    return torch.from_numpy(cv2.dilate(opened, np.ones((RIM, RIM), np.uint8)) > 0)
 
 
 def widened(mask: Tensor, pixels: int) -> Tensor:
