@@ -71,9 +71,9 @@ def view_of(frame: Frame, camera: Camera, tissue: Tissue, state: State | None) -
         image, counted = area_averaged(image, width, height), area_averaged(counted[..., None], width, height)[..., 0]
     rows = slice(0, camera.height), slice(0, camera.width)
     weight = torch.where(counted[rows] > 0.99, 1.0, 0.0)
-    drawn = tissue.draw(camera, state)
-    seen = as_drawn(image[rows], drawn, weight)
-    return View(camera, seen, weight, drawn, state, math.hypot(camera.width, camera.height))
+    rendered = tissue.draw(camera, state)
+    seen = as_drawn(image[rows], rendered, weight)
+    return View(camera, seen, weight, rendered, state, math.hypot(camera.width, camera.height))
 
 
 def as_drawn(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
@@ -81,18 +81,18 @@ def as_drawn(image: Tensor, tissue: Tensor, weight: Tensor) -> Tensor:
     for each channel of light, which most of the tissue tells. The image itself where they agree, or no line explains
     it."""
     small = (reduced(each, 1 / BLOCK).flatten(0, 1) for each in (image, tissue, weight[..., None]))
-    seen, drawn, counted = (each.clamp(0, 1) ** GAMMA for each in small)
-    kept = counted[:, 0] > 0.99
+    seen, rendered, counted = (each.clamp(0, 1) ** GAMMA for each in small)
+    used = counted[:, 0] > 0.99
     for _ in range(TRIMMINGS):
-        if int(kept.sum()) < 8:
+        if int(used.sum()) < 8:
             return image
-        (some, others), spread = (each[kept] for each in (seen, drawn)), drawn[kept].var(0)
+        (some, others), spread = (each[used] for each in (seen, rendered)), rendered[used].var(0)
         gain = ((some - some.mean(0)) * (others - others.mean(0))).mean(0) / spread.clamp_min(1e-6)
         offset = some.mean(0) - gain * others.mean(0)
-        off = (seen - gain * drawn - offset).abs().amax(1)
-        kept = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
-    changed = ((gain - 1) * drawn[kept] + offset).abs().mean()
-    explained = off[kept].mean() < UNEXPLAINED * seen[kept].std(0).mean()
+        off = (seen - gain * rendered - offset).abs().amax(1)
+        used = (off <= 2 * off[counted[:, 0] > 0.99].median()) & (counted[:, 0] > 0.99)
+    changed = ((gain - 1) * rendered[used] + offset).abs().mean()
+    explained = off[used].mean() < UNEXPLAINED * seen[used].std(0).mean()
     if changed < AGREES or not explained or bool(((gain < GAINS[0]) | (gain > GAINS[1])).any()):
         return image
     return ((image**GAMMA - offset) / gain).clamp_min(0) ** (1 / GAMMA)
