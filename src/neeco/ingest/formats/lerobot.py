@@ -7,10 +7,14 @@ a quaternion or the frame that poses are stated in; where the columns' names do 
 
 from __future__ import annotations
 
+import os
 import re
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +44,7 @@ TIME = "timestamp_s"
 UNNAMED = "instrument"  # what a body is called that nothing names
 LARGEST_IMAGE = 90_000_000  # px, as for files of images
 IMAGES_AT_ONCE = 16  # of those that stand in Parquet
+DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
@@ -231,14 +236,19 @@ class _Stored(VideoSource):
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.rows[int(index)]: int(index) for index in indices}
-        order = []
-        for row, cell in _cells(self.path, self.key, self.episode):
-            if row in wanted:
-                order.append(wanted[row])
-                yield wanted[row], _decoded(f"{self.path}: {self.key}: frame {wanted[row]}", cell, self.size)
-            if len(order) == len(wanted):
-                return
-        raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
+        found = ((wanted[row], cell) for row, cell in _cells(self.path, self.key, self.episode) if row in wanted)
+        ahead: deque[tuple[int, Future[np.ndarray]]] = deque()
+        missing = len(wanted)
+        with ThreadPoolExecutor(DECODERS) as pool:  # zlib lets other threads run
+            for index, cell in islice(found, missing):
+                where = f"{self.path}: {self.key}: frame {index}"
+                ahead.append((index, pool.submit(_decoded, where, cell, self.size)))
+                missing -= 1
+                while len(ahead) > (DECODERS if missing else 0):
+                    index, pixels = ahead.popleft()
+                    yield index, pixels.result()
+        if missing:
+            raise NeecoError(f"{self.path}: {self.key}: is shorter than before; do not change the data set")
 
 
 def _open_stored(
