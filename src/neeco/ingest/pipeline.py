@@ -432,6 +432,7 @@ class _Ingest:
             registered,
             self.bases,
             data.ranges,
+            dict(zip(data.ranges, data.starts.tolist(), strict=False)),
         )
 
     def _named_image(self, frame: int) -> Path:

@@ -43,6 +43,9 @@ class IngestResult:
     registered: bool = True  # instrument poses are in the cameras' world
     bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
     episodes: dict[str, tuple[int, int]] = field(default_factory=dict)  # frames (first, last) of several recordings
+    episode_starts: dict[str, float] = field(
+        default_factory=dict
+    )  # s of the capture's time at which each has its own 0
 
     @property
     def still(self) -> bool:
@@ -51,10 +54,21 @@ class IngestResult:
 
     def frame_words(self, frame: int) -> str:
         """What a video frame is called: its number, and of several recordings which is meant."""
-        for name, (first, last) in self.episodes.items():
-            if first <= frame <= last:
-                return f"{name}: video frame {frame - first}"
-        return f"video frame {frame}"
+        name = self._episode_of(frame)
+        return f"video frame {frame}" if name is None else f"{name}: video frame {frame - self.episodes[name][0]}"
+
+    def log_times(self, frame: int, seconds: float) -> dict[str, float]:
+        """What the logs' clocks show, s, as a video frame is taken at `seconds` of the capture's time: of several
+        recordings, those of the frame's own."""
+        name = self._episode_of(frame)
+        if name is None:
+            return {clock: seconds + ahead.seconds for clock, ahead in self.clocks.items()}
+        own = seconds - self.episode_starts[name]
+        return {clock: own + ahead.seconds for clock, ahead in self.clocks.items() if clock.endswith(f" of {name}")}
+
+    def _episode_of(self, frame: int) -> str | None:
+        """The name of the one of several recordings that a video frame is of."""
+        return next((name for name, (first, last) in self.episodes.items() if first <= frame <= last), None)
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts (`--json`): mm, degrees, px, s."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from neeco.report.ingest_figures import AXIS_COLORS, axis_length
 
 MISSING = "--rrd: needs the package rerun-sdk; install neeco[rerun]"
 VIDEO_CLOCK = "video"  # the timeline of the video's seconds; others are the logs' clocks
-WORLD, CAMERA = "world", "world/camera"
+WORLD, CAMERA, RIGHT_CAMERA = "world", "world/camera", "world/right_camera"
 
 
 def require_rerun() -> Any:
@@ -33,24 +34,32 @@ def write_rrd(result: IngestResult, capture: Capture, path: Path) -> None:
 
     In the viewer `world` has the tissue's points, the cameras with their images and what moves in them, and the
     instruments with their rough shapes; `joints` has curves; `clocks` says how far each log is ahead. There is a
-    timeline for the video and one for each clock. Poses that were not registered are under `unregistered`, a world of
-    their own. Raises NeecoError when rerun is missing, an image cannot be read or the file cannot be written.
+    timeline for the video and one for each clock, of several recordings for each clock of each. Poses that were not
+    registered are under `unregistered`, a world of their own. Raises NeecoError when rerun is missing, an image cannot
+    be read or the file cannot be written.
     """
     rerun = require_rerun()
     stream = rerun.RecordingStream("neeco ingest", recording_id=str(result.capture), send_properties=False)
     memory = stream.memory_recording()
     _log_still(rerun, stream, result, capture)
-    numbers = dict(zip(np.round(result.selected_times, 6).tolist(), result.selected.tolist(), strict=True))
+    shown = -math.inf
     for frame in sorted(capture.frames, key=lambda frame: frame.state.time):
         seconds = frame.state.time
+        number = int(result.selected[np.abs(result.selected_times - seconds).argmin()])
+        stream.reset_time()  # of several recordings, each has clocks of its own
         stream.set_time(VIDEO_CLOCK, duration=seconds)
-        for name, clock in result.clocks.items():
-            if name != VIDEO_CLOCK and not result.episodes:  # of several recordings, each has clocks of its own
-                stream.set_time(name, duration=seconds + clock.seconds)
-        _log_frame(rerun, stream, frame, capture.registered)
-        number = numbers.get(round(seconds, 6))
-        if number in result.moving:
-            _log_moving(rerun, stream, result.moving[number], frame)
+        for name, time in result.log_times(number, seconds).items():
+            if name != VIDEO_CLOCK:
+                stream.set_time(name, duration=time)
+        camera = (
+            RIGHT_CAMERA if seconds == shown else CAMERA
+        )  # a stereo partner's frame follows the left one of its time
+        _log_camera(rerun, stream, frame, camera)
+        if camera == CAMERA:
+            _log_states(rerun, stream, frame, capture.registered)
+            if number in result.moving:
+                _log_moving(rerun, stream, result.moving[number], frame)
+        shown = seconds
     content = memory.drain_as_bytes()
     write_atomically(path, lambda file: file.write_bytes(content))
 
@@ -78,16 +87,20 @@ def _log_still(rerun: Any, stream: Any, result: IngestResult, capture: Capture) 
     stream.log("clocks", rerun.TextDocument(table, media_type="text/markdown"), static=True)
 
 
-def _log_frame(rerun: Any, stream: Any, frame: Frame, registered: bool) -> None:
-    """A frame's image, camera and states, at the time that is set."""
+def _log_camera(rerun: Any, stream: Any, frame: Frame, place: str) -> None:
+    """A frame's image and camera at a place in the viewer, at the time that is set."""
     camera = frame.camera
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    stream.log(CAMERA, _transform(rerun, camera.world_from_camera.double().numpy()))
+    stream.log(place, _transform(rerun, camera.world_from_camera.double().numpy()))
     pinhole = rerun.Pinhole(
         image_from_camera=matrix, resolution=[camera.width, camera.height], camera_xyz=rerun.ViewCoordinates.RDF
     )
-    stream.log(f"{CAMERA}/image", pinhole)
-    stream.log(f"{CAMERA}/image", rerun.Image(frame.load_image_bytes().numpy()).compress(jpeg_quality=90))
+    stream.log(f"{place}/image", pinhole)
+    stream.log(f"{place}/image", rerun.Image(frame.load_image_bytes().numpy()).compress(jpeg_quality=90))
+
+
+def _log_states(rerun: Any, stream: Any, frame: Frame, registered: bool) -> None:
+    """A frame's instrument states, at the time that is set."""
     for name, state in frame.state.instruments.items():
         stream.log(_place(name, registered), _transform(rerun, state.pose.numpy()))
         for joint, value in state.joints.items():
