@@ -90,6 +90,25 @@ def test_readings_are_corrected_once_for_all_cameras_of_an_instant() -> None:
     assert refinement.found(recorded, (instrument,)) is recorded  # what was recorded stays
 
 
+def test_poses_are_corrected_once_for_all_cameras_of_an_instant() -> None:
+    frames, instrument = seen_twice()
+    refinement = Refinement(RefineConfig(frame_poses=True, start=0), frames, (instrument,), CPU)
+    state, _, _ = refinement.apply(4, frames[4].state, CAMERA, 1)
+    state.instruments["rod"].pose[0, 3].backward()
+    refinement.step(4, 0.0)
+
+    def moved(frame: int) -> float:
+        given = frames[frame].state
+        found = refinement.apply(frame, given, CAMERA, 1)[0]
+        return float(found.instruments["rod"].pose[0, 3].detach() - given.instruments["rod"].pose[0, 3])
+
+    shifts = [moved(frame) for frame in range(12)]
+    assert shifts[4] == shifts[5] < 0
+    assert shifts[:4] + shifts[6:] == pytest.approx([0.0] * 10, abs=1e-7)
+    refinement.center()  # of the one instant seen, nothing is left
+    assert moved(4) == pytest.approx(0.0, abs=1e-7)
+
+
 def test_a_joint_that_nobody_recorded_is_found_within_its_limits_and_told_beside() -> None:
     frames, instrument = seen_twice(("jaw",))
     refinement = Refinement(RefineConfig(frame_joints=True, start=0), frames, (instrument,), CPU)

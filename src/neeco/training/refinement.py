@@ -26,11 +26,11 @@ STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
 
 
 class Refinement:
-    """Per-frame 6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
+    """6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
 
     Readings of joints in stated kinematics are corrected in rad or mm, those that nobody recorded are found from half
-    way between their limits on: once for frames of one instant, as several cameras see it, and smooth in time.
-    Tensors: `poses` [F, I, 6], `joints` [instants, R], `cameras` [F, 6], `latency` [1].
+    way between their limits on, smooth in time. Poses and readings are corrected once for frames of one instant, as
+    several cameras see it. Tensors: `poses` [instants, I, 6], `joints` [instants, R], `cameras` [F, 6], `latency` [1].
     """
 
     def __init__(
@@ -47,11 +47,14 @@ class Refinement:
         sliding = {(item.name, reading) for item in instruments for reading in item.joints if item.slides(reading)}
         per_rad = torch.tensor([MM_PER_RAD if reading in sliding else 1.0 for reading in self.readings], device=device)
         self.instants, self.beside = _instants(frames, names)
+        self.shown_by: list[list[int]] = [[] for _ in self.beside]  # the frames of each instant
+        for frame, instant in enumerate(self.instants):
+            self.shown_by[instant].append(frame)
         self.joints = torch.zeros(len(self.beside), len(self.readings), device=device)
-        self.poses = torch.zeros(len(frames), len(names), 6, device=device)
+        self.poses = torch.zeros(len(self.beside), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
-        self.velocities = _velocities(frames, names).to(device)  # [F, I, 6] per s, body frame
+        self.velocities = _velocities(tuple(frames[shown[0]] for shown in self.shown_by), names).to(device)
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),
@@ -74,22 +77,21 @@ class Refinement:
         self._leaves = {}
         if iteration < self.config.start:
             return state, camera, None
-        penalty = None
+        penalty, instant = None, self.instants[index]
         if self.instruments and (self.config.frame_poses or self.config.latency or self.config.frame_joints):
             offset = self.latency.new_zeros(len(self.instruments), 6)
             if self.config.frame_poses:
-                leaf = self._leaves["poses"] = self.poses[index].clone().requires_grad_()
+                leaf = self._leaves["poses"] = self.poses[instant].clone().requires_grad_()
                 offset = offset + leaf
                 penalty = self._prior(leaf, self.prior_sigma)
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
-                offset = offset + self.velocities[index] * leaf
+                offset = offset + self.velocities[instant] * leaf
             moved = dict(state.instruments)
             for k, name in enumerate(self.instruments):
                 given = state.instruments[name]
                 moved[name] = InstrumentState(given.pose.to(offset) @ rigid_from_vector(offset[k]), given.joints)
             if self.config.frame_joints and self.readings:
-                instant = self.instants[index]
                 leaf = self._leaves["joints"] = self.joints[instant].clone().requires_grad_()
                 expected = torch.where(self.unrecorded, self.joints[self.beside[instant]].mean(0), 0.0)
                 joint_penalty = self._prior(leaf - expected, self.joint_sigma)
@@ -117,17 +119,20 @@ class Refinement:
             return
         self.frame_steps[index] += 1
         decay = log_linear(1.0, 0.1, progress)
+        instant = self.instants[index]
+        of_instant = float(self.frame_steps[self.shown_by[instant]].sum())
+        rows: dict[str, tuple[Any, float]] = {
+            "poses": (instant, of_instant),
+            "joints": (instant, of_instant),
+            "cameras": (index, float(self.frame_steps[index])),
+            "latency": (slice(None), float(self.frame_steps.sum())),  # shared by all frames
+        }
         for name, leaf in self._leaves.items():
             if leaf.grad is None:
                 continue
-            # the latency is shared by all frames
-            row, steps = (
-                (slice(None), self.frame_steps.sum()) if name == "latency" else (index, self.frame_steps[index])
-            )
-            if name == "joints":
-                row = self.instants[index]
+            row, steps = rows[name]
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
-            update = adam_update(leaf.grad, first, second, float(steps), (0.9, 0.99), 1e-12)
+            update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
             getattr(self, name)[row] -= decay * self.rates[name] * update
         self._leaves = {}
 
@@ -135,10 +140,12 @@ class Refinement:
     def center(self) -> None:
         """Take the mean correction out: a constant one belongs to the instrument's shape (and to
         `Scene.registration`)."""
-        seen = (self.frame_steps > 0).nonzero()[:, 0].to(self.poses.device)
+        seen = (self.frame_steps > 0).nonzero()[:, 0]
         if len(seen):
-            self.poses[seen] -= self.poses[seen].mean(0)
+            instants = torch.tensor(sorted({self.instants[frame] for frame in seen.tolist()}), device=self.poses.device)
+            self.poses[instants] -= self.poses[instants].mean(0)
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
+            seen = seen.to(self.cameras.device)
             self.cameras[seen] -= self.cameras[seen].mean(0)
 
     def found(self, recorded: Recorded, instruments: tuple[Instrument, ...]) -> Recorded:
@@ -190,8 +197,8 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
 
 
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:
-    """[F, I, 6] body-frame velocity (rad/s, mm/s) by differences between neighbours in time; 0 where time stands
-    still."""
+    """[F, I, 6] body-frame velocity (rad/s, mm/s) of frames, one for each instant, by differences between neighbours in
+    time; 0 where time stands still."""
     count = len(frames)
     velocity = torch.zeros(count, len(instruments), 6)
     order = sorted(range(count), key=lambda i: frames[i].state.time)
