@@ -12,11 +12,14 @@ WIDTH, HEIGHT, FRAMES = 160, 128, 40
 
 
 class Film:
-    """Smooth reddish tissue with texture, seen by a scope that moves by `drift` px a frame; it breathes by `breath` px,
-    shines in other places in every frame, and a grey bar with a shadow beside it sweeps over it."""
+    """Smooth reddish tissue with texture, seen by a scope that moves by `drift` px a frame; it breathes by `breath` px
+    in the middle, less by a Gaussian of `reach` px beside, shines in other places in every frame, and a grey bar with a
+    shadow beside it sweeps over it."""
 
-    def __init__(self, drift: float = 0.0, breath: float = 0.0, gain: float = 0.0, shadow: bool = False) -> None:
-        self.drift, self.breath, self.gain, self.shadow = drift, breath, gain, shadow
+    def __init__(
+        self, drift: float = 0.0, breath: float = 0.0, gain: float = 0.0, shadow: bool = False, reach: float = 1e6
+    ) -> None:
+        self.drift, self.breath, self.gain, self.shadow, self.reach = drift, breath, gain, shadow, reach
         generator = np.random.default_rng(1)
         wide = generator.normal(0, 1, (2 * HEIGHT, 4 * WIDTH)).astype(np.float32)
         texture = 2 * cv2.GaussianBlur(wide, (0, 0), 2.0) + 5 * cv2.GaussianBlur(wide, (0, 0), 5.0)
@@ -34,9 +37,10 @@ class Film:
 
     def load(self, number: int) -> np.ndarray:
         generator = np.random.default_rng(100 + number)
-        x, y = WIDTH / 2 + self.drift * number, 40 + self.breath * np.sin(1.1 * number)
-        shift = np.array([[1, 0, -x], [0, 1, -y]], np.float32)
-        image = cv2.warpAffine(self.tissue, shift, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR).astype(np.float64)
+        rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+        breathes = self.breath * np.exp(-(((columns - WIDTH / 2) / self.reach) ** 2)) * np.sin(1.1 * number)
+        places = columns + WIDTH / 2 + self.drift * number, rows + 40 + breathes.astype(np.float32)
+        image = cv2.remap(self.tissue, *places, cv2.INTER_LINEAR).astype(np.float64)
         for u, v in generator.integers((0, 0), (WIDTH, HEIGHT), (6, 2)).tolist():
             cv2.circle(image, (u, v), 1, (250, 245, 240), -1)
         left = self.place(number)
@@ -92,6 +96,7 @@ def test_where_an_instrument_is_known_to_stand_the_other_frames_say_what_is_behi
 def test_a_scope_is_still_whatever_moves_before_it_and_moving_when_it_drifts() -> None:
     assert stands_still(Film().load, FRAMES)
     assert stands_still(Film(breath=1.0, gain=0.1, shadow=True).load, FRAMES)
+    assert stands_still(Film(breath=4.0, reach=40.0).load, FRAMES)  # some of it hardly moves
     assert not stands_still(Film(drift=0.5).load, FRAMES)
     assert not stands_still(Film(breath=8.0).load, FRAMES)
 

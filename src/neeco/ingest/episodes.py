@@ -22,11 +22,12 @@ from neeco.ingest.logs import PoseLog, ReadingLog
 from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
 from neeco.ingest.registration import GIVEN, ClockOffset
 from neeco.ingest.sfm import StageProgress
-from neeco.ingest.still import STILL_SHARE, same_place
+from neeco.ingest.still import same_place
 from neeco.ingest.synchronized import States, SynchronizedRecording
 
 PAUSE_S = 2.0  # longer than anything that is smooth in time looks beyond an instant
-MOSTLY_ALIKE = 0.7  # of the features of one episode's background in place in another's: less is worth a note
+SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+MOSTLY_ALIKE = 0.7  # less is worth a note
 Log = TypeVar("Log", PoseLog, ReadingLog)
 
 
@@ -110,10 +111,11 @@ class Episodes:
         for background, episode in zip(backgrounds[1:], episodes[1:], strict=True):
             share = same_place(backgrounds[0], background)
             first, part = self.names[episodes[0]], self.parts[episode]
-            if share is not None and share < STILL_SHARE:
+            if share is not None and share < SAME_PLACE:
                 raise NeecoError(
                     f"{part.recording.path}: {self.names[episode]} shows another place than {first}: {share:.0%} of "
-                    "the background is where it was; one capture has one tissue: ingest it alone"
+                    "the background is where it was; one capture has one tissue: ingest it alone, and mix the scenes "
+                    "(`neeco synthesize --tissue`)"
                 )
             if share is not None and share < MOSTLY_ALIKE:
                 self.note(

@@ -26,7 +26,7 @@ FEW_FEATURES = 30  # from which nothing is concluded
 FOLLOWING: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
 IN_PLACE = 0.0125  # of the image's width: a feature is where it was (tissue breathes)
 RETURNS = 1.0  # px that a feature may be off when it is followed there and back
-STILL_SHARE = 0.4  # of the features, that stay in place in frames of a still scope; the others are on what moves
+STILL_SHARE = 0.2  # of the features, that stay in place in frames of a still scope; the others move or breathe
 STILL_PAIRS = 0.85  # of the pairs of frames, in which they do
 
 # background and what moves before it
