@@ -58,6 +58,7 @@ def test_a_stereo_partner_measures_the_tissue_and_is_one_view_more_to_learn_from
     depth = capture.points.positions[:, 2]
     assert np.quantile(np.abs(depth - TISSUE), 0.9) < 0.03 * TISSUE
     right = [frame for frame in capture.frames if frame.name.endswith("_right")]
+    assert all(frame.camera.world_from_lamps is not None for frame in right)  # the scope's lamps are at the left camera
     assert {frame.split for frame in right} == {"train"}
     assert len(right) == len(capture.split("train")) / 2
     assert right[0].camera.world_from_camera[:3, 3].tolist() == pytest.approx([BASELINE, 0, 0])

@@ -18,6 +18,7 @@ from neeco.raster.types import Shadow
 
 CAMERA = Camera(torch.eye(4), fx=80.0, fy=80.0, cx=40.0, cy=32.0, width=80, height=64)
 WALL, ROD = 100.0, 60.0  # mm, depths
+LAMP = torch.tensor([[-30.0, 0.0, 0.0]]), torch.tensor([0.5]), torch.tensor(0.005)  # offsets, strengths, width
 
 
 def scene(
@@ -61,6 +62,33 @@ def test_the_shadow_falls_on_the_side_away_from_the_light() -> None:
     assert middle == pytest.approx(expected, abs=0.5)
     assert float(darkened.max()) == pytest.approx(1 - 0.5 ** (1 / GAMMA), abs=0.03)  # half the light
     assert float(darkened[45:].abs().max()) < 1e-3
+
+
+def beside(shift: float) -> Camera:
+    """The camera `shift` mm to the right of CAMERA, beside which the lamps are."""
+    pose = torch.eye(4)
+    pose[0, 3] = shift
+    return replace(CAMERA, world_from_camera=pose, world_from_lamps=CAMERA.world_from_camera)
+
+
+def test_a_camera_beside_sees_the_shadow_where_the_first_cameras_lamps_cast_it() -> None:
+    offset, camera = torch.tensor([30.0, 0.0, 0.0]), beside(6.0)
+    darkened = (rasterize(scene(), camera).color - rasterize(scene(offset), camera).color)[32, :, 0]  # [W]
+    expected = CAMERA.cx + CAMERA.fx * (-20.0 - 6.0) / WALL  # it stays at -20 mm on the wall
+    middle = float((darkened * (torch.arange(80) + 0.5)).sum() / darkened.sum())
+    assert middle == pytest.approx(expected, abs=0.5)
+
+
+def test_light_dims_with_the_distance_from_the_lamps_whichever_camera_sees_it() -> None:
+    gaussians, place = scene(), torch.tensor([40.0, 10.0, WALL])
+    falloff = torch.full_like(gaussians.opacities, 2.0)
+    for shadow in (None, Shadow(scene(torch.zeros(3)).headlight.shadow.casters, *LAMP)):  # type: ignore[union-attr]
+        lit = replace(gaussians, headlight=Headlight(falloff, torch.zeros(2), shadow))
+        seen = []
+        for camera in (CAMERA, beside(25.0)):
+            x, y = camera.fx * (place[0] - camera.world_from_camera[0, 3]) / WALL, camera.fx * place[1] / WALL
+            seen.append(rasterize(lit, camera).color[int(camera.cy + y), int(camera.cx + x), 0])
+        assert float(seen[1]) == pytest.approx(float(seen[0]), rel=0.02)  # pixels are not at the same place of the wall
 
 
 def test_a_light_at_the_lens_hides_its_shadow_behind_what_casts_it() -> None:

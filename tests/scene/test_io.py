@@ -223,6 +223,22 @@ def test_an_unpaired_surrogate_is_refused(kinematic: Scene, tmp_path: Path) -> N
         load_scene(tmp_path / "scene.safetensors")
 
 
+def test_both_cameras_of_a_still_scope_have_the_lamps_of_the_first(any_scene: Scene, tmp_path: Path) -> None:
+    recorded, right = any_scene.recorded, torch.eye(4)
+    right[0, 3] = 5.0
+    poses = [torch.eye(4) if index % 2 == 0 else right for index in range(len(recorded.cameras))]
+    cameras = tuple(
+        dataclasses.replace(camera, world_from_camera=pose)
+        for camera, pose in zip(recorded.cameras, poses, strict=True)
+    )
+    any_scene.recorded = dataclasses.replace(recorded, cameras=cameras, still=True)
+    save_scene(any_scene, tmp_path / "scene.safetensors")
+    first, second, *_ = load_scene(tmp_path / "scene.safetensors").recorded.cameras
+    assert first.world_from_lamps is None
+    assert second.world_from_lamps is not None
+    assert torch.equal(second.world_from_lamps, torch.eye(4))
+
+
 def test_a_scene_remembers_that_its_scope_stood_still(any_scene: Scene, tmp_path: Path) -> None:
     any_scene.recorded = dataclasses.replace(any_scene.recorded, still=True)
     save_scene(any_scene, tmp_path / "scene.safetensors")

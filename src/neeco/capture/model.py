@@ -161,6 +161,17 @@ class Capture:
         return tuple(dict.fromkeys(frame.split for frame in self.frames))
 
 
+def share_lamps(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The cameras of a still scope, of which the first has the lamps beside it: a second one, of a stereo scope, has
+    none of its own."""
+    shared = []
+    for camera in cameras:
+        first = cameras[0].world_from_camera
+        beside = torch.equal(camera.world_from_camera, first)
+        shared.append(camera if beside else replace(camera, world_from_lamps=first))
+    return tuple(shared)
+
+
 class RecordedStates:
     """Distances of states from the recorded ones, in standard deviations of those.
 

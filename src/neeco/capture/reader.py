@@ -13,7 +13,7 @@ import torch
 from neeco.capture.colmap import find_model, parse_colmap
 from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
-from neeco.capture.model import Capture, Instrument, State
+from neeco.capture.model import Capture, Instrument, State, share_lamps
 from neeco.capture.points import points_in_view
 from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
@@ -44,6 +44,9 @@ def capture_of(parsed: Parsed) -> Capture:
     if points is None:
         points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
     frames, instruments = tuple(parsed.frames), parsed.instruments
+    if parsed.still:
+        lit = share_lamps([frame.camera for frame in frames])
+        frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
     if any(item.unrecorded for item in instruments):
         frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
     if any(item.kinematics is not None and item.kinematics.pose_of is not None for item in instruments):

@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample
 from neeco.raster.devices import constant
 from neeco.raster.native import all_run_native, native
 from neeco.raster.pinhole import project
-from neeco.raster.types import Camera, Gaussians, Rendering
+from neeco.raster.types import Camera, Gaussians, Rendering, Shadow
 
 RESOLUTION = 0.5  # of the image's
 MARGIN = 0.15  # of the image's size, to each side: what casts may stand beside the image
@@ -33,26 +33,41 @@ Draw = Callable[[Gaussians, Camera], Rendering]
 
 
 def shadowed(gaussians: Gaussians, camera: Camera, draw: Draw) -> Gaussians:
-    """The same Gaussians, their headlight with what its shadows leave of it instead of them; `draw` rasterizes.
+    """The same Gaussians, their headlight with what its shadows leave of it instead of them, as it shines from the
+    camera's lamps; `draw` rasterizes.
 
-    Gradients reach the lamps' offsets, strengths and width; the casters' shapes are taken as they are.
+    Gradients reach the falloff, and the lamps' offsets, strengths and width; the casters' shapes are taken as they are.
     """
     light = gaussians.headlight
-    if light is None or light.shadow is None:
+    if light is None or light.left is not None:
         return gaussians
-    shadow = light.shadow
+    left = None if light.shadow is None else _left_by(light.shadow, gaussians, camera, draw)
+    if camera.world_from_lamps is not None:
+        beside = _from_beside(light.falloff, gaussians.means, camera, camera.world_from_lamps)
+        left = beside if left is None else left * beside
+    return gaussians if left is None else replace(gaussians, headlight=replace(light, shadow=None, left=left))
+
+
+def _left_by(shadow: Shadow, gaussians: Gaussians, camera: Camera, draw: Draw) -> Tensor | None:
+    """[N] what a shadow leaves of the Gaussians' stored colours; None: nothing casts, or there is nothing behind."""
     casters, lit = shadow.casters, shadow.strengths.detach() > 0
     every, some, *shines = torch.stack([casters.all(), casters.any(), *lit]).tolist()  # the device is asked once
     if every or not some or not any(shines):  # nothing to fall on, or nothing that falls
-        return gaussians
+        return None
     shares = blocked(Casting.of(gaussians, casters, camera), shadow.width, shadow.offsets, draw, shines)
-    left = (1 - shadow.strengths @ shares).clamp_min(DARKEST) ** (1 / GAMMA)
-    return replace(gaussians, headlight=replace(light, shadow=None, left=left))
+    return (1 - shadow.strengths @ shares).clamp_min(DARKEST) ** (1 / GAMMA)
+
+
+def _from_beside(falloff: Tensor, means: Tensor, camera: Camera, world_from_lamps: Tensor) -> Tensor:
+    """[N] by how much brighter than from the camera itself the headlight shines from lamps elsewhere."""
+    places = (pose[:3, 3].detach().to(means) for pose in (camera.world_from_camera, world_from_lamps))
+    own, lamps = ((means.detach() - place).norm(dim=1).clamp_min(NEAREST).log() for place in places)
+    return torch.exp(falloff * (own - lamps))
 
 
 @dataclass(frozen=True)
 class Casting:
-    """Those that cast and those that may stand behind them, before a camera: the same for every lamp."""
+    """Those that cast and those that may stand behind them, before the lamps' camera: the same for every lamp."""
 
     casters: Tensor  # [N] bool
     bare: Gaussians  # the casters, as opaque as they are and of no particular colour
@@ -62,7 +77,9 @@ class Casting:
     @staticmethod
     @torch.no_grad()
     def of(gaussians: Gaussians, casters: Tensor, camera: Camera) -> Casting:
-        """Of all the Gaussians and which of them cast, bool [N]."""
+        """Of all the Gaussians and which of them cast, bool [N], before the camera that the lamps are beside."""
+        if camera.world_from_lamps is not None:
+            camera = replace(camera, world_from_camera=camera.world_from_lamps, world_from_lamps=None)
         bare = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None, background=None).select(casters)
         return Casting(casters, bare, gaussians.means.detach(), camera)
 

@@ -120,6 +120,8 @@ class Camera:
     distortion: tuple[float, ...] = ()  # k1, k2, p1, p2[, k3, ...]
     border: tuple[float, float, float] | None = None  # px: centre x, y and radius of what the lens shows
     learned_fx: float | None = None  # px, of the images that Gaussians were learned from; None: of ones like this
+    # [4, 4] rigid, mm: the camera that the lamps are beside, where it is another: a stereo scope has lamps once
+    world_from_lamps: Tensor | None = None
 
     if TYPE_CHECKING:  # what may be given
 
@@ -136,6 +138,7 @@ class Camera:
             distortion: tuple[float, ...] = ...,
             border: tuple[float, float, float] | None = ...,
             learned_fx: float | None = ...,
+            world_from_lamps: Tensor | None = ...,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -143,8 +146,9 @@ class Camera:
         object.__setattr__(self, "world_from_camera", pose)
 
     def to(self, device: torch.device | str) -> Camera:
-        """The same camera, its pose on `device`."""
-        return replace(self, world_from_camera=self.world_from_camera.to(device))
+        """The same camera, its pose and that of its lamps on `device`."""
+        lamps = None if self.world_from_lamps is None else self.world_from_lamps.to(device)
+        return replace(self, world_from_camera=self.world_from_camera.to(device), world_from_lamps=lamps)
 
     @property
     def is_pinhole(self) -> bool:

@@ -16,7 +16,7 @@ from neeco import __version__
 from neeco.capture.documents import Node, RaisingReport
 from neeco.capture.kinematicsfile import kinematics_of
 from neeco.capture.lensfile import parse_lens
-from neeco.capture.model import Camera, Instrument, InstrumentState, State
+from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
@@ -175,7 +175,8 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
-    return instruments, Recorded(names, splits, tuple(states), tuple(cameras), lens, scale, still)
+    lit = share_lamps(cameras) if still else tuple(cameras)
+    return instruments, Recorded(names, splits, tuple(states), lit, lens, scale, still)
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:
