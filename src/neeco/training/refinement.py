@@ -6,6 +6,7 @@ The constant tracker-to-world correction is the scene's own (`Scene.registration
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,8 +30,10 @@ class Refinement:
     """6-vectors (rotation rad, translation mm, in the instrument's or camera's own frame) and a latency in s.
 
     Readings of joints in stated kinematics are corrected in rad or mm, those that nobody recorded are found from half
-    way between their limits on, smooth in time. Poses and readings are corrected once for frames of one instant, as
-    several cameras see it. Tensors: `poses` [instants, I, 6], `joints` [instants, R], `cameras` [F, 6], `latency` [1].
+    way between their limits on, smooth in time, once for frames of one instant, as several cameras see it. Poses are
+    corrected once for the two images of a stereo scope, P of all; where scopes stand apart, what is wrong with their
+    cameras makes every image's own pose fit better. Tensors: `poses` [P, I, 6], `joints` [instants, R], `cameras`
+    [F, 6], `latency` [1].
     """
 
     def __init__(
@@ -47,14 +50,18 @@ class Refinement:
         sliding = {(item.name, reading) for item in instruments for reading in item.joints if item.slides(reading)}
         per_rad = torch.tensor([MM_PER_RAD if reading in sliding else 1.0 for reading in self.readings], device=device)
         self.instants, self.beside = _instants(frames, names)
-        self.shown_by: list[list[int]] = [[] for _ in self.beside]  # the frames of each instant
-        for frame, instant in enumerate(self.instants):
-            self.shown_by[instant].append(frame)
+        self.pose_rows = _numbered(
+            [(instant, _scope(frame)) for instant, frame in zip(self.instants, frames, strict=True)]
+        )
+        self.posed: list[list[int]] = [[] for _ in range(max(self.pose_rows, default=-1) + 1)]  # frames of each pose
+        for frame, row in enumerate(self.pose_rows):
+            self.posed[row].append(frame)
         self.joints = torch.zeros(len(self.beside), len(self.readings), device=device)
-        self.poses = torch.zeros(len(self.beside), len(names), 6, device=device)
+        self.poses = torch.zeros(len(self.posed), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
         self.latency = torch.zeros(1, device=device)
-        self.velocities = _velocities(tuple(frames[shown[0]] for shown in self.shown_by), names).to(device)
+        first = tuple(frames[shown[0]] for shown in self.posed)
+        self.velocities = _velocities(first, names).to(device)  # [P, I, 6] per s, body frame
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         self.rates = {
             "poses": rates.to(device),
@@ -77,16 +84,16 @@ class Refinement:
         self._leaves = {}
         if iteration < self.config.start:
             return state, camera, None
-        penalty, instant = None, self.instants[index]
+        penalty, instant, row = None, self.instants[index], self.pose_rows[index]
         if self.instruments and (self.config.frame_poses or self.config.latency or self.config.frame_joints):
             offset = self.latency.new_zeros(len(self.instruments), 6)
             if self.config.frame_poses:
-                leaf = self._leaves["poses"] = self.poses[instant].clone().requires_grad_()
+                leaf = self._leaves["poses"] = self.poses[row].clone().requires_grad_()
                 offset = offset + leaf
                 penalty = self._prior(leaf, self.prior_sigma)
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
-                offset = offset + self.velocities[instant] * leaf
+                offset = offset + self.velocities[row] * leaf
             moved = dict(state.instruments)
             for k, name in enumerate(self.instruments):
                 given = state.instruments[name]
@@ -119,12 +126,11 @@ class Refinement:
             return
         self.frame_steps[index] += 1
         decay = log_linear(1.0, 0.1, progress)
-        instant = self.instants[index]
-        of_instant = float(self.frame_steps[self.shown_by[instant]].sum())
+        pose, own = self.pose_rows[index], float(self.frame_steps[index])
         rows: dict[str, tuple[Any, float]] = {
-            "poses": (instant, of_instant),
-            "joints": (instant, of_instant),
-            "cameras": (index, float(self.frame_steps[index])),
+            "poses": (pose, float(self.frame_steps[self.posed[pose]].sum())),
+            "joints": (self.instants[index], own),
+            "cameras": (index, own),
             "latency": (slice(None), float(self.frame_steps.sum())),  # shared by all frames
         }
         for name, leaf in self._leaves.items():
@@ -142,8 +148,8 @@ class Refinement:
         `Scene.registration`)."""
         seen = (self.frame_steps > 0).nonzero()[:, 0]
         if len(seen):
-            instants = torch.tensor(sorted({self.instants[frame] for frame in seen.tolist()}), device=self.poses.device)
-            self.poses[instants] -= self.poses[instants].mean(0)
+            rows = torch.tensor(sorted({self.pose_rows[frame] for frame in seen.tolist()}), device=self.poses.device)
+            self.poses[rows] -= self.poses[rows].mean(0)
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             seen = seen.to(self.cameras.device)
             self.cameras[seen] -= self.cameras[seen].mean(0)
@@ -196,9 +202,22 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     return shown, near
 
 
+def _scope(frame: Frame) -> bytes:
+    """Tells scopes apart: by the place of their lamps."""
+    camera = frame.camera
+    lamps = camera.world_from_camera if camera.world_from_lamps is None else camera.world_from_lamps
+    return lamps.detach().cpu().double().numpy().tobytes()
+
+
+def _numbered(keys: Sequence[Hashable]) -> list[int]:
+    """The number of each key, counted from the first that is like it."""
+    numbers: dict[Hashable, int] = {}
+    return [numbers.setdefault(key, len(numbers)) for key in keys]
+
+
 def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tensor:
-    """[F, I, 6] body-frame velocity (rad/s, mm/s) of frames, one for each instant, by differences between neighbours in
-    time; 0 where time stands still."""
+    """[F, I, 6] body-frame velocity (rad/s, mm/s) by differences between neighbours in time; 0 where time stands
+    still."""
     count = len(frames)
     velocity = torch.zeros(count, len(instruments), 6)
     order = sorted(range(count), key=lambda i: frames[i].state.time)
