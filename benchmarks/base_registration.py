@@ -31,6 +31,7 @@ from neeco.capture.model import evenly_spaced, swap_camera_axes
 from neeco.errors import NeecoError
 from neeco.files import write_json
 from neeco.ingest.base import find_base
+from neeco.ingest.still import moving_masks
 
 CLOCK_S = 0.04  # by which the log is ahead
 BASE_TURN, BASE_SHIFT = (0.4, -1.1, 0.7), (30.0, -200.0, 90.0)  # base_from_world
@@ -83,15 +84,15 @@ class _Recording:
         self.intrinsics = tuple(document[key] for key in ("fl_x", "fl_y", "cx", "cy"))
         readings = [list(frames[row]["instruments"][0]["joints"].values()) for row in rows]
         self.readings = np.array(readings, np.float64)
+
+        def load(row: int) -> np.ndarray:
+            return np.asarray(Image.open(path / "truth" / frames[row]["file_path"]).convert("RGB"))
+
+        self.images = np.stack([load(row) for row in rows.tolist()])
         if masks == "truth":
             files = [path / "truth" / frames[row]["part_mask_path"] for row in rows]
             self.masks = np.stack([np.asarray(Image.open(file)) > 0 for file in files])
         else:
-            from neeco.ingest.still import moving_masks
-
-            def load(row: int) -> np.ndarray:
-                return np.asarray(Image.open(path / "truth" / frames[row]["file_path"]).convert("RGB"))
-
             self.masks = moving_masks(load, len(frames), rows)
 
     def poses_at(self, shift: float) -> np.ndarray:
@@ -113,7 +114,7 @@ class _Recording:
         try:
             found = find_base(
                 "instrument", self.masks, self.intrinsics, self.camera_from_world, self.poses_at, self.times, prior,
-                readings=self.readings, seed=seed,
+                readings=self.readings, images=self.images, seed=seed,
             )  # fmt: skip
         except NeecoError as error:
             return row | {"error": str(error)}
