@@ -102,7 +102,8 @@ def _align(colors: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.n
         middle = np.clip(best, 1, len(grid) - 2)
         rows = np.arange(frames)
         low, here, high = costs[rows, middle - 1], costs[rows, middle], costs[rows, middle + 1]
-        curve = low - 2 * here + high
+        with np.errstate(invalid="ignore"):  # where too little of a frame can be compared
+            curve = low - 2 * here + high
         good = np.isfinite(curve) & (curve > 1e-12) & (best == middle)
         with np.errstate(invalid="ignore", divide="ignore"):
             move = np.where(good, grid[middle] + np.clip(0.5 * (low - high) / curve, -1, 1), 0.0)
