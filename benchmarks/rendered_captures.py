@@ -33,6 +33,10 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      each with a recording.yaml; brings --video
     --still          the scope stands still at the middle of its path; the world is its camera's frame, in which poses
                      are logged, and cameras have no errors
+    --base-error MMxDEG
+                     --still with poses in a robot's base: recording/ says where that stands, off by so much where the
+                     instrument is (8x5), and nothing of the log's clock, 38 ms ahead; truth/base.json has both exactly;
+                     brings --video
     --stereo         --still with a second camera beside it: recording/ also has right.mp4 and stereo.yaml, as OpenCV's
                      stereoCalibrate finds it; brings --video
 
@@ -113,16 +117,18 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("--plus", action="store_true", help="also recording/plus/: the recording as PLUS has it")
     parser.add_argument("--lerobot", action="store_true", help="also recording/lerobot/: the recording as data sets")
     parser.add_argument("--still", action="store_true", help="the scope stands still")
+    parser.add_argument("--base-error", type=_base_error, metavar="MMxDEG", help="of the base that poses are stated in")
     parser.add_argument("--stereo", action="store_true", help="a still scope with two cameras")
     parser.add_argument("--workers", type=_count, default=1, metavar="N", help="processes that draw")
     arguments = parser.parse_args(words)
     spec = SCENES[arguments.scene]
     arguments.video |= arguments.bag or arguments.plus or arguments.lerobot or arguments.stereo
+    arguments.video |= arguments.base_error is not None
     if arguments.video and spec.encoders is not None:
         parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
     if arguments.stereo and arguments.lens:
         parser.error("--stereo: both cameras are pinholes; leave out --lens")
-    still = arguments.still or arguments.stereo
+    still = arguments.still or arguments.stereo or arguments.base_error is not None
     if still and (arguments.bag or arguments.plus or arguments.lerobot):
         parser.error("--still: bags, PLUS and LeRobot files are of a scope that moves; leave out one of the two")
     settings = Settings(
@@ -138,6 +144,7 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         plus=arguments.plus,
         lerobot=arguments.lerobot,
         still=still,
+        base_error=arguments.base_error,
         stereo=arguments.stereo,
         workers=arguments.workers,
     )
@@ -166,6 +173,17 @@ def _length(text: str) -> float:
     if not 0 <= value <= 8:
         raise argparse.ArgumentTypeError(f"{text} is no amplitude; give 0 to 8 mm")
     return value
+
+
+def _base_error(text: str) -> tuple[float, float]:
+    """mm and degrees of `text`, MMxDEG."""
+    try:
+        mm, degrees = (float(part) for part in text.split("x"))
+    except ValueError:
+        mm = degrees = 0.0
+    if not (0 < mm <= 50 and 0 < degrees <= 30):
+        raise argparse.ArgumentTypeError(f"{text} is no error of a base; give MMxDEG, such as 8x5 (up to 50x30)")
+    return mm, degrees
 
 
 def _count(text: str) -> int:

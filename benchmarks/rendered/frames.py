@@ -51,6 +51,7 @@ class Settings:
     plus: bool = False  # recording/plus/: the same as a PLUS sequence
     lerobot: bool = False  # recording/lerobot/: the same as LeRobot data sets
     still: bool = False  # the scope stands still
+    base_error: tuple[float, float] | None = None  # mm and degrees that recording/ is off about a robot's base
     stereo: bool = False  # right/: the images of a second camera beside it
     workers: int = 1
 
@@ -64,11 +65,12 @@ class Settings:
             (self.pulse_mm, f" --pulse {self.pulse_mm:g}"),
             (self.exposure, " --exposure"),
             (self.optics, " --lens"),
-            (self.video and not (self.bags or self.plus or self.lerobot), " --video"),
+            (self.video and not (self.bags or self.plus or self.lerobot or self.base_error), " --video"),
             (self.bags, " --bag"),
             (self.plus, " --plus"),
             (self.lerobot, " --lerobot"),
-            (self.still and not self.stereo, " --still"),
+            (self.still and not (self.stereo or self.base_error), " --still"),
+            (self.base_error, " --base-error {:g}x{:g}".format(*(self.base_error or (0, 0)))),
             (self.stereo, " --stereo"),
             (self.every > 1, f" --every {self.every}"),
         ]

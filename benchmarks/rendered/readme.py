@@ -89,6 +89,11 @@ def _switched_on(settings: Settings) -> str:
         said.append("`recording/lerobot/`: the recording as LeRobot data sets v2.1 and v3.0, states at the images.")
     if settings.still:
         said.append("The scope stands still; the world is its camera's frame, which has no errors.")
+    if settings.base_error:
+        said.append(
+            "`recording/` states poses in a robot's base, of which it says where it stands only roughly, on a clock"
+        )
+        said.append("that nothing tells (truth/base.json).")
     if settings.stereo:
         said.append("`right/`: what a second camera beside it sees (recording/stereo.yaml).")
     return "".join(f"{line}\n" for line in said)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.files import write_atomically, write_json, write_text
 from rendered import errors
+from rendered.base import BASE_FROM_CAMERA, rough_base
 from rendered.frames import RIGHT_FROM_LEFT, Settings, Shot, image_name, right_name
 from rendered.motion import FRAME_RATE, Array, Trajectory, rigid
 from rendered.optics import Optics
@@ -60,12 +61,20 @@ def write_raw_recording(
         moments = [trajectory.at(float(time)) for time in times]
         exact = [world.sensor(m) if name == "instrument" else world.camera(m) @ CAMERA_FROM_SENSOR for m in moments]
         poses = errors.disturb_poses(np.stack(exact), _numbers(times), spec.errors, generator)
+        if settings.base_error:
+            poses = BASE_FROM_CAMERA @ poses
         _write_csv(
             folder / "logs" / f"{name}.csv", "t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", _pose_rows(times, poses, generator)
         )
     sync = {clock: round(offset + float(generator.normal(0, SYNC_S / 2)), 4) for clock, offset in _CLOCKS.items()}
     if settings.optics:
         write_text(folder / "calibration.yaml", Optics.of(settings.lens).calibration())
+    if settings.base_error:
+        del sync["em"]
+        write_json(
+            path / "truth" / "base.json",
+            {"camera_from_base": np.linalg.inv(BASE_FROM_CAMERA).tolist(), "clock_s": EM_CLOCK_S},
+        )
     write_text(folder / "recording.yaml", yaml.safe_dump(_document(world, settings, sync), sort_keys=False))
     if settings.bags:
         from rendered.bags import write_bags  # needs rosbags
@@ -101,14 +110,18 @@ def _document(world: World, settings: Settings, sync: dict[str, float]) -> dict[
     poses: object = "logs/instrument.csv"
     if settings.still:
         document |= {"camera": "still"}
-        poses = {"file": poses, "frame": "camera"}
+        poses = {"file": poses} if settings.base_error else {"file": poses, "frame": "camera"}
+    instrument: dict[str, object] = {"name": spec.design.name, "poses": poses, "joints": {JOINT: joint}}
+    if settings.base_error:
+        seen = np.stack([world.sensor(shot.moment) for shot in world.shots])
+        instrument |= {"camera_from_base": rough_base(seen, *settings.base_error, spec.seed)}
     if settings.stereo:
         document |= {"stereo": {"video": "right.mp4", "calibration": "stereo.yaml"}}
     return document | {
         "intrinsics": "calibration.yaml"
         if settings.optics
         else [lens.focal, lens.focal, lens.width / 2, lens.height / 2],
-        "instruments": [{"name": spec.design.name, "poses": poses, "joints": {JOINT: joint}}],
+        "instruments": [instrument],
         **({} if settings.still else {"laparoscope": "logs/camera.csv"}),
         "sync": sync,
         "splits": {split: frames for split, frames in of.items() if frames},

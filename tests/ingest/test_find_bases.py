@@ -34,6 +34,10 @@ def _data(world, base, clocks=None):
     )  # fmt: skip
 
 
+def _black(row):
+    return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+
 def _no_masks(rows):
     pytest.fail("an exact base needs no masks")
 
@@ -41,21 +45,21 @@ def _no_masks(rows):
 def test_an_exact_base_is_taken_as_it_is():
     world = make_world(44)
     data = _data(world, StatedBase(WORLD_FROM_BASE))
-    placed = place_bases(data, world.times, STILL, LENS, _no_masks)["psm1"]
+    placed = place_bases(data, world.times, STILL, LENS, _black, _no_masks)["psm1"]
     assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)
     assert placed.clock is None
 
 
 def test_an_arm_that_says_nothing_of_its_base_is_left_alone():
     world = make_world(44)
-    assert place_bases(_data(world, None), world.times, STILL, LENS, _no_masks) == {}
+    assert place_bases(_data(world, None), world.times, STILL, LENS, _black, _no_masks) == {}
 
 
 @pytest.mark.slow
 def test_a_rough_base_is_found_with_its_clock_and_told_in_a_note():
     world = make_world(44)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0))
-    placed = place_bases(data, world.times, STILL, LENS, lambda rows: world.masks[rows])["psm1"]
+    placed = place_bases(data, world.times, STILL, LENS, _black, lambda rows: world.masks[rows])["psm1"]
     assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 0.8
     assert placed.clock.source == "found with the base"
     assert abs(placed.clock.seconds - 0.03) < 0.008
@@ -67,7 +71,7 @@ def test_what_shows_no_shaft_names_the_recording():
     world = make_world(44)
     data = _data(world, StatedBase())
     with pytest.raises(NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base"):
-        place_bases(data, world.times, STILL, LENS, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
+        place_bases(data, world.times, STILL, LENS, _black, lambda rows: np.zeros((len(rows), HEIGHT, WIDTH), bool))
     assert LENS.intrinsics == INTRINSICS
 
 
@@ -76,12 +80,12 @@ def test_a_rough_base_is_found_before_a_scope_that_moves():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(disturbed(8, 5, 1, world), 5.0, 3.0, to_world=True))
     cameras = np.linalg.inv(world.camera_from_world)
-    placed = place_bases(data, world.times, cameras, LENS, lambda rows: world.masks[rows])["psm1"]
+    placed = place_bases(data, world.times, cameras, LENS, _black, lambda rows: world.masks[rows])["psm1"]
     assert errors(placed.world_from_base, world.poses_at(0.0))[0] < 1.2  # of 3.5 s in all
 
 
 def test_a_base_stated_to_the_world_is_not_taken_for_one_to_the_camera():
     world = make_world(44, moving_camera=True)
     data = _data(world, StatedBase(WORLD_FROM_BASE, to_world=True))
-    placed = place_bases(data, world.times, np.linalg.inv(world.camera_from_world), LENS, _no_masks)["psm1"]
+    placed = place_bases(data, world.times, np.linalg.inv(world.camera_from_world), LENS, _black, _no_masks)["psm1"]
     assert np.array_equal(placed.world_from_base, WORLD_FROM_BASE)

@@ -24,23 +24,16 @@ from neeco.errors import NeecoError
 from neeco.ingest.base_fit import (
     CLOCK_SD,
     FRONT,
-    MOTION,
-    SCALE_SD,
-    SHIFTS,
     WIDTHS_PX,
-    Fit,
     Prior,
-    Problem,
     Sureness,
     fit_outlines,
-    instrument_in_base,
-    outlines,
-    pivot_of,
     refine,
-    resized,
     sureness,
 )
+from neeco.ingest.base_marks import with_marks
 from neeco.ingest.base_search import Candidates, Seen, rotations_about, search, uniform_rotations
+from neeco.ingest.base_shape import MOTION, SHIFTS, Fit, Problem, instrument_in_base, outlines, pivot_of, resized
 from neeco.ingest.silhouettes import shaft_lines, silhouettes_of
 
 FEWEST = 12  # frames that show a shaft, to find a base from
@@ -48,15 +41,13 @@ QUICK = 40  # frames that starts are compared on
 MOST = 140  # frames that the result is fitted to
 BLOCKS = 10  # stretches of a recording whose errors are taken to be independent
 ROTATIONS, EVERYWHERE = 500, 4000  # tried about a rough base, and without one
-SIZES, FINE_SIZES = (
-    (1.25, 1.1),
-    (1.04, 1.015),
-)  # factors by which everything is made larger or smaller, one after the other
+SIZES = 1.25, 1.1  # factors by which everything is made larger or smaller, one after the other
 FARTHEST = 8  # times each
 SPAN, SAMPLES = 0.15, 9  # of the logarithm of the size, over which the loss is sampled at last
 AS_MUCH = 0.95  # of the overlap before must stay: less of an instrument fits more easily
 LEAST_OVERLAP = 0.25  # of the instrument's outline with what moves, to believe a base
-SIZE_BIAS = 0.03  # by which the size is off however many frames there are: jaws blur where the tip is
+# by which the size is off however many frames there are: jaws blur where the tip is; and with marks on the shaft
+SIZE_BIAS, MARKED_BIAS = 0.03, 0.007
 USUAL_RADII = (1.5, 5.5)  # mm: a shaft outside is first taken to be of the usual size
 USUAL_RADIUS = 3.5  # mm of a shaft, to guess how far away one is
 LEVER = 40.0  # mm from the instrument's middle at which a turn counts as a shift
@@ -70,14 +61,12 @@ UNEXPLAINED = 1.5  # px of masks 160 wide: outlines farther off on average expla
 class BaseRegistration:
     """Where a base stands, and how sure that is.
 
-    world_from_base takes the log's positions times `scale` (mm) into the cameras' world. Standard deviations are along
+    Standard deviations are along
     the first camera's right, down and forward, at the instrument: mm for shifts and degrees for turns; NaN where a
     direction is open and nothing was given beforehand. `open_directions`: what the motion does not determine, in words.
     """
 
     world_from_base: np.ndarray  # [4, 4]
-    scale: float
-    scale_sd: float  # 0: taken as given
     clock_s: float  # by which the log is ahead of what was given
     clock_sd_s: float
     sd_mm: np.ndarray  # [3]
@@ -102,7 +91,6 @@ class BaseRegistration:
             "world_from_base": self.world_from_base.tolist(),
             "sd_mm": known(self.sd_mm),
             "sd_deg": known(self.sd_deg),
-            "scale": self.scale,
             "clock_s": self.clock_s,
             "clock_sd_s": self.clock_sd_s,
             "moved_mm": known(np.array([self.moved_mm]))[0],
@@ -125,7 +113,7 @@ def find_base(
     readings: np.ndarray | None = None,
     hidden: np.ndarray | None = None,
     clock_known: bool = False,
-    metric: bool = False,
+    images: np.ndarray | None = None,
     seed: int = 0,
 ) -> BaseRegistration:
     """Find the base of instrument `name`.
@@ -133,12 +121,12 @@ def find_base(
     masks: bool [F, h, w], what moves, seen through a pinhole of `intrinsics` (fx, fy, cx, cy px of the masks);
     camera_from_world [F, 4, 4]; poses_at(s): base_from_instrument [F, 4, 4] mm of the frames as the log has them s
     seconds later, NaN where it has none; times [F] s; prior: (world_from_base, sd mm at the instrument, sd degrees);
-    readings [F, J] of its joints; hidden: bool [h, w], beyond a round border; metric: the cameras' world has a length
-    of its own (they move, or are several), so that the robot's can be checked. Raises NeecoError, naming the
-    instrument, where what moves is not it.
+    readings [F, J] of its joints; hidden: bool [h, w], beyond a round border; images: uint8 [F, h, w, 3], from which
+    colours along the instrument tell how far in it is. Raises NeecoError, naming the instrument, where what moves is
+    not it.
     """
     generator = np.random.default_rng(seed)
-    problem = _problem(masks, intrinsics, hidden, camera_from_world, poses_at, times, readings)
+    problem = _problem(masks, intrinsics, hidden, camera_from_world, poses_at, times, readings, images)
     lines = shaft_lines(problem.seen.masks, hidden)
     shows = np.isfinite(lines.points[:, 0])
     if shows.sum() < FEWEST:
@@ -150,7 +138,7 @@ def find_base(
     problem = problem.take(np.flatnonzero(shows))
     quick = problem.take(np.array(evenly_spaced(len(problem.blocks), QUICK)))
     distance = _distance(problem, prior)
-    known = _prior(problem, prior, distance, clock_known, metric)
+    known = _prior(prior, clock_known)
     starts = _starts(quick, prior, distance, known, generator)
     if not starts:
         raise NeecoError(_unmoved(name))
@@ -160,7 +148,11 @@ def find_base(
     if not USUAL_RADII[0] < radius < USUAL_RADII[1]:
         best = refine(quick, known, resized(quick, best, USUAL_RADIUS / radius))
     best = _best_size(quick, known, best, SIZES)
-    fit, curvature = _settle_size(problem, known, fit_outlines(problem, known, best, widths=WIDTHS_PX[-2:]))
+    fit = fit_outlines(problem, known, best, widths=WIDTHS_PX[-2:])
+    problem, fit = with_marks(problem, fit)
+    fit, curvature = _settle_size(problem, known, refine(problem, known, fit))
+    problem, fit = with_marks(problem, fit)
+    fit = refine(problem, known, fit)
     _require_moved(name, problem, known, fit)
     sure = sureness(problem, known, fit)
     return _result(problem, known, prior, fit, sure, _size_sd(problem, fit, sure, curvature))
@@ -174,6 +166,7 @@ def _problem(
     poses_at: Callable[[float], np.ndarray],
     times: np.ndarray,
     readings: np.ndarray | None,
+    images: np.ndarray | None,
 ) -> Problem:
     """The frames whose poses are known at all clocks tried, at most MOST."""
     poses = np.stack([poses_at(float(shift)) for shift in SHIFTS])
@@ -186,8 +179,9 @@ def _problem(
         values = (values[:, moving] - values[:, moving].mean(0)) / values[:, moving].std(0)
     blocks = np.minimum(np.arange(len(rows)) * BLOCKS // max(len(rows), 1), BLOCKS - 1)
     return Problem(
-        silhouettes_of(masks[rows], intrinsics, hidden), camera_from_world[rows], poses[:, rows], values, blocks
-    )
+        silhouettes_of(masks[rows], intrinsics, hidden), camera_from_world[rows], poses[:, rows], values, blocks,
+        None if images is None else images[rows],
+    )  # fmt: skip
 
 
 def _distance(problem: Problem, prior: tuple[np.ndarray, float, float] | None) -> float:
@@ -203,13 +197,11 @@ def _distance(problem: Problem, prior: tuple[np.ndarray, float, float] | None) -
     return depth if depth > 0.2 * guess else guess
 
 
-def _prior(
-    problem: Problem, prior: tuple[np.ndarray, float, float] | None, distance: float, clock_known: bool, metric: bool
-) -> Prior:
-    clock, scale = (0.0 if clock_known else CLOCK_SD), (SCALE_SD if metric else 0.0)
-    if prior is None:
-        return Prior(np.eye(4), None, None, clock, scale)
-    return Prior(prior[0], np.radians(prior[2]), prior[1], clock, scale)
+def _prior(prior: tuple[np.ndarray, float, float] | None, clock_known: bool) -> Prior:
+    clock = 0.0 if clock_known else CLOCK_SD
+    return Prior(np.eye(4), None, None, clock) if prior is None else Prior(
+        prior[0], np.radians(prior[2]), prior[1], clock
+    )  # fmt: skip
 
 
 def _starts(
@@ -231,7 +223,7 @@ def _starts(
         center, sd_mm, step = prior[0][:3, :3] @ problem.middle + prior[0][:3, 3], prior[1], 0.5 * known.sd_rad
     found: Candidates = search(seen, rotations, center, sd_mm, distance, generator, step)
     return [
-        Fit(base, 0.0, 0.0, tip, axis, np.zeros(1), np.zeros((1, 1 + problem.readings.shape[1], 5)), np.zeros(0))
+        Fit(base, 0.0, tip, axis, np.zeros(1), np.zeros((1, 1 + problem.readings.shape[1], 5)), np.zeros(0))
         for cost, base, tip, axis in zip(found.costs, found.world_from_base, found.tips, found.axes, strict=True)
         if cost < 2  # of robust losses below 1 each, and the prior's
     ]
@@ -279,8 +271,9 @@ def _size_sd(problem: Problem, fit: Fit, sure: Sureness, curvature: float) -> fl
     width = problem.seen.distances.shape[2] / 160  # of the narrowest loss, px
     count = problem.seen.distances.shape[0] * 2 * len(fit.stations) * (1 - FRONT)
     variance = (fit.residual_px / 0.67 / width) ** 2 * _alike(sure)
+    bias = SIZE_BIAS if problem.marks is None else MARKED_BIAS
     still = len(np.unique(problem.camera_from_world.round(3), axis=0)) == 1
-    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), SIZE_BIAS if still else 0.0))
+    return float(np.hypot(np.sqrt(variance / max(curvature * count, 1e-9)), bias if still else 0.0))
 
 
 def _alike(sure: Sureness) -> float:
@@ -334,10 +327,7 @@ def _result(
     sure: Sureness,
     size_sd: float,
 ) -> BaseRegistration:
-    scale = float(np.exp(fit.log_scale))
-    world_from_base = fit.world_from_base.copy()
-    world_from_base[:3, 3] += world_from_base[:3, :3] @ ((1 - scale) * problem.middle)
-    covariance, open_directions, clock_sd, scale_sd = _sureness_in_words(problem, known, fit, sure, size_sd)
+    covariance, open_directions, clock_sd = _sureness_in_words(problem, known, fit, sure, size_sd)
     view = problem.camera_from_world[0, :3, :3]
     turns, shifts = (view @ covariance[part, part] @ view.T for part in (slice(0, 3), slice(3, 6)))
     moved, turned, before = np.nan, np.nan, np.nan
@@ -351,26 +341,26 @@ def _result(
     with np.errstate(invalid="ignore"):
         sd_mm, sd_deg = np.sqrt(np.diag(shifts)), np.degrees(np.sqrt(np.diag(turns)))
     return BaseRegistration(
-        world_from_base, scale, scale_sd, fit.clock, clock_sd, sd_mm, sd_deg, open_directions, moved, turned,
+        fit.world_from_base, fit.clock, clock_sd, sd_mm, sd_deg, open_directions, moved, turned,
         overlap(problem, fit), before, fit.residual_px, len(problem.blocks), fit, problem,
     )  # fmt: skip
 
 
 def _sureness_in_words(
     problem: Problem, known: Prior, fit: Fit, sure: Sureness, size_sd: float
-) -> tuple[np.ndarray, tuple[str, ...], float, float]:
+) -> tuple[np.ndarray, tuple[str, ...], float]:
     """Covariance [6, 6] of the base (rad, mm, in the world's directions at the instrument), what is open, and the
-    standard deviations of clock s and scale."""
+    standard deviation of the clock s."""
     away = pivot_of(problem, fit) - np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)  # moves by it
-    units = np.array([1 / LEVER] * 3 + [1.0] * 3 + [0.05, 0.02])  # about as much of an outline's motion each
-    used = np.array([True] * 6 + [known.sd_clock > 0, known.sd_scale > 0])
+    units = np.array([1 / LEVER] * 3 + [1.0] * 3 + [0.05])  # about as much of an outline's motion each
+    used = np.array([True] * 6 + [known.sd_clock > 0])
     units = units[used]
     information = sure.information[np.ix_(used, used)] * np.outer(units, units)
     scatter = sure.scatter[np.ix_(used, used)] * np.outer(units, units)
     before = np.zeros(MOTION)
     if known.sd_rad is not None and known.sd_mm is not None:
         before[:6] = [known.sd_rad**-2.0] * 3 + [known.sd_mm**-2.0] * 3
-    before[6], before[7] = (sd**-2.0 if sd > 0 else 0.0 for sd in (known.sd_clock, known.sd_scale))
+    before[6] = known.sd_clock**-2.0 if known.sd_clock > 0 else 0.0
     prior = np.diag(before[used] * units**2)
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-12)
@@ -394,8 +384,8 @@ def _sureness_in_words(
             words.append(_direction(problem, fit, vector[:6]))
     if known.sd_mm is None and words:
         covariance[:6, :6] = np.where(np.abs(covariance[:6, :6]) > 1e6, np.nan, covariance[:6, :6])
-    extra = dict(zip(np.flatnonzero(used)[6:], np.sqrt(np.diag(covariance)[6:]), strict=True))
-    return covariance[:6, :6], tuple(dict.fromkeys(words)), float(extra.get(6, 0.0)), float(extra.get(7, 0.0))
+    clock_sd = float(np.sqrt(covariance[6, 6])) if known.sd_clock > 0 else 0.0
+    return covariance[:6, :6], tuple(dict.fromkeys(words)), clock_sd
 
 
 _BY_SIZE = "a shift towards where the instrument comes in, together with its size"

@@ -1,11 +1,8 @@
 """Where a robot's base stands, exactly: least squares on the outlines of the instrument in the masks, together with its
-shape, the clock and the scale of the robot's lengths.
+shape and the clock.
 
-The shape is a tube about a line of the instrument's frame: at stations along it, its support function (how far the
-outline seen from any side lies from the line) as a Fourier series of that side's angle. Outlines depend on it linearly,
-whatever the cross-section: order 0 is the radius, 1 where the middle lies, 2 how flat it is. Silhouettes that fit the
-motion have one such shape; how far they allow another base is what the shape cannot make up for (compare silhouette
-coherence: Hernandez, Schmitt, Cipolla, PAMI 2007).
+Silhouettes that fit the motion have one shape (`base_shape`); how far they allow another base is what the shape cannot
+make up for (compare silhouette coherence: Hernandez, Schmitt, Cipolla, PAMI 2007).
 """
 
 from __future__ import annotations
@@ -15,254 +12,50 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neeco.ingest.silhouettes import Silhouettes
+from neeco.ingest.base_shape import (
+    LINE,
+    MOTION,
+    ORDERS,
+    Fit,
+    Problem,
+    first_shape,
+    marks_off,
+    moved,
+    outlines,
+    outlines_by_mm,
+    tips,
+    waves,
+)
 
-STATIONS = 14
-ORDERS = 2  # of the Fourier series
 SHAPE_MM = (10.0, 1.0, 0.7)  # standard deviations of orders 0 (about the first guess), 1 and 2 at each station
 FRONT = 0.4  # of the line that is seen, from the tip: where jaws and wrist move
 LEVEL_MM = 1.0  # and by which the radius differs from that of the next station: shafts are tubes
 LINE_MM, LINE_RAD = 30.0, 0.5  # how far the line may go from its first guess
-SCALE_SD = 0.01  # of a robot's lengths
+ANYWHERE_MM = 1e4  # where along the line the marks are
 CLOCK_SD = 0.1  # s, of a clock that nothing gives
-SHIFTS = np.arange(-0.16, 0.161, 0.02)  # s by which poses are known beside the clock's first guess
-MOTION = 8  # parameters of the base, the clock and the scale
-LINE = 4
-SHAPE = 1 + 2 * ORDERS
-NEAREST = 5.0  # mm
 UNEVEN = 3.0  # times the median residual of a station: at least so wide is its loss
-FRONT = 0.4  # of the line that is seen, from the tip: where jaws and wrist move
 END_MM = 4.0  # standard deviation of what a deviation of a reading, or its square, moves the tip
-THINNEST = 0.3  # mm, the radius of anything
 JOINT_MM = 2.0  # standard deviation of what a deviation of a reading adds to any order
 WIDTHS_PX = (12.0, 6.0, 3.0, 1.5, 1.0)  # of the robust loss, one after the other; px of masks 160 wide
+MARK_SHARE = 0.125  # of that width: marks are seen more exactly than outlines, whose errors are alike in one frame
 STEPS = 12  # of Levenberg and Marquardt, at each
 ENOUGH = 1e-5  # share of the loss that a step must save to be followed by another
+FREE = 1e-5  # damping at which a step is as long as it can be
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
     """What is known of world_from_base [4, 4] beforehand: sd_rad about it, sd_mm at the instrument (None: nothing), of
-    the clock s and of the logarithm of the scale (0: that is known)."""
+    the clock s (0: that is known)."""
 
     world_from_base: np.ndarray
     sd_rad: float | None
     sd_mm: float | None
     sd_clock: float = CLOCK_SD
-    sd_scale: float = SCALE_SD
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Silhouettes of frames [F], their cameras, and the poses at the clock's first guess moved by SHIFTS."""
-
-    seen: Silhouettes
-    camera_from_world: np.ndarray  # [F, 4, 4]
-    poses: np.ndarray  # [S, F, 4, 4] base_from_instrument
-    readings: np.ndarray  # [F, J] of its joints, with mean 0 and deviation 1
-    blocks: np.ndarray  # [F] which stretch of the recording a frame is of: errors within one are alike
-
-    def take(self, rows: np.ndarray) -> Problem:
-        """Some of the frames."""
-        return Problem(
-            self.seen.take(rows),
-            self.camera_from_world[rows],
-            self.poses[:, rows],
-            self.readings[rows],
-            self.blocks[rows],
-        )
-
-    @property
-    def middle(self) -> np.ndarray:
-        """[3] mm, mean position of the instrument in the base's frame."""
-        return np.asarray(self.poses[len(SHIFTS) // 2, :, :3, 3].mean(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A base and a shape that explain silhouettes."""
-
-    world_from_base: np.ndarray  # [4, 4]; positions in the base's frame are to be scaled about `middle`
-    clock: float  # s by which the log is ahead of the first guess
-    log_scale: float
-    tip: np.ndarray  # [3] mm, instrument frame: where the line ends
-    axis: np.ndarray  # [3] unit, towards the tip
-    stations: np.ndarray  # [K] mm behind the tip; the first is 0
-    shape: np.ndarray  # [K, 1 + J, SHAPE] mm: at the mean readings, and what a deviation of each adds
-    ends: np.ndarray  # [E] mm: how far masks reach beyond `tip`, as `_tips` has it; the first: along the line
-    cost: float = np.inf  # mean robust loss
-    loss: float = np.inf  # mean robust loss and the prior's share
-    residual_px: float = np.inf  # median distance of outlines
-
-
-def instrument_in_base(problem: Problem, fit: Fit) -> np.ndarray:
-    """[F, 4, 4] base_from_instrument at the fit's clock and scale."""
-    place = np.clip((fit.clock - SHIFTS[0]) / (SHIFTS[1] - SHIFTS[0]), 0, len(SHIFTS) - 1.001)
-    low = int(place)
-    poses = problem.poses[low] + (place - low) * (problem.poses[low + 1] - problem.poses[low])  # 20 ms apart: a chord
-    poses[:, :3, 3] = problem.middle + np.exp(fit.log_scale) * (poses[:, :3, 3] - problem.middle)
-    return poses
-
-
-def frame_about(axis: np.ndarray) -> np.ndarray:
-    """[3, 3] with unit columns across, across and along the axis."""
-    least = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    u = _cross(axis, least)
-    u /= np.linalg.norm(u)
-    return np.stack([u, _cross(axis, u), axis], -1)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[3]; numpy's takes longer to begin."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def outlines(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places x, y [F, 2K] px of the outline on both sides of the line at every station, and the same points' angles
-    about the line [F, 2K] rad."""
-    x, y, angles, _ = _outlines(problem, fit)
-    return x, y, angles
-
-
-def _outlines(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """As `outlines`, and by how many px [F, 2K, 2] an outline moves for every mm of the shape outwards; 0 behind the
-    camera."""
-    camera_from_instrument = problem.camera_from_world @ fit.world_from_base @ instrument_in_base(problem, fit)
-    rotation, shift = camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3]
-    basis = frame_about(fit.axis)
-    middle = fit.tip - fit.stations[:, None] * fit.axis  # [K, 3]
-    eye = -np.einsum("fji,fj->fi", rotation, shift)  # [F, 3] the camera, instrument frame
-    local = (eye[:, None] - middle) @ basis  # [F, K, 3]: towards it, in the line's frame
-    flat = np.maximum(np.linalg.norm(local[..., :2], axis=-1), NEAREST)
-    towards = np.arctan2(local[..., 1], local[..., 0])
-    shapes = fit.shape[:, 0] + np.einsum("fj,kjm->fkm", problem.readings, fit.shape[:, 1:])  # [F, K, SHAPE]
-    angles, support = [], []
-    for side in (1.0, -1.0):
-        angle = towards + side * np.pi / 2
-        for _ in range(2):  # the tangent plane goes through the camera: where cos(angle - towards) = support / distance
-            height = np.einsum("fkm,fkm->fk", _waves(angle), shapes)
-            angle = towards + side * np.arccos(np.clip(height / flat, -0.9, 0.9))
-        angles.append(angle)
-        support.append(np.einsum("fkm,fkm->fk", _waves(angle), shapes))
-    angle, height = np.concatenate(angles, 1), np.concatenate(support, 1)  # [F, 2K]
-    normals = np.cos(angle)[..., None] * basis[:, 0] + np.sin(angle)[..., None] * basis[:, 1]
-    points = np.concatenate([middle, middle]) + height[..., None] * normals
-    camera = np.einsum("fij,fkj->fki", rotation, points) + shift[:, None]
-    fx, fy, cx, cy = problem.seen.intrinsics
-    depth = np.maximum(camera[..., 2], NEAREST)
-    x, y = camera[..., 0] / depth * fx + cx, camera[..., 1] / depth * fy + cy
-    outwards = np.einsum("fij,fkj->fki", rotation, normals)
-    per_mm = np.stack(
-        [
-            fx * (outwards[..., 0] - camera[..., 0] / depth * outwards[..., 2]) / depth,
-            fy * (outwards[..., 1] - camera[..., 1] / depth * outwards[..., 2]) / depth,
-        ],
-        -1,
-    )
-    return x, y, angle, np.where((camera[..., 2] > NEAREST)[..., None], per_mm, 0.0)
-
-
-def _tips(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far the instrument reaches along its line in the images [F] px; these directions [F, 2]; and the derivatives
-    [F, E] px/mm by `ends`.
-
-    What lies about the tip reaches along a direction as far as its support function says, which depends on the angle
-    from the line and on the side: jaws open to two sides, towards the camera or across.
-    """
-    camera_from_instrument = problem.camera_from_world @ fit.world_from_base @ instrument_in_base(problem, fit)
-    rotation, shift = camera_from_instrument[:, :3, :3], camera_from_instrument[:, :3, 3]
-    fx, fy, cx, cy = problem.seen.intrinsics
-    axis, end = rotation @ fit.axis, rotation @ fit.tip + shift
-    depth = np.maximum(end[:, 2], NEAREST)
-    x, y = end[:, 0] / depth, end[:, 1] / depth
-    slope = np.stack([fx * (axis[:, 0] - x * axis[:, 2]), fy * (axis[:, 1] - y * axis[:, 2])], -1)
-    along = slope / np.maximum(np.linalg.norm(slope, axis=1), 1e-6)[:, None]
-    outwards = np.stack([fx * along[:, 0], fy * along[:, 1], -(fx * x * along[:, 0] + fy * y * along[:, 1])], -1)
-    outwards = np.einsum("fji,fj->fi", rotation, outwards / depth[:, None]) @ frame_about(fit.axis)  # [F, 3] px/mm
-    readings = np.concatenate([np.ones((len(x), 1)), problem.readings], 1)  # [F, 1 + J]
-    squares = problem.readings**2 - (problem.readings**2).mean(0)
-    across = np.linalg.norm(outwards[:, :2], axis=1)[:, None] * _waves(np.arctan2(outwards[:, 1], outwards[:, 0]))
-    terms = np.concatenate(
-        [
-            outwards[:, 2:] * np.concatenate([readings, squares], 1),
-            (readings[:, :, None] * across[:, None]).reshape(len(x), -1),
-        ],
-        1,
-    )
-    place = np.stack([x * fx + cx, y * fy + cy], -1)
-    ends = fit.ends if len(fit.ends) else np.zeros(terms.shape[1])
-    return np.einsum("fj,fj->f", place, along) + terms @ ends, along, terms
-
-
-def _waves(angles: np.ndarray) -> np.ndarray:
-    """[..., SHAPE] 1, cos, sin, cos 2, sin 2 ... of angles [...]."""
-    parts = [np.ones_like(angles)]
-    for order in range(1, ORDERS + 1):
-        parts += [np.cos(order * angles), np.sin(order * angles)]
-    return np.stack(parts, -1)
-
-
-def first_shape(problem: Problem, fit: Fit) -> Fit:
-    """The fit with stations as far back along its line as images show it, and radii as wide as masks are there."""
-    if len(fit.ends):
-        fit = replace(fit, tip=fit.tip + fit.ends[0] * fit.axis, ends=np.append(0.0, fit.ends[1:]))
-    reach = np.linspace(0, 150, 61)
-    kinds = 1 + problem.readings.shape[1]
-    probe = replace(fit, stations=reach, shape=np.zeros((len(reach), kinds, SHAPE)))
-    x, y, _, per_mm = _outlines(problem, probe)
-    x, y, per_mm = x[:, : len(reach)], y[:, : len(reach)], per_mm[:, : len(reach)]
-    shown = problem.seen.inside(x, y) & per_mm.any(-1)
-    last = np.where(shown.any(1), reach[len(reach) - 1 - np.argmax(shown[:, ::-1], 1)], 0.0)
-    length = max(float(np.quantile(last, 0.8)), 15.0)
-    stations = length * (np.arange(STATIONS) / (STATIONS - 1)) ** 1.4
-    probe = replace(fit, stations=stations, shape=np.zeros((STATIONS, kinds, SHAPE)))
-    x, y, _, per_mm = (part[:, :STATIONS] for part in _outlines(problem, probe))
-    half, _ = problem.seen.look_up(x, y)
-    radii = np.full((len(x), STATIONS), np.nan)
-    usable = problem.seen.inside(x, y) & per_mm.any(-1)
-    radii[usable] = half[usable] / np.linalg.norm(per_mm[usable], axis=-1)
-    typical = np.array([np.nanmedian(column) if np.isfinite(column).any() else np.nan for column in radii.T])
-    inner = np.nanmedian(typical[STATIONS // 2 :]) if np.isfinite(typical[STATIONS // 2 :]).any() else 3.0
-    shape = np.zeros((STATIONS, kinds, SHAPE))
-    shape[:, 0, 0] = np.clip(np.where(np.isfinite(typical), typical, inner), 0.5, 15.0)
-    shape[0] = 0.0
-    ends = fit.ends if len(fit.ends) else np.zeros(2 * kinds - 1 + kinds * SHAPE)
-    return replace(fit, stations=stations, shape=shape, ends=ends)
-
-
-def _moved(problem: Problem, fit: Fit, step: np.ndarray, pivot: np.ndarray) -> Fit:
-    """The fit after a step [MOTION + LINE + (K - 1) * SHAPE] in its parameters; the base turns about `pivot`."""
-    turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    base = fit.world_from_base.copy()
-    base[:3, :3] = turn @ base[:3, :3]
-    base[:3, 3] = turn @ (base[:3, 3] - pivot) + pivot + step[3:6]
-    line = step[MOTION : MOTION + LINE]
-    basis = frame_about(fit.axis)
-    axis = fit.axis + basis[:, :2] @ line[:2]
-    axis /= np.linalg.norm(axis)
-    # the line turns about its middle, where it is seen
-    middle = fit.tip - fit.stations[-1] / 2 * fit.axis + basis[:, :2] @ line[2:4]
-    tip = middle + fit.stations[-1] / 2 * axis
-    shape, ends = fit.shape.copy(), fit.ends
-    if len(step) > MOTION + LINE:
-        shape[1:] += step[MOTION + LINE :][: shape[1:].size].reshape(len(shape) - 1, *shape.shape[1:])
-        ends = ends + step[MOTION + LINE + shape[1:].size :]
-        shape[1:, 0, 0] = np.maximum(shape[1:, 0, 0], THINNEST)
-    return replace(
-        fit,
-        world_from_base=base,
-        clock=float(np.clip(fit.clock + step[6], SHIFTS[0], SHIFTS[-1])),
-        log_scale=fit.log_scale + step[7],
-        tip=tip,
-        axis=axis,
-        shape=shape,
-        ends=ends,
-    )
 
 
 _PROBES = np.array(
-    [0.012] * 3 + [0.8] * 3 + [0.02, 0.01] + [0.012] * 2 + [0.8] * 2
+    [0.012] * 3 + [0.8] * 3 + [0.02] + [0.012] * 2 + [0.8] * 2
 )  # for differences, by parameter: pixels' steps average out
 
 
@@ -272,75 +65,82 @@ class _System:
     def __init__(self, problem: Problem, prior: Prior, first: Fit, front: float = 0.0) -> None:
         self.problem, self.prior, self.first, self.front = problem, prior, first, front
         self.middle = problem.middle
-        self.free = np.ones(MOTION + LINE + first.shape[1:].size + len(first.ends), dtype=bool)
+        self.free = np.ones(MOTION + LINE + first.shape[1:].size + len(first.ends) + 1, dtype=bool)
         used = first.stations > front * first.stations[-1]
         self.on_shaft = np.flatnonzero(used[1:] & used[:-1])[1:] + 1  # stations as is the one before
         self.free[MOTION + LINE :][: first.shape[1:].size] = np.repeat(used[1:], first.shape[0].size)
         self.free[6] = prior.sd_clock > 0
-        self.free[7] = prior.sd_scale > 0
+        self.free[-1] = problem.marks is not None
 
     def pivot(self, fit: Fit) -> np.ndarray:
         """[3] where the instrument is in the world, on average."""
         return np.asarray(fit.world_from_base[:3, :3] @ self.middle + fit.world_from_base[:3, 3])
 
     def residuals(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What a fit is off [F, 2K + 1] px: the outline's points from the masks' outlines, and the tip along the line
-        from where masks end; derivatives [F, 2K] by mm outwards, the points' angles [F, 2K], and bool
-        [F, 2K + 1]: what is seen."""
-        x, y, angles, per_mm = _outlines(self.problem, fit)
-        seen = self.problem.seen.inside(x, y, margin=1.0) & per_mm.any(-1)
+        """What a fit is off [F, 2K + 2] px: the outline's points from the masks' outlines, and along the line the tip
+        from where masks end and the marks from where images show them; derivatives [F, 2K] by mm outwards, the points'
+        angles [F, 2K], and bool [F, 2K + 2]: what is seen."""
+        x, y, angles, per_mm = outlines_by_mm(self.problem, fit)
+        seen = self.problem.seen.inside(x, y, margin=1.0) & (per_mm[..., 0] != 0)
         found, gradient = self.problem.seen.look_up(x, y)
         front = np.tile(fit.stations <= self.front * fit.stations[-1], 2)  # where the line ends, masks' ends say
         seen[:, front] = False
-        ahead, along, self._end_terms = _tips(self.problem, fit)
-        short = ahead - self.problem.seen.extent(along)
-        ended = np.isfinite(short)
+        lengths = self._lengths(fit)
+        ended = np.isfinite(lengths)
         return (
-            np.concatenate([found, np.where(ended, short, 0.0)[:, None]], 1),
-            (gradient * per_mm).sum(-1),
+            np.concatenate([found, np.where(ended, lengths, 0.0)], 1),
+            gradient[..., 0] * per_mm[..., 0] + gradient[..., 1] * per_mm[..., 1],
             angles,
-            np.concatenate([seen, ended[:, None]], 1),
+            np.concatenate([seen, ended], 1),
         )
+
+    def _lengths(self, fit: Fit) -> np.ndarray:
+        """[F, 2] px along the line that the tip is from where masks end, and the marks from where images show them; NaN
+        where neither does."""
+        ahead, along, self._end_terms = tips(self.problem, fit)
+        beyond, self._mark_term = marks_off(self.problem, fit, along)
+        return np.stack([ahead - self.problem.seen.extent(along), beyond], 1)
 
     def jacobian(
         self, fit: Fit, found: np.ndarray, per_mm: np.ndarray, angles: np.ndarray, smooth: bool = False
     ) -> np.ndarray:
-        """[F, 2K + 1, P] derivatives of the residuals. smooth: as if masks had the model's outlines and no pixels,
+        """[F, 2K + 2, P] derivatives of the residuals. smooth: as if masks had the model's outlines and no pixels,
         whose steps would be taken for something that tells where along a shaft one is."""
-        stations, ends = len(fit.stations), self._end_terms
+        stations, ends, mark = len(fit.stations), self._end_terms, self._mark_term
         pivot = self.pivot(fit)
         columns = np.zeros((*found.shape, len(self.free)))
-        outwards = _outlines(self.problem, fit)[3]
-        size = np.linalg.norm(outwards, axis=-1)
+        outwards = outlines_by_mm(self.problem, fit)[3]
+        size = np.hypot(outwards[..., 0], outwards[..., 1])
         outwards = outwards / np.maximum(size, 1e-9)[..., None]
         if smooth:
             per_mm = -size
 
-        def measured(moved: Fit) -> np.ndarray:
-            off = self.residuals(moved)[0]
-            if smooth:
-                x, y, _ = outlines(self.problem, moved)
-                off[:, :-1] = -(x * outwards[..., 0] + y * outwards[..., 1])
-            return off
+        def measured(fit: Fit) -> np.ndarray:
+            if not smooth:
+                return self.residuals(fit)[0]
+            x, y, _ = outlines(self.problem, fit)
+            lengths = np.nan_to_num(self._lengths(fit))
+            return np.concatenate([-(x * outwards[..., 0] + y * outwards[..., 1]), lengths], 1)
 
         for index, probe in enumerate(_PROBES):
             if not self.free[index]:
                 continue
             step = np.zeros(MOTION + LINE)
             step[index] = probe
-            ahead = measured(_moved(self.problem, fit, step, pivot))
-            behind = measured(_moved(self.problem, fit, -step, pivot))
+            ahead = measured(moved(self.problem, fit, step, pivot))
+            behind = measured(moved(self.problem, fit, -step, pivot))
             columns[..., index] = (ahead - behind) / (2 * probe)
         # outwards by a mm: a distance falls by as many px as that is, where the outline is about that of the mask
-        waves = per_mm[..., None] * _waves(angles)  # [F, 2K, SHAPE]
+        by_shape = per_mm[..., None] * waves(angles)  # [F, 2K, SHAPE]
         factors = np.concatenate([np.ones((len(found), 1)), self.problem.readings], 1)  # [F, 1 + J]
-        terms = (factors[:, None, :, None] * waves[:, :, None]).reshape(len(found), 2 * stations, -1)
+        terms = (factors[:, None, :, None] * by_shape[:, :, None]).reshape(len(found), 2 * stations, -1)
         for point in range(2 * stations):
             station = point % stations
             if station:
                 first = MOTION + LINE + (station - 1) * terms.shape[-1]
                 columns[:, point, first : first + terms.shape[-1]] = terms[:, point]
-        columns[:, -1, -len(fit.ends) :] = ends
+        columns[:, -2, -len(fit.ends) - 1 : -1] = ends
+        columns[:, -1, -1] = mark
         return columns
 
     def prior_terms(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -361,8 +161,6 @@ class _System:
                 add(3 + axis, shift[axis], prior.sd_mm)
         if prior.sd_clock > 0:
             add(6, fit.clock, prior.sd_clock)
-        if prior.sd_scale > 0:
-            add(7, fit.log_scale, prior.sd_scale)
         for index, sd in enumerate((LINE_RAD, LINE_RAD, LINE_MM, LINE_MM)):
             add(MOTION + index, 0.0, sd)
         start, each = MOTION + LINE, fit.shape[0].size
@@ -372,7 +170,8 @@ class _System:
         ):
             add(start + place, value, sd)
         for place, value in enumerate(fit.ends):
-            add(count - len(fit.ends) + place, value, END_MM if place else LINE_MM)
+            add(count - 1 - len(fit.ends) + place, value, END_MM if place else LINE_MM)
+        add(count - 1, 0.0, ANYWHERE_MM)
         for station in self.on_shaft:
             rows = start + each * np.array([station - 2, station - 1])
             pattern = np.array([-1.0, 1.0])
@@ -407,15 +206,18 @@ def fit_outlines(
 
 
 def _widths(found: np.ndarray, seen: np.ndarray, width: float) -> np.ndarray:
-    """[2K + 1] px: the loss's width at every station, wider where outlines fit badly in most frames (jaws)."""
-    stations = found.shape[1] // 2
-    both = np.concatenate([found[:, :stations], found[:, stations:-1]])
-    used = np.concatenate([seen[:, :stations], seen[:, stations:-1]])
+    """[2K + 2] px: the loss's width at every station, wider where outlines fit badly in most frames (jaws)."""
+    stations = found.shape[1] // 2 - 1
+    both = np.concatenate([found[:, :stations], found[:, stations:-2]])
+    used = np.concatenate([seen[:, :stations], seen[:, stations:-2]])
     typical = [np.median(np.abs(column[use])) if use.any() else 0.0 for column, use in zip(both.T, used.T, strict=True)]
-    last = found[seen[:, -1], -1]
-    ended = float(np.median(np.abs(last - np.median(last)))) if len(last) else 0.0
     outline = np.tile(np.maximum(width, UNEVEN * np.array(typical)), 2)
-    return np.append(outline, max(width, UNEVEN * ended))
+    lengths = []
+    for column, narrow in ((-2, width), (-1, MARK_SHARE * width)):
+        last = found[seen[:, column], column]
+        spread = float(np.median(np.abs(last - np.median(last)))) if len(last) else 0.0
+        lengths.append(max(narrow, UNEVEN * spread))
+    return np.append(outline, lengths)
 
 
 def _loss(found: np.ndarray, seen: np.ndarray, width: np.ndarray) -> float:
@@ -423,11 +225,11 @@ def _loss(found: np.ndarray, seen: np.ndarray, width: np.ndarray) -> float:
     return float(np.where(seen, np.log1p((found / width) ** 2), 0.0).sum())
 
 
-def _minimise(system: _System, fit: Fit, width: float, steps: int = STEPS) -> Fit:
-    damping = 1e-2
+def _minimise(system: _System, fit: Fit, width: float, steps: int = STEPS, smooth: bool = False) -> Fit:
+    damping = 1e-4 if smooth else 1e-2
     for _ in range(steps):
         found, per_mm, angles, seen = system.residuals(fit)
-        columns = system.jacobian(fit, found, per_mm, angles)[..., system.free]
+        columns = system.jacobian(fit, found, per_mm, angles, smooth)[..., system.free]
         widths = _widths(found, seen, width)
         weights = np.where(seen, 1 / (1 + (found / widths) ** 2), 0.0) / widths**2
         information, gradient = system.prior_terms(fit)
@@ -440,7 +242,7 @@ def _minimise(system: _System, fit: Fit, width: float, steps: int = STEPS) -> Fi
             step[system.free] = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
             step[:3] = np.clip(step[:3], -0.15, 0.15)
             step[3:6] = np.clip(step[3:6], -15, 15)
-            trial = _moved(system.problem, fit, step, system.pivot(fit))
+            trial = moved(system.problem, fit, step, system.pivot(fit))
             after = _loss(system.residuals(trial)[0], seen, widths) + _prior_loss(system, trial)
             if after < before:
                 break
@@ -448,57 +250,29 @@ def _minimise(system: _System, fit: Fit, width: float, steps: int = STEPS) -> Fi
         else:
             break
         fit, damping = trial, max(damping / 4, 1e-6)
-        if before - after < ENOUGH * before:
+        if before - after < ENOUGH * before and damping <= FREE:
             break
     found, _, _, seen = system.residuals(fit)
     median = float(np.median(np.abs(found[seen]))) if seen.any() else np.inf
     count = max(int(seen.sum()), 1)
-    cost = _loss(found, seen, np.array(width)) / count
+    cost = _loss(found, seen, width * np.append(np.ones(found.shape[1] - 1), MARK_SHARE)) / count
     # residuals are far smaller than the loss's width where they fit, so its sum counts as little as that is squared
     noise = float(np.median(np.abs(found[seen]))) / 0.67 / width if seen.any() else 1.0
     return replace(fit, cost=cost, loss=cost + noise**2 * _prior_loss(system, fit) / count, residual_px=median)
 
 
-def pivot_of(problem: Problem, fit: Fit) -> np.ndarray:
-    """[3] mm, world: the point nearest to all lines of the instrument: the trocar, where it moves about one."""
-    world = fit.world_from_base @ instrument_in_base(problem, fit)
-    through, along = world[:, :3, :3] @ fit.tip + world[:, :3, 3], world[:, :3, :3] @ fit.axis
-    across = np.eye(3) - along[:, :, None] * along[:, None]
-    weak = np.eye(3) * 1e-3 * len(along)  # lines that are almost parallel: near the instrument
-    middle = through.mean(0)
-    return np.asarray(middle + np.linalg.solve(across.sum(0) + weak, np.einsum("fij,fj->i", across, through - middle)))
-
-
-def resized(problem: Problem, fit: Fit, factor: float) -> Fit:
-    """The fit with everything so many times as far from the cameras and as large, but the robot's motion: what images
-    of one still camera hardly tell from it where an instrument moves about a trocar."""
-    camera = np.linalg.inv(problem.camera_from_world)[:, :3, 3].mean(0)
-    base = fit.world_from_base.copy()
-    base[:3, 3] += (factor - 1) * (pivot_of(problem, fit) - camera)
-    poses = instrument_in_base(problem, fit)
-    before = fit.world_from_base @ poses
-    tip = before[:, :3, :3] @ fit.tip + before[:, :3, 3]
-    wanted = camera + factor * (tip - camera)
-    rotation = base[:3, :3] @ poses[:, :3, :3]
-    at = poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
-    local = np.einsum("fji,fj->fi", rotation, wanted - at).mean(0)
-    return replace(
-        fit, world_from_base=base, tip=local, stations=fit.stations * factor, shape=fit.shape * factor,
-        ends=fit.ends * factor,
-    )  # fmt: skip
-
-
 def refine(problem: Problem, prior: Prior, fit: Fit, steps: int = 40, front: float = FRONT) -> Fit:
     """The fit with the narrowest loss."""
     width = WIDTHS_PX[-1] * problem.seen.distances.shape[2] / 160
-    return _minimise(_System(problem, prior, fit, front), fit, width, steps)
+    # with marks, it is known how far in the instrument is: along what outlines leave open, the solver has to go there
+    return _minimise(_System(problem, prior, fit, front), fit, width, steps, smooth=problem.marks is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class Sureness:
-    """What silhouettes say of base, clock and scale once line and shape have taken what they can: information
+    """What silhouettes say of base and clock once line and shape have taken what they can: information
     [MOTION, MOTION], how its gradient scatters over the recording's blocks [MOTION, MOTION], and the variance of one
-    residual in widths of the loss. rad and mm about the instrument, s, 1."""
+    residual in widths of the loss. rad and mm about the instrument, s."""
 
     information: np.ndarray
     scatter: np.ndarray
@@ -543,7 +317,6 @@ def _prior_loss(system: _System, fit: Fit) -> float:
         shift = system.pivot(fit) - (given[:3, :3] @ system.middle + given[:3, 3])
         loss += np.square(turn / prior.sd_rad).sum() + np.square(shift / prior.sd_mm).sum()
     loss += (fit.clock / prior.sd_clock) ** 2 if prior.sd_clock > 0 else 0.0
-    loss += (fit.log_scale / prior.sd_scale) ** 2 if prior.sd_scale > 0 else 0.0
     off, sds = system.shape_off(fit)
     step = fit.shape[system.on_shaft, 0, 0] - fit.shape[system.on_shaft - 1, 0, 0]
     loss += float(np.square(fit.ends[1:] / END_MM).sum() + (fit.ends[0] / LINE_MM) ** 2)

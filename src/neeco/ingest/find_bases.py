@@ -17,6 +17,7 @@ from neeco.ingest.episodes import Episodes
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.recording import InstrumentLogs
 from neeco.ingest.registration import GIVEN, SCOPE_MOTION, ClockOffset
+from neeco.ingest.still import reduced
 
 FRAMES = 140  # looked at, evenly spaced
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
@@ -70,12 +71,13 @@ def take_bases(
     times: np.ndarray,
     cameras: np.ndarray,
     pinhole: Lens,
+    load: Callable[[int], np.ndarray],
     moving: Callable[[np.ndarray], np.ndarray],
     hidden: np.ndarray | None,
 ) -> dict[str, BaseRegistration]:
     """`place_bases`, and from then on all poses and clocks are as these say. Returns those found."""
     found = {}
-    for name, base in place_bases(data, times, cameras, pinhole, moving, hidden).items():
+    for name, base in place_bases(data, times, cameras, pinhole, load, moving, hidden).items():
         data.world_from_base[name] = base.world_from_base
         if base.clock is not None:
             data.move_clock(data.poses[name].clock, base.clock)
@@ -89,14 +91,16 @@ def place_bases(
     times: np.ndarray,
     cameras: np.ndarray,
     pinhole: Lens,
+    load: Callable[[int], np.ndarray],
     moving: Callable[[np.ndarray], np.ndarray],
     hidden: np.ndarray | None = None,
 ) -> dict[str, PlacedBase]:
     """The bases of all instruments that say something of theirs.
 
-    times [M] s of the frames, cameras [M, 4, 4] world_from_camera; moving(rows): masks bool [R, h, w] of what moves in
-    rows of them, reduced to REFERENCE_PIXELS; hidden: bool [h, w] of these. Lengths of a robot are taken as they are.
-    Notes what was found, how sure it is and what is open. Raises NeecoError where nothing moves with an instrument.
+    times [M] s of the frames, cameras [M, 4, 4] world_from_camera; load(row): their image uint8 [H, W, 3], as `pinhole`
+    sees it; moving(rows): masks bool [R, h, w] of what moves in rows of them, reduced to REFERENCE_PIXELS; hidden: bool
+    [h, w] of these. Lengths of a robot are taken as they are. Notes what was found, how sure it is and what is open.
+    Raises NeecoError where nothing moves with an instrument.
     """
     placed: dict[str, PlacedBase] = {}
     unknown = []
@@ -110,11 +114,11 @@ def place_bases(
     if not unknown:
         return placed
     rows = np.array(evenly_spaced(len(times), FRAMES))
-    masks = moving(rows)
+    masks, images = moving(rows), np.stack([reduced(load(int(row))) for row in rows])
     lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
     for item in unknown:
         assert item.base is not None
-        registration, clock = _find(data, item, item.base, masks, lens, times[rows], cameras[rows], hidden)
+        registration, clock = _find(data, item, item.base, (masks, images), lens, times[rows], cameras[rows], hidden)
         placed[item.name] = PlacedBase(registration.world_from_base, clock, registration)
         data.note(describe(item.name, registration))
     return placed
@@ -124,7 +128,7 @@ def _find(
     data: Episodes,
     item: InstrumentLogs,
     stated: StatedBase,
-    masks: np.ndarray,
+    seen: tuple[np.ndarray, np.ndarray],
     lens: Lens,
     times: np.ndarray,
     cameras: np.ndarray,
@@ -154,9 +158,9 @@ def _find(
         prior = (_in_world(stated, cameras), stated.sd_mm, stated.sd_deg)
     try:
         found = find_base(
-            item.name, masks, lens.intrinsics, np.linalg.inv(cameras), base_from_shaft, times, prior,
+            item.name, seen[0], lens.intrinsics, np.linalg.inv(cameras), base_from_shaft, times, prior,
             readings=np.stack(list(readings.values()), -1) if readings else None, hidden=hidden,
-            clock_known=clock.source in KNOWN,
+            images=seen[1], clock_known=clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
         raise NeecoError(f"{data.recording.path}: {error}") from error
@@ -186,8 +190,6 @@ def describe(name: str, found: BaseRegistration) -> str:
     )
     if np.isfinite(found.overlap_before):
         words += f" ({found.overlap_before:.2f} as given)"
-    if found.scale_sd > 0:
-        words += f"; lengths of its robot are {100 * (found.scale - 1):+.1f} +- {100 * found.scale_sd:.1f} % off"
     if found.open_directions:
         what = "as given" if np.isfinite(found.moved_mm) else "as first guessed"
         words += f"; its motion does not determine {', nor '.join(found.open_directions)}: there it stays about {what}"

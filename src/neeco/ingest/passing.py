@@ -10,16 +10,13 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
+from neeco.ingest.colors import color_levels, color_odds, whole_pieces
 from neeco.ingest.motion import ResidualFlow
 from neeco.ingest.still import reduced
 
 SUSPECT, SURE, TISSUE = 0.3, 0.7, 0.2  # share of neighbours in time against which a pixel moves: may, does, does not
 REACH = np.ones((9, 9), np.uint8)  # px about what may move, in which the instrument is
-LEVELS = 20  # of each colour, that are told apart
-BLUR = 0.7  # levels: colours alike
-RARE = 1e-7  # share of a colour that was never seen
 SMOOTH_PX = 1.5  # over which neighbours vote
 ODDS = 1.0  # logarithm of the odds from which a pixel shows an instrument
 ROUNDS = 4  # each with the colours of what the one before found
@@ -45,30 +42,13 @@ def passing_masks(
     suspect = np.stack([cv2.dilate((share > SUSPECT).astype(np.uint8), REACH) > 0 for share in moves])
     shown = np.ones(size[::-1], bool) if visible is None else reduced(visible.astype(np.uint8) * 255) == 255
     suspect &= shown
-    level = images.astype(np.int64) * LEVELS // 256
-    colors = (level[..., 0] * LEVELS + level[..., 1]) * LEVELS + level[..., 2]
+    colors = color_levels(images)
     inside, outside = moves > SURE, moves <= TISSUE
     for _ in range(ROUNDS):
-        odds = np.log(_shares(colors[inside & shown]) / _shares(colors[outside & shown])).astype(np.float32)
+        odds = color_odds(colors, inside & shown, outside & shown)
         masks = np.stack([
-            _pieces((cv2.GaussianBlur(odds[found], (0, 0), SMOOTH_PX) > ODDS) & may)
+            whole_pieces((odds.smoothed(found, SMOOTH_PX) > ODDS) & may, SMALLEST)
             for found, may in zip(colors, suspect, strict=True)
         ])  # fmt: skip
         inside, outside = masks, ~masks
     return masks
-
-
-def _shares(colors: np.ndarray) -> np.ndarray:
-    """How often each colour is among those [P], and those like it."""
-    counts = np.bincount(colors, minlength=LEVELS**3).reshape((LEVELS,) * 3).astype(np.float64)
-    return np.asarray(gaussian_filter(counts, BLUR) / max(len(colors), 1) + RARE).reshape(-1)
-
-
-def _pieces(mask: np.ndarray) -> np.ndarray:
-    """A mask bool [h, w] without specks and holes."""
-    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    whole = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    _, labels, facts, _ = cv2.connectedComponentsWithStats(whole, connectivity=8)
-    large = facts[:, cv2.CC_STAT_AREA] >= SMALLEST * whole.size
-    large[0] = False  # the rest of the image
-    return np.asarray(large[labels])

@@ -178,7 +178,7 @@ class _Ingest:
             if log.frame == CAMERA:
                 data.world_from_base[name] = np.eye(4)
         self._find_bases(
-            cameras.world_from_camera, self._times(cameras), pinhole,
+            cameras, cameras.world_from_camera, pinhole,
             lambda rows: moving_masks(self._load, len(self.names), rows, visible),
         )  # fmt: skip
         unplaced = [name for name in data.poses if name not in data.world_from_base]
@@ -196,23 +196,26 @@ class _Ingest:
             return
         flow, rows = self._residual_flow(sfm, pinhole), sfm.indices
         self._find_bases(
-            registration.cameras(sfm.world_from_camera), self._times(sfm), pinhole,
+            sfm, registration.cameras(sfm.world_from_camera), pinhole,
             lambda some: passing_masks(self._loader(rows), flow, some, self.settings.moving_px, self._field_of_view()),
         )  # fmt: skip
 
     def _find_bases(
         self,
+        sfm: SfmResult,
         cameras: np.ndarray,
-        times: np.ndarray,
         pinhole: Lens,
         moving: Callable[[np.ndarray], np.ndarray],
     ) -> None:
-        """Take the bases as stated, or find them from what moves; see `place_bases`."""
+        """Take the bases as stated, or find them from what moves before `cameras`, of the rows of `sfm`; see
+        `place_bases`."""
         if any(item.base is not None for item in self.recording.instruments):
             self.progress("finding the robot's base", 0, 0)
             visible = self._field_of_view()
             hidden = None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255
-            self.bases = take_bases(self.data, times, cameras, pinhole, moving, hidden)
+            self.bases = take_bases(
+                self.data, self._times(sfm), cameras, pinhole, self._loader(sfm.indices), moving, hidden
+            )
 
     def _right_camera(self) -> RightCamera | None:
         if self.recording.stereo is None:

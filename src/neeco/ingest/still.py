@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
+from neeco.ingest.colors import color_levels, color_odds, whole_pieces
 from neeco.raster.types import Camera
 
 # noticing
@@ -41,6 +42,13 @@ SHADOW = (0.35, 0.97)  # share of the light that a shadow leaves
 SHADOW_TINT = 0.08  # by which that share may differ between the colours
 COLORFUL = 0.2  # saturation of a background from which a shadow is told from a dark instrument
 SPECK = 0.001  # of the image: what moves is larger
+
+# colours of what moves
+AROUND, COVERS = 4, 3  # px about what moves that are not surely tissue, and that do not count as background
+LIKELY, SURE, DECIDED = 0.5, 1.0, 2.0  # logarithms of odds
+VOTING_PX, NEAR_PX = 1.5, 0.7  # within which neighbours vote, at first and for outlines
+OF_IT_MOVES = 0.2  # share of what has its colours
+RARELY = 0.02  # share of images that show what is behind, too few to tell it
 
 
 def stands_still(load: Callable[[int], np.ndarray], count: int) -> bool:
@@ -212,10 +220,38 @@ def moving_masks(
     """What moves before the still background, in some of `count` images of a still scope.
 
     load: one image uint8 [H, W, 3]; rows [R]: which of them; visible: bool [H, W], the field of view, where it has a
-    border. Returns bool [R, h, w], of the images `reduced`. Nothing is known of instruments here: one that stands in
-    one place in most frames is taken for background there.
+    border. Returns bool [R, h, w], of the images `reduced`.
+
+    Nothing is known of instruments here. Where a shaft lies in most images, it is background at first, and only its
+    ends move; but it has colours that are seen where something moves and hardly elsewhere. What these show does not
+    count for the background in a second pass.
     """
     background = find_background(lambda row: reduced(load(row)), count)
-    shown = None if visible is None else reduced(visible.astype(np.uint8) * 255) == 255
-    found = [moving_mask(reduced(load(int(row))), background) for row in rows]
-    return np.stack(found) if shown is None else np.stack(found) & shown
+    images = np.stack([reduced(load(int(row))) for row in rows])
+    shown = np.ones(images.shape[1:3], bool)
+    if visible is not None:
+        shown = reduced(visible.astype(np.uint8) * 255) == 255
+    moves = np.stack([moving_mask(image, background) for image in images]) & shown
+    colors = color_levels(images)
+    around = np.stack([_grown(mask, AROUND) for mask in moves])
+    odds = color_odds(colors, moves, ~around & shown)
+    hidden = np.stack([
+        _grown(mask | (whole_pieces(odds.smoothed(found, VOTING_PX) > LIKELY, SPECK, mask, OF_IT_MOVES)), COVERS)
+        for mask, found in zip(moves, colors, strict=True)
+    ])  # fmt: skip
+    background = find_background(lambda place: images[place], len(rows), lambda place: hidden[place])
+    unseen = background.seen < RARELY
+    return shown & np.stack([
+        _with_colors(moving_mask(image, background) | (covered & unseen), odds.smoothed(found, NEAR_PX))
+        for image, found, covered in zip(images, colors, hidden, strict=True)
+    ])  # fmt: skip
+
+
+def _with_colors(moves: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """What moves, bool [h, w], and what has its colours beside it, by the odds [h, w] of each pixel."""
+    return whole_pieces((moves & (odds > -DECIDED)) | (odds > SURE), SPECK, moves, OF_IT_MOVES)
+
+
+def _grown(mask: np.ndarray, px: int) -> np.ndarray:
+    """A mask bool [h, w] and what is within so many px of it."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1,) * 2, np.uint8)) > 0)
