@@ -5,7 +5,9 @@
 
 `footage` makes a capture of CAPTURE's images and cameras whose instruments' states are withheld (`--first-state`: all
 but that of the first frame). `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
-all frames of its track.json, whether they were trusted or not.
+all frames of its track.json, whether they were trusted or not. Where the sensors of RUN's capture and of CAPTURE sit
+otherwise on the instrument (footage over another tissue), only the rows without the constant offset say something;
+readings of the jaw are compared as the openings they mean (truth/hinge.json).
 
 Errors are those of camera_from_instrument, so that the gauge of the cameras does not count. `px` is where a point near
 the tips falls in the image; `deg` the rotation; `joint` deg (mm where it slides), the largest of an instrument's;
@@ -38,7 +40,7 @@ from neeco.raster.pinhole import project
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.raster.types import Camera
 from neeco.tracking.track import state_of
-from neeco.training.run import open_run
+from neeco.training.run import load_run, open_run
 
 DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
@@ -80,6 +82,16 @@ def _tip_and_axis(root: Path) -> tuple[Tensor, Tensor]:
     return tip, torch.tensor([0.0, 0, 1], dtype=torch.float64)
 
 
+def opened(root: Path, joints: dict[str, float]) -> dict[str, float]:
+    """Readings as the openings that they mean in a capture, where its truth says so."""
+    file = root / "truth" / "hinge.json"
+    meant = json.loads(file.read_text()).get("joint", {}) if file.exists() else {}
+    return {
+        name: meant[name]["sign"] * (value - meant[name]["zero"]) if name in meant else value
+        for name, value in joints.items()
+    }
+
+
 def camera_from_instrument(world_from_camera: Tensor, world_from_instrument: Tensor) -> Tensor:
     """[4, 4] float64."""
     return torch.linalg.inv(world_from_camera.double()) @ world_from_instrument.double()
@@ -115,16 +127,19 @@ def score(run: Path, root: Path, tracked: Path) -> None:
     frames = {frame.name: frame for frame in capture.frames}
     records = json.loads((tracked / "track.json").read_text())["frames"]
     found, true, rows = [], [], []
-    with open_run(run) as opened:
+    with open_run(run) as tracked_by:
+        recorded, own = tracked_by.capture().root, tracked / "run"  # over another tissue: by which it was tracked
+        scene = load_run(own).scene if own.exists() else tracked_by.scene
         for record in records:
             frame = frames[record["frame"]]
             given = next(iter(record["instruments"].values()))
             pose = torch.tensor(given["pose"], dtype=torch.float64)
             found.append(camera_from_instrument(frame.camera.world_from_camera, pose))
             true.append(truth.camera_from_instrument[frame.name])
-            joints = [given["joints"][j] - value for j, value in truth.joints[frame.name].items()]
+            values, true_values = opened(recorded, given["joints"]), opened(root, truth.joints[frame.name])
+            joints = [values[name] - value for name, value in true_values.items()]
             row = {"split": frame.split, "trust": record["trust"]["value"], "how": record["how"], "joints": joints}
-            reference, parts = load_reference(capture, frame), draw(opened.scene, state_of(record), frame.camera).parts
+            reference, parts = load_reference(capture, frame), draw(scene, state_of(record), frame.camera).parts
             if reference is not None and parts is not None:
                 one, other = parts.numpy() > 0, reference.mask.numpy() > 0
                 row["iou"] = float((one & other).sum() / max(1, (one | other).sum()))

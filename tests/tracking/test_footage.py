@@ -12,18 +12,22 @@ from grasper_world import CAMERA, RecordedRun, grasper_state, make_scene, moving
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from neeco.capture.images import write_image
 from neeco.capture.model import Capture, PointCloud, State
 from neeco.cli import main
 from neeco.errors import NeecoError
 from neeco.raster.types import Camera
 from neeco.scene import Scene
-from neeco.tracking import footage_scene, footage_tissue
-from neeco.tracking.coordinates import DEG
+from neeco.tracking import footage_again, footage_scene, footage_tissue
+from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue
+from neeco.tracking.follow import Step
 from neeco.tracking.footage_scene import Colors, over_tissue
 from neeco.tracking.footage_tissue import passing
 from neeco.tracking.footage_video import read_footage
+from neeco.tracking.motion import Motion
 from neeco.tracking.track import state_of, track_footage
+from neeco.tracking.trust import TrackTrust
 from neeco.training.run import load_run
 
 COUNT = 6
@@ -68,6 +72,7 @@ def other_footage(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(footage_tissue, "ROUNDS", (100, 250))
     monkeypatch.setattr(footage_scene, "FRAMES", 2)
+    monkeypatch.setattr(footage_again, "ITERATIONS", 60)
 
 
 def in_camera(state: State, camera: Camera) -> Tensor:
@@ -162,6 +167,42 @@ def test_another_tissue_broken_off_goes_on_to_the_same_bytes(
     for one, other in zip(*files, strict=True):
         if one.name != "config.yaml":  # says where its capture lies
             assert one.read_bytes() == other.read_bytes(), one
+
+
+def test_tissue_alone_is_learned_again(other_footage: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(footage_again, "ITERATIONS", 60)
+    scene, trust = make_scene(), TrackTrust(0.9, 1.0, 1.0, 1.0)
+    coordinates = Coordinates.of(scene)
+    motion = Motion.of(coordinates, scene.recorded.states)
+    frames = [replace(f, camera=CAMERA) for f in other_footage.frames]
+    steps = [
+        Step(k, "followed", motion.begin(moving(1.2 * k)), 0.2, 1.0, trust, (), 0.0, 0.0) for k in range(len(frames))
+    ]
+    before = {name: tensor.clone() for name, tensor in scene.canonical.tensors().items()}
+    footage_again.learned_again(scene, frames, steps, lambda what, done, total: None)
+    rows, after = scene.canonical.of_instruments, scene.canonical.tensors()
+    assert all(torch.equal(after[name][rows], tensor[rows]) for name, tensor in before.items())
+    assert not torch.equal(after["sh_dc"][~rows], before["sh_dc"][~rows])
+    lost = [replace(step, how="lost") for step in steps]
+    assert footage_again.usable(lost) == []
+
+
+@pytest.mark.parametrize("what", ["no instrument", "black"])
+def test_footage_without_the_instrument_is_trusted_nowhere(
+    tracked_run: RecordedRun, other_footage: Capture, tmp_path: Path, short_rounds: None, what: str
+) -> None:
+    wall = Tissue(other_wall()).draw(CAMERA, None)
+    frames = []
+    for frame in other_footage.frames[:2]:
+        path = tmp_path / f"{frame.name}.png"
+        write_image(path, wall if what == "no instrument" else torch.zeros_like(wall))
+        frames.append(replace(frame, image_path=path))
+    footage = replace(other_footage, frames=tuple(frames))
+    tracked = track_footage(tracked_run, footage, tmp_path / "out", tissue="footage")
+    assert tracked.written == 0
+    assert max(rec["trust"]["value"] for rec in tracked.records) < 0.5
+    with pytest.raises(NeecoError, match=r"no frame is trusted"):
+        tracked.require_trusted()
 
 
 def test_one_frame_does_not_tell_tissue_from_what_passes(

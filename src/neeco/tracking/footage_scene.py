@@ -8,6 +8,7 @@ fitted to where the instruments are found in a few frames, as are the lamps whos
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,12 +23,16 @@ from neeco.capture.model import Frame, State, evenly_spaced
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.canonical import join_bodies
+from neeco.scene.training_views import TrainingViews
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, view_of, working_size
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.footage_tissue import Report, passing
 from neeco.tracking.motion import Motion
 from neeco.tracking.search import Search
+from neeco.training.config import method_defaults
+from neeco.training.instruments.shadow import find_shadow
+from neeco.training.session import new_session
 
 FRAMES = 8  # in which instruments are looked for
 USED, MOST_MISFIT = 0.5, 2.0  # of them, those explained best tell colours; none explained so many times worse than one
@@ -40,6 +45,7 @@ HUBER = 0.05  # residual of a colour beyond which a pixel pulls linearly
 DRAWN = 24  # recorded states whose colours are compared with those of what passes before the tissue
 SHARES = (0.1, 0.9, 17)  # quantiles of these: from, to, how many
 FEWEST = 200  # pixels from which they are taken
+ALIKE = 0.15  # of the logarithm of gains and gamma: less is no other colour
 GAINS, GAMMAS = (0.4, 2.5), (0.5, 2.0)
 GAMMA_PRIOR, PRIOR = 0.2, 0.005  # standard deviation of its logarithm; mean error of colours that weighs as much
 LEAST_COLOR = 0.01  # of a Gaussian: below, a gamma is taken of this
@@ -51,6 +57,11 @@ class Colors:
 
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gamma: float = 1.0
+
+    @property
+    def differs(self) -> bool:
+        """Whether instruments could not be found in their recorded colours."""
+        return any(abs(math.log(value)) > ALIKE for value in (*self.gain, self.gamma))
 
     def of(self, scene: Scene) -> Scene:
         """The scene, its instruments' Gaussians recoloured: what they show head on exactly, what changes with the
@@ -143,7 +154,16 @@ class Adapted:
 
     def to_json(self) -> dict[str, Any]:
         """What was found, as plain values for files."""
-        return {"gain": [round(gain, 4) for gain in self.colors.gain], "gamma": round(self.colors.gamma, 4)}
+        scene = self.scene
+        return {
+            "gain": [round(gain, 4) for gain in self.colors.gain],
+            "gamma": round(self.colors.gamma, 4),
+            "lamps_mm": [
+                [round(value, 2) for value in offset.tolist()]
+                for offset, strength in zip(scene.shadow_offsets, scene.shadow_strengths, strict=True)
+                if float(strength) > 0
+            ],
+        }
 
 
 def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
@@ -151,8 +171,9 @@ def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
     plain, coordinates = _fitter(scene), Coordinates.of(scene)
     chosen = [frames[k] for k in evenly_spaced(len(frames), FRAMES)]
     found: list[tuple[Frame, Fit]] = []
-    for guess in (Colors(), _guessed(plain, chosen)):  # of a like make, of another
-        fits = _found(guess.of(scene), chosen, report)
+    guess = _guessed(plain, chosen)
+    for tried in (Colors(), guess) if guess.differs else (Colors(),):
+        fits = _found(tried.of(scene), chosen, report)
         if sum(fit.gain for _, fit in fits) > sum(fit.gain for _, fit in found):
             found = fits
     lit, colors = scene, Colors()
@@ -167,7 +188,23 @@ def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
             for frame, fit in found
             if (better := fitter.fit(_view(frame, fitter, fit.state), fit.state, wide(coordinates, *NEAR)))
         ]
-    return Adapted(lit, colors)
+    return Adapted(with_lamps(lit, found), colors)
+
+
+def with_lamps(scene: Scene, found: Sequence[tuple[Frame, Fit]]) -> Scene:
+    """The scene with the lamps whose shadow its instruments cast on the tissue, as training finds them; with none where
+    these explain too little."""
+    made = _like(scene, scene.canonical)
+    if not found:
+        return made
+    frames = [replace(frame, split="train", state=fit.state) for frame, fit in found]
+    views = TrainingViews.read(frames).to(scene.center.device)
+    session = new_session(made, views, method_defaults(scene.method))
+    logits = made.canonical.opacity_logits.clone()
+    with session.searching():
+        find_shadow(session)
+    made.canonical.opacity_logits.copy_(logits)  # training makes what is faint, such as a learned shadow, fainter
+    return made.requires_grad_(False)
 
 
 def _found(scene: Scene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:

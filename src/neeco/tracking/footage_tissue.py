@@ -25,9 +25,10 @@ from neeco.training.train import ProgressRow, train
 
 METHOD = "3dgs"
 FRAMES = 240  # of the footage that the tissue is learned from, at most
-ROUNDS = (1000, 2000)  # iterations; from the second on what passes is masked
+ROUNDS = (800, 1000, 1800)  # iterations; from the second on what passes is masked
 GAUSSIANS = 12_000  # of 320x256 images; the instrument hides fine detail anyway
-ODD, TIMES = 0.06, 3.0  # of white, and of what is usual: a pixel that the tissue explains worse shows what passes
+ODD, TIMES = 0.05, 3.0  # of white, and of what is usual: a pixel that the tissue explains worse shows what passes
+WHITE = 0.75  # of every colour: the lamps' reflections, which 3DGS learns as the tissue's
 USUAL = 0.5  # of a frame's pixels are explained better
 WINDOW, SPECK, RIM = 5, 2, 8  # px of images of 320x256: mean error over, smallest radius of, and about what passes
 MOST_MASKED = 0.7  # of an image: more, and the masks say nothing
@@ -97,6 +98,7 @@ def passing(frame: Frame, tissue: Tissue, rim: int = RIM) -> np.ndarray:
     image = area_averaged(frame.load_image(), camera.width, camera.height)
     error = uniform_filter((tissue.draw(camera, None) - image).abs().mean(-1).numpy(), WINDOW)
     odd = error > max(ODD, TIMES * float(np.quantile(error, USUAL)))
+    odd &= image.amin(-1).numpy() < WHITE
     odd = binary_opening(odd, iterations=SPECK)
     if rim:
         odd = binary_dilation(odd, iterations=rim)

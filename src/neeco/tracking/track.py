@@ -31,6 +31,7 @@ from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
+from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
 from neeco.tracking.footage_video import FOOTAGE
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
+SECOND = "second"  # in it: steps by tissue and light that were learned again
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
 SURE = 0.8  # trust with which instruments are begun to be followed at once
@@ -130,11 +132,14 @@ def track_footage(
             if tissue == "footage":
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
                 fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-            motion = Motion.of(coordinates, scene.recorded.states)
-            search = Search(fitter, motion, scene.recorded)
-            follower = Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
-            work = _Work(output / STEPS, follower, on_progress)
-            records = [_record(frames[k], step, coordinates) for k, step in enumerate(work.all_steps(given))]
+            work = _Work(output / STEPS, _follower(fitter, frames, reference), on_progress)
+            steps = work.all_steps(given)
+            if tissue == "footage":
+                scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
+                fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
+                work = _Work(output / STEPS / SECOND, _follower(fitter, frames, reference), on_progress)
+                steps = work.all_steps(given)
+            records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
             info = stored
@@ -147,6 +152,21 @@ def track_footage(
         if (output / STEPS).exists():
             shutil.rmtree(output / STEPS)
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
+
+
+def _follower(fitter: Fitter, frames: Sequence[Frame], reference: Reference) -> Follower:
+    recorded = fitter.drawer.scene.recorded
+    motion = Motion.of(fitter.coordinates, recorded.states)
+    search = Search(fitter, motion, recorded)
+    return Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
+
+
+def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:
+    """Tissue and light learned again from what was tracked; kept in `folder`."""
+    file = folder / "scene-2.safetensors"
+    if not file.exists():
+        save_scene(learned_again(scene, frames, steps, report), file)
+    return gaussian_scene(load_scene(file).to(scene.center.device), "track")
 
 
 def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Report) -> tuple[Scene, dict[str, Any]]:
