@@ -79,10 +79,10 @@ class Colors:
         return made
 
     @classmethod
-    def fitted(cls, drawn: Tensor, seen: Tensor) -> Colors:
+    def fitted(cls, rendered: Tensor, seen: Tensor) -> Colors:
         """Those by which drawn colours [P, 3] become the seen ones [P, 3], by least squares with Huber's loss."""
-        usable = ((drawn > DARK) & (drawn < BRIGHT) & (seen > DARK) & (seen < BRIGHT)).all(1)
-        pairs = torch.stack([drawn[usable], seen[usable]]).double().numpy()  # [2, P, 3]
+        usable = ((rendered > DARK) & (rendered < BRIGHT) & (seen > DARK) & (seen < BRIGHT)).all(1)
+        pairs = torch.stack([rendered[usable], seen[usable]]).double().numpy()  # [2, P, 3]
         pairs = pairs[:, evenly_spaced(pairs.shape[1], PIXELS)] if pairs.shape[1] else pairs
         if not pairs.shape[1]:
             return cls()
@@ -226,16 +226,16 @@ def _fitter(scene: Scene) -> Fitter:
 def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
     """Before any state is known: from how often colours are among those of what passes before the tissue, and of the
     instruments drawn in recorded states."""
-    scene, drawn, seen = plain.drawer.scene, [], []
+    scene, rendered, seen = plain.drawer.scene, [], []
     recorded = scene.recorded
     for k in evenly_spaced(len(recorded.states), DRAWN):
         camera = working_size(recorded.cameras[k], recorded)
         color, alpha = plain.drawer.draw(recorded.states[k], camera)
-        drawn.append((color / alpha[..., None])[alpha > SOLID])
+        rendered.append((color / alpha[..., None])[alpha > SOLID])
     for frame in frames:
-        shown = torch.from_numpy(passing(frame, plain.tissue, rim=0))
+        shown = torch.from_numpy(passing(frame, plain.tissue, margin=0))
         seen.append(frame.load_image()[shown])
-    samples = [torch.cat(colors) for colors in (drawn, seen)]
+    samples = [torch.cat(colors) for colors in (rendered, seen)]
     if any(len(sample) < FEWEST for sample in samples):
         return Colors()
     shares = torch.linspace(*SHARES)
@@ -245,14 +245,14 @@ def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
 
 def _colors(plain: Fitter, found: Sequence[tuple[Frame, Fit]]) -> Colors:
     """From the instruments as drawn in their recorded colours, and the frames."""
-    drawn, seen = [], []
+    rendered, seen = [], []
     for frame, fit in found:
         view = _view(frame, plain, None)
         color, alpha = plain.drawer.draw(fit.state, view.camera)
         solid = torch.from_numpy(binary_erosion((alpha > SOLID).numpy(), iterations=1)) & (view.weight > 0)
-        drawn.append(color[solid] / alpha[solid][:, None])
+        rendered.append(color[solid] / alpha[solid][:, None])
         seen.append(view.image[solid])
-    return Colors.fitted(torch.cat(drawn), torch.cat(seen)) if drawn else Colors()
+    return Colors.fitted(torch.cat(rendered), torch.cat(seen)) if rendered else Colors()
 
 
 def _view(frame: Frame, fitter: Fitter, state: State | None) -> View:

@@ -92,7 +92,7 @@ def _masked(frames: Sequence[Frame], scene: Scene, folder: Path) -> tuple[Frame,
     return tuple(masked)
 
 
-def passing(frame: Frame, tissue: Tissue, rim: int = RIM) -> np.ndarray:
+def passing(frame: Frame, tissue: Tissue, margin: int = RIM) -> np.ndarray:
     """bool [H, W]: where a frame shows something before the tissue, with a rim (px of images of 320x256)."""
     camera = frame.camera.within(REFERENCE_PIXELS)
     image = area_averaged(frame.load_image(), camera.width, camera.height)
@@ -100,8 +100,8 @@ def passing(frame: Frame, tissue: Tissue, rim: int = RIM) -> np.ndarray:
     odd = error > max(ODD, TIMES * float(np.quantile(error, USUAL)))
     odd &= image.amin(-1).numpy() < WHITE
     odd = binary_opening(odd, iterations=SPECK)
-    if rim:
-        odd = binary_dilation(odd, iterations=rim)
+    if margin:
+        odd = binary_dilation(odd, iterations=margin)
     if odd.mean() > MOST_MASKED:
         odd = np.zeros_like(odd)
     rows = np.arange(frame.camera.height) * camera.height // frame.camera.height

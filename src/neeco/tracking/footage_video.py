@@ -33,13 +33,13 @@ def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: R
     path = Path(path)
     if not path.is_file():
         return read_capture(path)
-    kept = output / FOOTAGE
+    capture_folder = output / FOOTAGE
     with path.open("rb") as stream:
         source = {"video_sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
-    if kept.exists() and resume:
-        if read_json(kept / SOURCE) != source:
-            raise NeecoError(f"{kept}: is of another video than {path}; use a new folder")
-        return read_capture(kept)
+    if capture_folder.exists() and resume:
+        if read_json(capture_folder / SOURCE) != source:
+            raise NeecoError(f"{capture_folder}: is of another video than {path}; use a new folder")
+        return read_capture(capture_folder)
     if not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
     recording = recording_from_flags(path)
@@ -53,13 +53,13 @@ def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: R
         write_json(folder / SOURCE, source)
 
     try:
-        ingest(recording, kept, report, complete)
+        ingest(recording, capture_folder, report, complete)
     except NeecoError as error:
         raise NeecoError(
             f"{error} (with more known of it: neeco ingest --video {path} --calibration FILE --output CAPTURE, then "
             "track CAPTURE with --tissue footage)"
         ) from None
-    return read_capture(kept)
+    return read_capture(capture_folder)
 
 
 def _distance(scene: Scene) -> float:
