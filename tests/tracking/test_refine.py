@@ -65,6 +65,16 @@ def test_tracked_frames_join_the_recorded_ones(
     refine.refine_run(tracked_run, [tracked], output, device=CPU, resume=True)
 
 
+def test_an_image_is_trained_on_once(tracked_run: RecordedRun) -> None:
+    own = tracked_run.capture()
+    withheld = replace(own.frames[1], split="unseen")
+    own = replace(own, frames=(own.frames[0], withheld))
+    tracked = [own.frames[0], replace(withheld, split="train")]
+    left, added = refine.without_twice(own, tracked)
+    assert left.frames == (own.frames[0],)
+    assert added == [tracked[1]]
+
+
 def test_recorded_states_are_fitted_to_their_images(tracked_run: RecordedRun) -> None:
     capture = tracked_run.capture()
     true = capture.frames[3].state.instruments["grasper"]

@@ -6,6 +6,7 @@ that was learned says, free of a tracker's latency and noise. Trust weighs frame
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,7 +19,7 @@ from neeco.capture.model import Capture, Frame
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_json
+from neeco.files import is_vacant, own_folder, read_bytes, read_json
 from neeco.scene import Scene
 from neeco.scene.scene import gaussian_scene
 from neeco.settings import with_fields
@@ -59,6 +60,7 @@ def refine_run(
         scene, own = gaussian_scene(run.scene, "refine"), run.capture()
         frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
         with own_folder(output):
+            own, frames = without_twice(own, frames)
             recorded = fitted(scene, own, on_progress)
             merged = replace(own, frames=(*recorded, *_named_apart(frames, output / STAGING)))
             write_capture(merged, folder)
@@ -85,6 +87,21 @@ def _tracked_frames(path: Path, scene: Scene) -> list[Frame]:
                 "capture that `neeco track` made with this run"
             )
     return [replace(frame, split="train") for frame in capture.frames]
+
+
+def without_twice(own: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
+    """Both without images that both have: what is trained on stays as recorded; what was withheld and then tracked is
+    trained on as tracked, and tests no more. Raises NeecoError when an image cannot be read."""
+    images = {_digest(frame): frame for frame in own.frames}
+    again = {digest: frame for frame in tracked if (digest := _digest(frame)) in images}
+    withheld = {images[digest].image_path for digest in again if images[digest].split != "train"}
+    recorded = {frame.image_path for digest, frame in again.items() if images[digest].split == "train"}
+    frames = tuple(frame for frame in own.frames if frame.image_path not in withheld)
+    return replace(own, frames=frames), [frame for frame in tracked if frame.image_path not in recorded]
+
+
+def _digest(frame: Frame) -> bytes:
+    return hashlib.sha256(read_bytes(frame.image_path, "an image")).digest()
 
 
 def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
