@@ -57,6 +57,9 @@ scene is one more entry in `scenes.SCENES`.
               behind the wrist, tilted 16 degrees
     bowel-grasper, stomach-scissors
               each with the other's instrument, in other colours, under a single lamp whose shadow falls beside it
+    stomach-footage, bowel-footage
+              over each organ the other's instrument as it was recorded there, moved otherwise, under a single lamp: to
+              be tracked by the other's run
     bowel-wristed, stomach-wristed
               8 mm black shaft whose wrist pitches and, 9 mm further, yaws two unequal jaws; readings wrist_pitch and
               wrist_yaw with the encoders' offsets, play and noise; `kinematics` states every axis 5 degrees

@@ -10,7 +10,9 @@ but that of the first frame). `--effect`: camera effects as in docs/camera-effec
 `--rod`: a steel rod goes through the image, before the instrument, every three seconds; `--window`: images cropped, so
 that the instrument leaves and enters. `single` finds the state in each frame for itself, nothing known before.
 `score` compares TRACKED, what `neeco track RUN OUT` made of it, with CAPTURE's truth/:
-all frames of its track.json, whether they were trusted or not.
+all frames of its track.json, whether they were trusted or not. Where the sensors of RUN's capture and of CAPTURE sit
+otherwise on the instrument (footage over another tissue), only the rows without the constant offset say something;
+readings of the jaw are compared as the openings they mean (truth/hinge.json).
 
 Errors are those of camera_from_instrument, so that the gauge of the cameras does not count. `px` is where a point near
 the tips falls in the image; `deg` the rotation; `joint` deg (mm where it slides), the largest of an instrument's;
@@ -56,7 +58,7 @@ from neeco.tracking.motion import Motion
 from neeco.tracking.search import Search
 from neeco.tracking.track import state_of
 from neeco.tracking.trust import Judge, Reference
-from neeco.training.run import open_run
+from neeco.training.run import load_run, open_run
 
 DEG = math.pi / 180
 TIP_BEYOND = 15.0  # mm beyond the hinge along the shaft: a point near the tips
@@ -99,6 +101,16 @@ def _tip_and_axis(root: Path) -> tuple[Tensor, Tensor]:
     return tip, torch.tensor([0.0, 0, 1], dtype=torch.float64)
 
 
+def opened(root: Path, joints: dict[str, float]) -> dict[str, float]:
+    """Readings as the openings that they mean in a capture, where its truth says so."""
+    file = root / "truth" / "hinge.json"
+    meant = json.loads(file.read_text()).get("joint", {}) if file.exists() else {}
+    return {
+        name: meant[name]["sign"] * (value - meant[name]["zero"]) if name in meant else value
+        for name, value in joints.items()
+    }
+
+
 def camera_from_instrument(world_from_camera: Tensor, world_from_instrument: Tensor) -> Tensor:
     """[4, 4] float64."""
     return torch.linalg.inv(world_from_camera.double()) @ world_from_instrument.double()
@@ -133,14 +145,18 @@ def score(run: Path, root: Path, tracked: Path) -> None:
     capture, truth = read_capture(root), Truth.read(root)
     frames = {frame.name: frame for frame in capture.frames}
     info = json.loads((tracked / "track.json").read_text())
-    records, seen_by = info["frames"], {f.name: f.camera for f in read_capture(Path(info["footage"])).frames}
+    footage = tracked / "footage" if (tracked / "footage").exists() else Path(info["footage"])  # a video's, or given
+    records, seen_by = info["frames"], {frame.name: frame.camera for frame in read_capture(footage).frames}
     rows = []
-    with open_run(run) as opened:
+    with open_run(run) as tracked_by:
+        recorded, own = tracked_by.capture().root, tracked / "run"  # over another tissue: by which it was tracked
+        scene = load_run(own).scene if own.exists() else tracked_by.scene
         for record in records:
-            frame = frames[record["frame"]]
-            row = compared(frame, next(iter(state_of(record).instruments.values())), record["trust"]["value"], truth)
+            frame, state = frames[record["frame"]], state_of(record)
+            (found,) = state.instruments.values()
+            row = compared(frame, found, record["trust"]["value"], truth, (recorded, root))
             row["inside"] = tip_is_inside(seen_by[frame.name], row["true"], truth)
-            reference, parts = load_reference(capture, frame), draw(opened.scene, state_of(record), frame.camera).parts
+            reference, parts = load_reference(capture, frame), draw(scene, state, frame.camera).parts
             if reference is not None and parts is not None:
                 one, other = parts.numpy() > 0, reference.mask.numpy() > 0
                 row["iou"] = float((one & other).sum() / max(1, (one | other).sum()))
@@ -148,15 +164,18 @@ def score(run: Path, root: Path, tracked: Path) -> None:
     print_tables(rows, truth)
 
 
-def compared(frame: Frame, state: InstrumentState, trust: float, truth: Truth) -> dict[str, Any]:
-    """What a frame's errors are made of."""
+def compared(
+    frame: Frame, state: InstrumentState, trust: float, truth: Truth, roots: tuple[Path, Path]
+) -> dict[str, Any]:
+    """What a frame's errors are made of; `roots`: of the run's capture and of that with the truth."""
+    values, true_values = opened(roots[0], dict(state.joints)), opened(roots[1], truth.joints[frame.name])
     return {
         "camera": frame.camera,
         "split": frame.split,
         "trust": trust,
         "found": camera_from_instrument(frame.camera.world_from_camera, state.pose),
         "true": truth.camera_from_instrument[frame.name],
-        "joints": [state.joints[name] - value for name, value in truth.joints[frame.name].items()],
+        "joints": [values[name] - value for name, value in true_values.items()],
         "inside": True,
     }
 
@@ -265,7 +284,7 @@ def single(given: argparse.Namespace) -> None:
             step = follower.find(k)
             seconds += time.process_time() - began
             state = next(iter(step.moving.state.instruments.values()))
-            rows.append(compared(frame, state, step.trust.value, truth))
+            rows.append(compared(frame, state, step.trust.value, truth, (given.capture, given.capture)))
     print_tables(rows, truth)
     print(f"{seconds / len(rows):.2f} s of processor time a frame")
 

@@ -26,6 +26,7 @@ OF_A_RUN = {
     "evaluate": [],
     "annotate": ["--output", "out"],
     "track": ["footage", "--output", "out"],
+    "refine": ["footage", "--output", "out"],
     "export": [],
     "view": ["--export", "page.html"],
     "render": ["--output", "out"],

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.methods import make_deformation, method_settings
+from neeco.training.config import config_to_dict, method_defaults
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=90.0, fy=90.0, cx=48.0, cy=32.0, width=96, height=64)
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.2)})
@@ -85,6 +87,7 @@ class RecordedRun:
     path: Path
     scene: Scene
     recording: Capture
+    config: dict[str, Any] = field(default_factory=lambda: config_to_dict(method_defaults("kinematic")))
 
     def capture(self) -> Capture:
         return self.recording

@@ -34,6 +34,7 @@ VERBS = {
     "synthesize": "Draw a labelled data set of states that nobody recorded.",
     "annotate": "Label the recorded frames by the scene, each with how far to trust it.",
     "track": "Find instruments in footage that has no states, by their learned scene.",
+    "refine": "Train a run again, with frames that were tracked by it.",
     "downstream": "Train detectors and segmenters on drawn images; test them on recorded frames.",
     "ablate": "Take parts of the methods away one by one; the paper's tables and ours.",
 }

@@ -19,11 +19,16 @@ class Arguments:
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote, by method kinematic."""
     footage: tyro.conf.Positional[Path]
-    """Capture with cameras in the run's world; states in it are not looked at."""
+    """Capture with cameras, whose states are not looked at, or a video file; its cameras are found first, as by
+    `neeco ingest`."""
     output: Path
     """Capture folder to write; must be empty or absent unless --resume."""
     start: Literal["first", "none"] = "none"
     """first: the first frame's states are about known, the footage says them. none: nothing is known."""
+    tissue: Literal["run", "footage"] | None = None
+    """run: the footage shows the run's tissue, its cameras in the run's world (default for a capture). footage: any
+    tissue, cameras in any world; it is learned from the footage first, and OUTPUT/run becomes a run of the instruments
+    over it (default for a video)."""
     min_trust: float = 0.5
     """Frames trusted less are left out of the capture: 0 to 1."""
     resume: bool = False
@@ -33,27 +38,37 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Track, write the page, and say where both lie."""
-    from neeco.capture.reader import read_capture
-    from neeco.cli._progress import counting, resumable
+    from neeco.cli._progress import Bars, resumable
+    from neeco.errors import NeecoError
     from neeco.raster.devices import device_of
     from neeco.report.track_page import write_track_page
+    from neeco.scene.scene import gaussian_scene
+    from neeco.tracking.footage_video import read_footage
     from neeco.tracking.track import track_footage
     from neeco.training.run import open_run
 
+    is_video = arguments.footage.is_file()
+    if is_video and arguments.tissue == "run":
+        raise NeecoError(
+            f"--tissue: run: {arguments.footage} is a video, whose cameras are in no run's world; leave it out"
+        )
     with open_run(arguments.run, device_of(arguments.device)) as trained:
-        footage = read_capture(arguments.footage)
         with (
-            counting("track") as advance,
+            Bars() as bars,
             resumable("what was done is kept; run the same command again with --resume"),
         ):
+            scene = gaussian_scene(trained.scene, "track")
+            footage = read_footage(arguments.footage, arguments.output, scene, arguments.resume, bars.stage)
             tracked = track_footage(
                 trained,
                 footage,
                 arguments.output,
                 start=arguments.start,
+                tissue=arguments.tissue or ("footage" if is_video else "run"),
                 min_trust=arguments.min_trust,
                 resume=arguments.resume,
-                on_progress=advance,
+                on_progress=lambda done, total: bars.stage("track", done, total),
+                on_stage=bars.stage,
             )
         page = write_track_page(tracked)
     tracked.require_trusted()

@@ -20,17 +20,25 @@ import torch
 
 import neeco
 from neeco.capture.model import Capture, Frame, InstrumentState, State
+from neeco.capture.reader import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
+from neeco.files import LOCK, is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
+from neeco.scene import Recorded
+from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import gaussian_scene
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
+from neeco.tracking.footage_again import learned_again
+from neeco.tracking.footage_scene import adapted, over_tissue
+from neeco.tracking.footage_tissue import Report, learn_tissue
+from neeco.tracking.footage_video import FOOTAGE
 from neeco.tracking.motion import Motion
 from neeco.tracking.search import Search
 from neeco.tracking.trust import Judge, Reference
+from neeco.training.run import load_run, stored_config, write_config
 
 if TYPE_CHECKING:
     from neeco.scene import Scene
@@ -39,12 +47,15 @@ if TYPE_CHECKING:
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
+SECOND = "second"  # in it: steps by tissue and light that were learned again
+RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
 SURE = 0.8  # trust with which instruments are begun to be followed at once
 BEGINNINGS = 8  # frames in which the instruments are looked for, until one is SURE
 TOGETHER = 0.7  # trust below which a stretch is followed once more, from its far end
 
 Start = Literal["first", "none"]
+TissueOf = Literal["run", "footage"]
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,7 @@ class Tracked:
             best = max(record["trust"]["value"] for record in self.records)
             raise NeecoError(
                 f"{self.footage.root}: no frame is trusted by {self.min_trust:g}, the best is by {best:.2f}; is it the "
-                f"run's instrument, over its tissue? {self.output} shows what was found"
+                f"run's instrument, over its tissue (if not: --tissue footage)? {self.output} shows what was found"
             )
 
 
@@ -74,12 +85,17 @@ def track_footage(
     output: Path,
     *,
     start: Start = "none",
+    tissue: TissueOf = "run",
     min_trust: float = MIN_TRUST,
     resume: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_stage: Report = lambda what, done, total: None,
 ) -> Tracked:
-    """Find the states of the run's instruments in every frame of `footage`, which shows them over the run's tissue, its
-    cameras in the run's world, and write those that are trusted as a capture.
+    """Find the states of the run's instruments in every frame of `footage`, and write those that are trusted as a
+    capture.
+
+    `tissue`: "run", the footage shows the run's tissue, its cameras are in the run's world; "footage", any other, in
+    any world: it is learned from the footage, and the scene that is tracked by becomes the output's own run (`RUN`).
 
     States that the footage has are not looked at, but for that of its first frame where `start` is "first". Interrupted
     (Ctrl-C) or failing, it keeps what is done, for `resume`. How many threads torch takes is the caller's to set
@@ -103,6 +119,7 @@ def track_footage(
         "scene_sha256": digest,
         "captures_sha256": [fingerprint(capture) for capture in (footage, trained_on)],
         "start": start,
+        "tissue": tissue,
         "min_trust": min_trust,
     }
     _check_output(output, info, resume)
@@ -111,20 +128,70 @@ def track_footage(
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
             fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-            motion = Motion.of(coordinates, scene.recorded.states)
-            search = Search(fitter, motion, scene.recorded)
             reference = Reference.of(fitter, trained_on.split("train"))
-            follower = Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
-            work = _Work(output / STEPS, follower, on_progress)
-            records = [_record(frames[k], step, coordinates) for k, step in enumerate(work.all_steps(given))]
+            if tissue == "footage":
+                scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
+                fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
+            work = _Work(output / STEPS, _follower(fitter, frames, reference), on_progress)
+            steps = work.all_steps(given)
+            if tissue == "footage":
+                scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
+                fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
+                work = _Work(output / STEPS / SECOND, _follower(fitter, frames, reference), on_progress)
+                steps = work.all_steps(given)
+            records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
             info = stored
+            if tissue == "footage":
+                scene = gaussian_scene(load_run(output / RUN, scene.center.device).scene, "track")
         written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust)
+        if tissue == "footage" and not stored.get("complete"):
+            _write_run(output, run, scene)
         write_json(output / INFO, info)
         if (output / STEPS).exists():
             shutil.rmtree(output / STEPS)
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
+
+
+def _follower(fitter: Fitter, frames: Sequence[Frame], reference: Reference) -> Follower:
+    recorded = fitter.drawer.scene.recorded
+    motion = Motion.of(fitter.coordinates, recorded.states)
+    search = Search(fitter, motion, recorded)
+    return Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
+
+
+def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:
+    """Tissue and light learned again from what was tracked; kept in `folder`."""
+    file = folder / "scene-2.safetensors"
+    if not file.exists():
+        save_scene(learned_again(scene, frames, steps, report), file)
+    return gaussian_scene(load_scene(file).to(scene.center.device), "track")
+
+
+def _over_footage(instruments: Scene, footage: Capture, folder: Path, report: Report) -> tuple[Scene, dict[str, Any]]:
+    """The instruments over the footage's tissue, in its light; and what that light is. Kept in `folder`."""
+    file, light = folder / "scene.safetensors", folder / "light.json"
+    if not light.exists():
+        ground = learn_tissue(footage, folder / "tissue", instruments.center.device, report)
+        found = adapted(over_tissue(instruments, ground), footage.frames, report)
+        save_scene(found.scene, file)
+        write_json(light, found.to_json())
+    scene = load_scene(file).to(instruments.center.device)
+    return gaussian_scene(scene, "track"), read_json(light)
+
+
+def _write_run(output: Path, run: Run, scene: Scene) -> None:
+    """The scene that was tracked by as a run of its own, trained on the capture at `output`, where there is one."""
+    folder, digest = output / RUN, ""
+    if (output / "transforms.json").exists():
+        capture = read_capture(output)
+        scene.recorded = Recorded.of(capture.frames, scene.instruments, capture.lens, still=capture.still)
+        digest = fingerprint(capture)
+    folder.mkdir(exist_ok=True)
+    save_scene(scene, folder / "scene.safetensors")
+    config = stored_config(Path(run.path), run.config)
+    write_config(folder, output, replace(config, transforms="transforms.json"), digest)
 
 
 @dataclass
@@ -293,7 +360,7 @@ def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     """Raises NeecoError when `output` may not be written to."""
     if output.exists() and not output.is_dir():
         raise NeecoError(f"{output}: is a file; give a folder")
-    if is_vacant(output):
+    if is_vacant(output) or {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
         return
     if not resume:
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
@@ -305,6 +372,6 @@ def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     begun = read_json(require_inside(file, output))
     if not isinstance(begun, dict):
         raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
-    for key in ("schema", "version", "scene_sha256", "captures_sha256", "start", "min_trust"):
+    for key in ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust"):
         if begun.get(key) != info[key]:
             raise NeecoError(f"{file}: {key}: begun with {begun.get(key)!r}, now {info[key]!r}; use a new folder")

@@ -157,7 +157,7 @@ class GaussianSession(GaussianTraining):
         if following is not None:
             self.views.prefetch(following)
         loss = photometric_loss(rendering.color, target, mask, ssim_weight=self.config.ssim_weight)
-        total = loss + self._regularisation(rendering, penalty)
+        total = trust_of(self.given[index][0]) * loss + self._regularisation(rendering, penalty)
         with tf32_products(self.views.device) if scene.deformation.large_operations else nullcontext():
             (total / views).backward()  # given the gradient instead, torch would import sympy: 2 s of every training
         gradient = rendering.center_offsets.grad
@@ -329,6 +329,11 @@ def pose_order(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> np.nd
         for frame in frames
     ]
     return order_by_pose(np.stack(rows))
+
+
+def trust_of(state: State) -> float:
+    """How far a frame counts: by the least trusted of its instruments' states; recorded ones are trusted wholly."""
+    return min((1.0 if given.trust is None else given.trust for given in state.instruments.values()), default=1.0)
 
 
 def _squared_error(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:

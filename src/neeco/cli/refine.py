@@ -1,0 +1,56 @@
+"""`neeco refine`: train a run again, with frames that were tracked by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from neeco.settings import Device
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train a run again with frames whose states were tracked by it, so that sides of the instruments that only they
+    show become known. Writes OUTPUT/capture, the frames of both, and OUTPUT/run."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder that `neeco train` wrote, by method kinematic."""
+    tracked: tyro.conf.Positional[tuple[Path, ...]]
+    """Captures that `neeco track` made with it, over its tissue."""
+    output: Path
+    """Folder to write; must be empty or absent unless --resume."""
+    resume: bool = False
+    """Go on where work was broken off."""
+    device: Device = "auto"
+
+
+def run(arguments: Arguments) -> int:
+    """Fit, merge, train; say where the run lies."""
+    from neeco.cli._progress import Bars, resumable
+    from neeco.errors import NeecoError
+    from neeco.raster.devices import device_of
+    from neeco.tracking.refine import refine_run
+    from neeco.training.run import open_run
+
+    if not arguments.tracked:
+        raise NeecoError("refine: give the captures that `neeco track` made, after the run")
+    device = device_of(arguments.device)
+    with (
+        open_run(arguments.run, device) as opened,
+        Bars() as bars,
+        resumable("run the same command again with --resume"),
+    ):
+        path = refine_run(
+            opened,
+            arguments.tracked,
+            arguments.output,
+            device=device,
+            resume=arguments.resume,
+            on_progress=lambda done, total: bars.stage("fitting recorded states", done, total),
+            on_row=bars.training,
+        )
+        bars.end("training")
+    print(f"finished: {path}  (next: neeco evaluate {path})")
+    return 0

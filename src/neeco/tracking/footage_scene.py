@@ -1,0 +1,260 @@
+"""A run's instruments over the tissue of footage, in its light: the scene by which footage over another tissue is
+tracked.
+
+Tissue and light are those that footage itself shows (`neeco.tracking.footage_tissue`). Another camera has another
+exposure, white balance and contrast: the instruments' colours get one gain each for red, green and blue, and one gamma,
+fitted to where the instruments are found in a few frames, as are the lamps whose shadow they cast.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_erosion
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from neeco.capture.model import Frame, State, evenly_spaced
+from neeco.raster.reference import SH_C0
+from neeco.scene import CanonicalGaussians, Recorded, Scene
+from neeco.scene.canonical import join_bodies
+from neeco.scene.training_views import TrainingViews
+from neeco.tracking.coordinates import Coordinates
+from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, view_of, working_size
+from neeco.tracking.fitting import Fit, Fitter, wide
+from neeco.tracking.footage_tissue import Report, passing
+from neeco.tracking.motion import Motion
+from neeco.tracking.search import Search
+from neeco.training.config import method_defaults
+from neeco.training.instruments.shadow import find_shadow
+from neeco.training.session import new_session
+
+FRAMES = 8  # in which instruments are looked for
+USED, MOST_MISFIT = 0.5, 2.0  # of them, those explained best tell colours; none explained so many times worse than one
+ROUNDS = 3  # each with states fitted in the colours of the one before
+NEAR = (10.0, 10.0, 15.0)  # deg, mm, deg of joints: how far states may move in these
+SOLID = 0.95  # opacity of a pixel that shows the instruments alone
+DARK, BRIGHT = 0.02, 0.95  # colours beyond which nothing is compared
+PIXELS = 20_000  # compared, at most
+HUBER = 0.05  # residual of a colour beyond which a pixel pulls linearly
+DRAWN = 24  # recorded states whose colours are compared with those of what passes before the tissue
+SHARES = (0.1, 0.9, 17)  # quantiles of these: from, to, how many
+FEWEST = 200  # pixels from which they are taken
+ALIKE = 0.15  # of the logarithm of gains and gamma: less is no other colour
+GAINS, GAMMAS = (0.4, 2.5), (0.5, 2.0)
+GAMMA_PRIOR, PRIOR = 0.2, 0.005  # standard deviation of its logarithm; mean error of colours that weighs as much
+LEAST_COLOR = 0.01  # of a Gaussian: below, a gamma is taken of this
+
+
+@dataclass(frozen=True)
+class Colors:
+    """What a camera makes of the instruments' colours c as recorded: gain * c ** gamma."""
+
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    gamma: float = 1.0
+
+    @property
+    def differs(self) -> bool:
+        """Whether instruments could not be found in their recorded colours."""
+        return any(abs(math.log(value)) > ALIKE for value in (*self.gain, self.gamma))
+
+    def of(self, scene: Scene) -> Scene:
+        """The scene, its instruments' Gaussians recoloured: what they show head on exactly, what changes with the
+        direction to first order, and dimming with the distance as far as it is a power of it."""
+        canonical, rows = scene.canonical, scene.canonical.of_instruments
+        gain = canonical.sh_dc.new_tensor(self.gain)
+        color = (canonical.sh_dc[:, 0] * SH_C0 + 0.5).clamp_min(LEAST_COLOR)  # [N, 3]
+        slope = gain * self.gamma * color ** (self.gamma - 1)
+        dc = ((gain * color**self.gamma - 0.5) / SH_C0)[:, None]
+        tensors = canonical.tensors()
+        tensors["sh_dc"] = torch.where(rows[:, None, None], dc, canonical.sh_dc)
+        tensors["sh_rest"] = torch.where(rows[:, None, None], canonical.sh_rest * slope[:, None], canonical.sh_rest)
+        made = _like(scene, CanonicalGaussians.from_tensors(tensors, canonical.counts))
+        made.falloff[1] *= self.gamma
+        return made
+
+    @classmethod
+    def fitted(cls, rendered: Tensor, seen: Tensor) -> Colors:
+        """Those by which drawn colours [P, 3] become the seen ones [P, 3], by least squares with Huber's loss."""
+        usable = ((rendered > DARK) & (rendered < BRIGHT) & (seen > DARK) & (seen < BRIGHT)).all(1)
+        pairs = torch.stack([rendered[usable], seen[usable]]).double().numpy()  # [2, P, 3]
+        pairs = pairs[:, evenly_spaced(pairs.shape[1], PIXELS)] if pairs.shape[1] else pairs
+        if not pairs.shape[1]:
+            return cls()
+        weight = 1 / np.sqrt(pairs[0].size)
+
+        def residuals(at: np.ndarray) -> np.ndarray:
+            off = np.exp(at[:3]) * pairs[0] ** np.exp(at[3]) - pairs[1]
+            far = np.maximum(np.abs(off), HUBER)
+            bent = np.where(np.abs(off) < HUBER, off, np.sign(off) * np.sqrt(2 * HUBER * far - HUBER**2))
+            return np.append(weight * bent.ravel(), PRIOR * at[3] / GAMMA_PRIOR)
+
+        low, high = (np.log([GAINS[k]] * 3 + [GAMMAS[k]]) for k in (0, 1))
+        found = least_squares(residuals, np.zeros(4), bounds=(low, high)).x
+        red, green, blue, gamma = (float(value) for value in np.exp(found))
+        return cls((red, green, blue), gamma)
+
+
+def over_tissue(instruments: Scene, tissue: Scene) -> Scene:
+    """The instruments of one scene over the tissue of another, in its light. Recorded are the states and cameras of the
+    first, as corrected by its registration, which is taken out."""
+    for scene in (instruments, tissue):
+        scene.visibility()  # each by its own recorded frames
+    own = instruments.canonical
+    rest = own.map(lambda tensor: tensor[own.counts[0] :], (len(own) - own.counts[0],))
+    size = tissue.canonical.counts[0]
+    floor = tissue.canonical.map(lambda tensor: tensor[:size], (size,))
+    extras = {
+        name: floor.extras.get(name, tensor.new_zeros(len(floor), *tensor.shape[1:]))
+        for name, tensor in own.extras.items()
+    }
+    ground = replace(floor, extras=extras)
+    joined = join_bodies([ground, rest])
+    joined = replace(joined, counts=(len(floor), *own.counts[1:]))
+    deformation = instruments.deformation.combined([instruments.deformation])
+    recorded = instruments.recorded
+    recorded = replace(recorded, states=tuple(instruments.registered(state) for state in recorded.states))
+    made = Scene(instruments.method, joined, deformation, instruments.instruments, recorded, tissue.center.clone())
+    with torch.no_grad():
+        made.falloff.copy_(torch.stack([tissue.falloff[0], instruments.falloff[1]]))
+        made.vignette.copy_(tissue.vignette)
+    made.sh_degree = max(instruments.sh_degree, tissue.sh_degree)
+    made.background = tissue.background
+    made.label_threshold = instruments.label_threshold
+    return made.to(own.means.device).requires_grad_(False)
+
+
+def _like(scene: Scene, canonical: CanonicalGaussians, recorded: Recorded | None = None) -> Scene:
+    """The scene with other Gaussians, or with other frames as recorded; tensors are not shared."""
+    made = Scene(
+        scene.method,
+        canonical.map(torch.clone),
+        scene.deformation.combined([scene.deformation]),
+        scene.instruments,
+        scene.recorded if recorded is None else recorded,
+        scene.center.clone(),
+    )
+    made.load_state_dict(scene.state_dict())
+    made.sh_degree, made.background = scene.sh_degree, scene.background
+    made.label_threshold = scene.label_threshold
+    return made.to(scene.center.device).requires_grad_(False)
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """A scene in the light of footage, and what was found of it."""
+
+    scene: Scene
+    colors: Colors
+
+    def to_json(self) -> dict[str, Any]:
+        """What was found, as plain values for files."""
+        scene = self.scene
+        return {
+            "gain": [round(gain, 4) for gain in self.colors.gain],
+            "gamma": round(self.colors.gamma, 4),
+            "lamps_mm": [
+                [round(value, 2) for value in offset.tolist()]
+                for offset, strength in zip(scene.shadow_offsets, scene.shadow_strengths, strict=True)
+                if float(strength) > 0
+            ],
+        }
+
+
+def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
+    """`scene`, of instruments over the tissue of `frames` (`over_tissue`), in their light."""
+    plain, coordinates = _fitter(scene), Coordinates.of(scene)
+    chosen = [frames[k] for k in evenly_spaced(len(frames), FRAMES)]
+    found: list[tuple[Frame, Fit]] = []
+    guess = _guessed(plain, chosen)
+    for tried in (Colors(), guess) if guess.differs else (Colors(),):
+        fits = _found(tried.of(scene), chosen, report)
+        if sum(fit.gain for _, fit in fits) > sum(fit.gain for _, fit in found):
+            found = fits
+    lit, colors = scene, Colors()
+    for _ in range(ROUNDS):
+        found.sort(key=lambda pair: pair[1].misfit)
+        most = MOST_MISFIT * found[0][1].misfit if found else 0.0
+        colors = _colors(plain, [pair for pair in found[: max(1, round(USED * len(found)))] if pair[1].misfit <= most])
+        lit = colors.of(scene)
+        fitter = _fitter(lit)
+        found = [
+            (frame, better)
+            for frame, fit in found
+            if (better := fitter.fit(_view(frame, fitter, fit.state), fit.state, wide(coordinates, *NEAR)))
+        ]
+    return Adapted(with_lamps(lit, found), colors)
+
+
+def with_lamps(scene: Scene, found: Sequence[tuple[Frame, Fit]]) -> Scene:
+    """The scene with the lamps whose shadow its instruments cast on the tissue, as training finds them; with none where
+    these explain too little."""
+    made = _like(scene, scene.canonical)
+    if not found:
+        return made
+    frames = [replace(frame, split="train", state=fit.state) for frame, fit in found]
+    views = TrainingViews.read(frames).to(scene.center.device)
+    session = new_session(made, views, method_defaults(scene.method))
+    logits = made.canonical.opacity_logits.clone()
+    with session.searching():
+        find_shadow(session)
+    made.canonical.opacity_logits.copy_(logits)  # training makes what is faint, such as a learned shadow, fainter
+    return made.requires_grad_(False)
+
+
+def _found(scene: Scene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:
+    """Where the instruments of `scene` are in some frames, nothing known."""
+    fitter, found = _fitter(scene), []
+    search = Search(fitter, Motion.of(fitter.coordinates, scene.recorded.states), scene.recorded)
+    for done, frame in enumerate(frames):
+        report("looking for the instruments' colours", done, len(frames))
+        fit = search.anywhere(_view(frame, fitter, None))
+        if fit is not None:
+            found.append((frame, fit))
+    return found
+
+
+def _fitter(scene: Scene) -> Fitter:
+    return Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
+
+
+def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
+    """Before any state is known: from how often colours are among those of what passes before the tissue, and of the
+    instruments drawn in recorded states."""
+    scene, rendered, seen = plain.drawer.scene, [], []
+    recorded = scene.recorded
+    for k in evenly_spaced(len(recorded.states), DRAWN):
+        camera = working_size(recorded.cameras[k], recorded)
+        color, alpha = plain.drawer.draw(recorded.states[k], camera)
+        rendered.append((color / alpha[..., None])[alpha > SOLID])
+    for frame in frames:
+        shown = torch.from_numpy(passing(frame, plain.tissue, margin=0))
+        seen.append(frame.load_image()[shown])
+    samples = [torch.cat(colors) for colors in (rendered, seen)]
+    if any(len(sample) < FEWEST for sample in samples):
+        return Colors()
+    shares = torch.linspace(*SHARES)
+    rows = [torch.from_numpy(np.quantile(sample.numpy(), shares.numpy(), axis=0)) for sample in samples]
+    return Colors.fitted(rows[0].float(), rows[1].float())
+
+
+def _colors(plain: Fitter, found: Sequence[tuple[Frame, Fit]]) -> Colors:
+    """From the instruments as drawn in their recorded colours, and the frames."""
+    rendered, seen = [], []
+    for frame, fit in found:
+        view = _view(frame, plain, None)
+        color, alpha = plain.drawer.draw(fit.state, view.camera)
+        solid = torch.from_numpy(binary_erosion((alpha > SOLID).numpy(), iterations=1)) & (view.weight > 0)
+        rendered.append(color[solid] / alpha[solid][:, None])
+        seen.append(view.image[solid])
+    return Colors.fitted(torch.cat(rendered), torch.cat(seen)) if rendered else Colors()
+
+
+def _view(frame: Frame, fitter: Fitter, state: State | None) -> View:
+    camera = working_size(frame.camera, fitter.drawer.scene.recorded)
+    return view_of(frame, camera, fitter.tissue, state)

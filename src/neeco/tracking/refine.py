@@ -1,0 +1,131 @@
+"""Tracked frames are training frames: a run is trained again with them, so that sides only they show become known.
+
+States of the run's own frames are fitted to their images first, as tracked ones were: both then stand as the scene
+that was learned says, free of a tracker's latency and noise. Trust weighs frames in the loss.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from neeco.capture.model import Capture, Frame
+from neeco.capture.reader import read_capture
+from neeco.capture.writer import write_capture
+from neeco.errors import NeecoError
+from neeco.files import is_vacant, own_folder, read_bytes, read_json
+from neeco.scene import Scene
+from neeco.scene.scene import gaussian_scene
+from neeco.settings import with_fields
+from neeco.tracking.coordinates import Coordinates
+from neeco.tracking.drawing import InstrumentDrawer, Tissue, view_of, working_size
+from neeco.tracking.fitting import Fitter, wide
+from neeco.tracking.track import INFO
+from neeco.training.run import stored_config
+from neeco.training.train import ShowRow, train
+
+if TYPE_CHECKING:
+    from neeco.training.run import Run
+
+CAPTURE, RUN = "capture", "run"  # folders of the output
+NEAR = (2.0, 2.0, 4.0)  # deg, mm, deg of joints: how far recorded states may be off
+STAGING = "images"
+
+
+def refine_run(
+    run: Run,
+    tracked: Sequence[Path],
+    output: Path,
+    *,
+    device: torch.device,
+    resume: bool = False,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_row: ShowRow | None = None,
+) -> Path:
+    """Train again on the run's own frames and on those of captures that `track` made over its tissue; returns the run.
+
+    Writes `CAPTURE`, all these frames, and `RUN`, trained on it as the run was, into the folder `output`. Raises
+    NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`).
+    """
+    folder = output / CAPTURE
+    if not resume and not is_vacant(output):
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on in it")
+    if not (folder / "transforms.json").exists():
+        scene, own = gaussian_scene(run.scene, "refine"), run.capture()
+        frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
+        with own_folder(output):
+            own, frames = without_twice(own, frames)
+            recorded = fitted(scene, own, on_progress)
+            merged = replace(own, frames=(*recorded, *_named_apart(frames, output / STAGING)))
+            write_capture(merged, folder)
+            shutil.rmtree(output / STAGING)
+    # the latency of a tracker is gone from the states
+    config = with_fields(
+        stored_config(run.path, run.config), {"refine.latency": False, "transforms": "transforms.json"}
+    )
+    return train(folder, output / RUN, config, device=device, resume=(output / RUN).exists(), progress=on_row)
+
+
+def _tracked_frames(path: Path, scene: Scene) -> list[Frame]:
+    """The frames of a tracked capture, to train on. Raises NeecoError where they do not belong to the scene."""
+    capture = read_capture(path)
+    info = read_json(path / INFO) if (path / INFO).exists() else {}
+    if isinstance(info, dict) and info.get("tissue") == "footage":
+        raise NeecoError(f"{path / INFO}: tissue: is the footage's, in a world of its own; train on {path} by itself")
+    known = {item.name: set(item.joints) for item in scene.instruments}
+    for frame in capture.frames:
+        given = {name: set(state.joints) for name, state in frame.state.instruments.items()}
+        if missing := [name for name, joints in known.items() if not joints <= given.get(name, {None})]:
+            raise NeecoError(
+                f"{path}: {frame.name}: instruments: does not state {missing[0]!r} with all its joints; give a "
+                "capture that `neeco track` made with this run"
+            )
+    return [replace(frame, split="train") for frame in capture.frames]
+
+
+def without_twice(own: Capture, tracked: Sequence[Frame]) -> tuple[Capture, list[Frame]]:
+    """Both without images that both have: what is trained on stays as recorded; what was withheld and then tracked is
+    trained on as tracked, and tests no more. Raises NeecoError when an image cannot be read."""
+    images = {_digest(frame): frame for frame in own.frames}
+    again = {digest: frame for frame in tracked if (digest := _digest(frame)) in images}
+    withheld = {images[digest].image_path for digest in again if images[digest].split != "train"}
+    recorded = {frame.image_path for digest, frame in again.items() if images[digest].split == "train"}
+    frames = tuple(frame for frame in own.frames if frame.image_path not in withheld)
+    return replace(own, frames=frames), [frame for frame in tracked if frame.image_path not in recorded]
+
+
+def _digest(frame: Frame) -> bytes:
+    return hashlib.sha256(read_bytes(frame.image_path, "an image")).digest()
+
+
+def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
+    """The frames, their images under names that the run's own do not have."""
+    folder.mkdir(parents=True, exist_ok=True)
+    named = []
+    for k, frame in enumerate(frames):
+        path = folder / f"tracked_{k:05d}_{frame.name}{frame.image_path.suffix}"
+        shutil.copyfile(frame.image_path, path)
+        named.append(replace(frame, image_path=path))
+    return named
+
+
+def fitted(scene: Scene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
+    """The frames of a capture; those trained on with states as the scene explains their images best, near the recorded
+    ones."""
+    fitter = Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
+    near, frames = wide(fitter.coordinates, *NEAR), []
+    for done, frame in enumerate(capture.frames):
+        on_progress(done, len(capture.frames))
+        if frame.split == "train":
+            view = view_of(frame, working_size(frame.camera, scene.recorded), fitter.tissue, frame.state)
+            fit = fitter.fit(view, frame.state, near)
+            if fit is not None:
+                frame = replace(frame, state=fit.state)
+        frames.append(frame)
+    return frames
