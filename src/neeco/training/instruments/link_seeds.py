@@ -111,8 +111,8 @@ def start_links(
 def _open_links(
     session: GaussianSession, links: StatedLinks, evidence: Evidence, name: str, radius: float
 ) -> dict[int, tuple[Tensor, Tensor]]:
-    """(place [3] mm, unit directions [2, 3]) at rest, to which sides of it each link lies that opens as nobody
-    recorded: beyond its pivot, and where it opens to.
+    """(place [3] mm, unit directions [K, 3]) at rest, to which sides of it each link lies that opens as nobody
+    recorded: where it opens to, and where its heading is found, beyond its pivot.
 
     Tools are held closed, or open by the same angle, for much of a recording, and the zero of what turns both is not
     learned. So the opening and the heading are taken at which both links have most evidence beside the plane between
@@ -125,7 +125,7 @@ def _open_links(
         if not opening:
             continue
         low, high = instrument.joints[reading] or (0.0, 0.0)
-        values, turned = low + (high - low) * OPENINGS, 0.0
+        values, turned, found = low + (high - low) * OPENINGS, 0.0, False
         recorded = readings_of(session, evidence, name)
         scores = torch.stack(
             [
@@ -136,12 +136,13 @@ def _open_links(
         likely = scores - HEADING_WEIGHT * (HEADINGS / HEADING_SIGMA).square()
         best, heading = divmod(int(likely.argmax()), len(HEADINGS))
         if float(scores[best, heading] - scores[len(OPENINGS) // 2, len(HEADINGS) // 2]) > CLEARLY_MORE:
-            turned = float(HEADINGS[heading])
+            turned, found = float(HEADINGS[heading]), True
             column = session.refinement.readings.index((name, reading))
             session.refinement.joints[:, column] = values[best] - instrument.halfway(reading)
         for link, (joint, sense) in opening.items():
             pivot, ahead, towards = links.plane_between(joint, turned)
-            sides[link] = (pivot, torch.stack([ahead, sense * towards]))
+            opens_to = sense * towards
+            sides[link] = (pivot, torch.stack([ahead, opens_to]) if found else opens_to[None])
     return sides
 
 
@@ -209,7 +210,7 @@ def _on_link(
     points = centers[which] + (2 * random[:, :3] - 1) * reaches[which, None]
     if side is not None:
         place, directions = (part.to(device) for part in side)
-        outside = ((points - place) @ directions.T + ACROSS_RADII * radius).clamp_max(0)  # [Q, 2]
+        outside = ((points - place) @ directions.T + ACROSS_RADII * radius).clamp_max(0)  # [Q, K]
         points = points - 2 * outside @ directions  # mirrored into it
     own, seen = views[link].scores(points)
     likely = torch.nonzero((own > 0.5 * POSSIBLE) & (seen > MIN_SEEN))[:, 0]
