@@ -140,6 +140,7 @@ def test_footage_over_another_tissue_in_another_world_is_tracked(
     assert len(run.capture().frames) == COUNT
 
 
+@pytest.mark.slow
 def test_another_tissue_broken_off_goes_on_to_the_same_bytes(
     tracked_run: RecordedRun, other_footage: Capture, tmp_path: Path, short_rounds: None
 ) -> None:
