@@ -72,7 +72,6 @@ def test_every_backend_and_kind_is_timed(device: str, quick: ModuleType, tmp_pat
     assert case["workload"] == {"gaussians": 300, "width": 32, "height": 24}
     for row in case["ms"]:
         assert all(row[kind] > 0 for kind in KINDS)
-        assert row["step"] > row["draw"]  # which it contains
     for rows in case["stages"].values():
         check_stages(rows)
     assert bool(case["stages"]) == any("triton" in row["backend"] for row in case["ms"])
