@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
+OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 SECOND = "second"  # in it: steps by tissue and light that were learned again
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
@@ -129,15 +130,16 @@ def track_footage(
             write_json(output / INFO, info | {"complete": False})
             fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
             reference = Reference.of(fitter, trained_on.split("train"))
+            allowance = OTHER_TISSUE if tissue == "footage" else 1.0
             if tissue == "footage":
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
                 fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-            work = _Work(output / STEPS, _follower(fitter, frames, reference), on_progress)
+            work = _Work(output / STEPS, _follower(fitter, frames, reference, allowance), on_progress)
             steps = work.all_steps(given)
             if tissue == "footage":
                 scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
                 fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-                work = _Work(output / STEPS / SECOND, _follower(fitter, frames, reference), on_progress)
+                work = _Work(output / STEPS / SECOND, _follower(fitter, frames, reference, allowance), on_progress)
                 steps = work.all_steps(given)
             records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
@@ -154,11 +156,11 @@ def track_footage(
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
 
 
-def _follower(fitter: Fitter, frames: Sequence[Frame], reference: Reference) -> Follower:
+def _follower(fitter: Fitter, frames: Sequence[Frame], reference: Reference, allowance: float) -> Follower:
     recorded = fitter.drawer.scene.recorded
     motion = Motion.of(fitter.coordinates, recorded.states)
     search = Search(fitter, motion, recorded)
-    return Follower(frames, fitter, motion, search, Judge(fitter, search, reference))
+    return Follower(frames, fitter, motion, search, Judge(fitter, search, reference, allowance))
 
 
 def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:

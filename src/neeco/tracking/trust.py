@@ -156,6 +156,7 @@ class Judge:
     fitter: Fitter
     search: Search
     reference: Reference
+    allowance: float = 1.0  # times the usual misfit that is usual here: light and tissue may be learned less well
 
     @cached_property
     def range(self) -> RecordedRange:
@@ -169,7 +170,7 @@ class Judge:
         beside = BESIDE * about.whole / math.hypot(about.camera.width, about.camera.height)
         overlap = estimate_trust(drawing, about.image, about.weight > 0, self.reference.errors, beside).value
         beyond = self.range.beyond(fit.state, about.camera)
-        half = HALF_TRUSTED * self.reference.misfit / (1 + beyond / STRANGE_DEG)
+        half = HALF_TRUSTED * self.allowance * self.reference.misfit / (1 + beyond / STRANGE_DEG)
         explained = 1 / (1 + (fit.misfit / half) ** STEEPNESS)
         observed = min(1.0, observed_share(drawing) / (LEAST_OBSERVED * self.reference.observed))
         trust = TrackTrust(overlap, explained, observed, 1.0)
