@@ -50,14 +50,10 @@ from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.raster.types import Camera
 from neeco.scene.scene import gaussian_scene
 from neeco.synthesis.camera_effects import SMOKE_MM, apply_effects
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import Follower
-from neeco.tracking.motion import Motion
-from neeco.tracking.search import Search
 from neeco.tracking.track import state_of
-from neeco.tracking.trust import Judge, Reference
+from neeco.tracking.trust import Reference
 from neeco.training.run import load_run, open_run
 
 DEG = math.pi / 180
@@ -274,11 +270,8 @@ def single(given: argparse.Namespace) -> None:
     chosen = [frame for frame in capture.frames if not given.splits or frame.split in given.splits][:: given.every]
     with open_run(given.run) as opened, torch.no_grad():
         scene = gaussian_scene(opened.scene, "track")
-        fitter = Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
-        motion = Motion.of(fitter.coordinates, scene.recorded.states)
-        search = Search(fitter, motion, scene.recorded)
-        judge = Judge(fitter, search, Reference.of(fitter, opened.capture().split("train")))
-        follower = Follower(chosen, fitter, motion, search, judge)
+        fitter = Fitter.of(scene)
+        follower = Follower.of(chosen, fitter, Reference.of(fitter, opened.capture().split("train")))
         for k, frame in enumerate(chosen):
             began = time.process_time()
             step = follower.find(k)

@@ -246,24 +246,31 @@ SCENES |= {
 
 # Footage of each instrument over the other organ: made and held as in its recording, moved otherwise, under one lamp.
 SCENES |= {
-    "stomach-footage": replace(
-        SCENES["bowel"],
-        organ="stomach",
-        lamps=SCENES["stomach-scissors"].lamps,
-        mount=SCENES["stomach-scissors"].mount,
-        joint=SCENES["stomach-scissors"].joint,
-        seed=131,
-        words="smooth reddish stomach wall under a single lamp; the bowel's scissors, seen from where they were there",
-    ),
-    "bowel-footage": replace(
-        SCENES["stomach"],
-        organ="bowel",
-        lamps=SCENES["bowel-grasper"].lamps,
-        mount=SCENES["bowel-grasper"].mount,
-        joint=SCENES["bowel-grasper"].joint,
-        seed=149,
-        words="folded pale small-bowel loops under a single lamp; the stomach's grasper, seen from where it was there",
-    ),
+    f"{organ}-footage": replace(
+        SCENES[own],
+        organ=organ,
+        lamps=SCENES[held].lamps,
+        mount=SCENES[held].mount,
+        joint=SCENES[held].joint,
+        seed=seed,
+        words=words,
+    )
+    for organ, own, held, seed, words in (
+        (
+            "stomach",
+            "bowel",
+            "stomach-scissors",
+            131,
+            "smooth reddish stomach wall under a single lamp; the bowel's scissors, seen from where they were there",
+        ),
+        (
+            "bowel",
+            "stomach",
+            "bowel-grasper",
+            149,
+            "folded pale small-bowel loops under a single lamp; the stomach's grasper, seen from where it was there",
+        ),
+    )
 }
 
 # The organs under an instrument with a wrist, as robots carry: pitch, then 9 mm further yaw and two unequal jaws.

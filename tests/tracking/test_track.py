@@ -29,7 +29,7 @@ from neeco.tracking.trust import TrackTrust
 
 
 def fitter_of(run: RecordedRun) -> Fitter:
-    return Fitter(InstrumentDrawer(run.scene), Coordinates.of(run.scene), Tissue(run.scene))
+    return Fitter.of(run.scene)
 
 
 def off(found: State, true: State) -> tuple[float, float, float]:

@@ -43,9 +43,8 @@ class IngestResult:
     registered: bool = True  # instrument poses are in the cameras' world
     bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
     episodes: dict[str, tuple[int, int]] = field(default_factory=dict)  # frames (first, last) of several recordings
-    episode_starts: dict[str, float] = field(
-        default_factory=dict
-    )  # s of the capture's time at which each has its own 0
+    # s of the capture's time at which each of several recordings has its own 0
+    episode_starts: dict[str, float] = field(default_factory=dict)
 
     @property
     def still(self) -> bool:

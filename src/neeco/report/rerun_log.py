@@ -51,9 +51,8 @@ def write_rrd(result: IngestResult, capture: Capture, path: Path) -> None:
         for name, time in result.log_times(number, seconds).items():
             if name != VIDEO_CLOCK:
                 stream.set_time(name, duration=time)
-        camera = (
-            RIGHT_CAMERA if seconds == shown else CAMERA
-        )  # a stereo partner's frame follows the left one of its time
+        # a stereo partner's frame follows the left one of its time
+        camera = RIGHT_CAMERA if seconds == shown else CAMERA
         _log_camera(rerun, stream, frame, camera)
         if camera == CAMERA:
             _log_states(rerun, stream, frame, capture.registered)

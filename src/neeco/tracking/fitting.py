@@ -11,17 +11,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neeco.capture.model import State
+from neeco.capture.model import Frame, State
 from neeco.evaluation.photometric_fit import Minimum, Observed, minimise
 from neeco.raster.types import Gaussians
+from neeco.scene import Scene
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, LabelledView, Tissue, View, over, reduced
+from neeco.tracking.drawing import (
+    InstrumentDrawer,
+    LabelledView,
+    Tissue,
+    View,
+    over,
+    reduced,
+    view_of,
+    working_size,
+)
 
 HUBER = 0.05  # colour residual beyond which a pixel pulls linearly
 CORRELATION_PX = 25.0  # neighbouring pixels err together: so many of the full size count as one observation
-BESIDE = (
-    0.015  # of the whole image's diagonal: so close by, an instrument explained badly is seen; not ill-drawn tissue
-)
+# of the whole image's diagonal: so close by, an instrument explained badly is seen; not ill-drawn tissue
+BESIDE = 0.015
 HIDING = 0.02  # of the diagonal: areas as wide that neither instrument nor tissue explains are of what is in front
 UNLIKE = 3 * HUBER * (0.1 - HUBER / 2)  # error of a pixel whose colours are off by 0.1
 MOST_HIDDEN = 0.3  # of an instrument: more, and it is rather somewhere else
@@ -51,6 +60,16 @@ class Fitter:
     drawer: InstrumentDrawer
     coordinates: Coordinates
     tissue: Tissue
+
+    @classmethod
+    def of(cls, scene: Scene) -> Fitter:
+        """Of all instruments of a scene, over its tissue."""
+        return cls(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
+
+    def view(self, frame: Frame, state: State | None) -> View:
+        """What a frame shows, at the size that is worked on; the shadow of instruments in `state` is expected in it
+        (None: no shadow)."""
+        return view_of(frame, working_size(frame.camera, self.drawer.scene.recorded), self.tissue, state)
 
     def fit(
         self,

@@ -12,11 +12,11 @@ import torch
 
 from neeco.capture.model import Frame, InstrumentState, State
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import View, view_of, working_size
+from neeco.tracking.drawing import View
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.motion import LONGEST, Motion, Moving
 from neeco.tracking.search import Search
-from neeco.tracking.trust import NONE, Judge, TrackTrust
+from neeco.tracking.trust import NONE, Judge, Reference, TrackTrust
 
 UNUSUAL = 1.3  # times the usual misfit: from there on a fit is doubted
 BETTER = 0.85  # of a doubted fit's misfit: what another has to have
@@ -100,6 +100,12 @@ class Follower:
     motion: Motion
     search: Search
     judge: Judge
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], fitter: Fitter, reference: Reference, allowance: float = 1.0) -> Follower:
+        """Of the instruments that the fitter draws; `allowance` as `Judge` has it."""
+        search = Search.of(fitter)
+        return cls(frames, fitter, search.motion, search, Judge(fitter, search, reference, allowance))
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -192,9 +198,7 @@ class Follower:
         return max(usual)
 
     def _view(self, frame: int, state: State | None) -> View:
-        recorded = self.fitter.drawer.scene.recorded
-        camera = working_size(self.frames[frame].camera, recorded)
-        return view_of(self.frames[frame], camera, self.fitter.tissue, state)
+        return self.fitter.view(self.frames[frame], state)
 
 
 def is_lost(trust: TrackTrust) -> bool:

@@ -19,16 +19,15 @@ from scipy.ndimage import binary_erosion
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from neeco.capture.model import Frame, State, evenly_spaced
+from neeco.capture.model import Frame, evenly_spaced
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.canonical import join_bodies
 from neeco.scene.training_views import TrainingViews
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, view_of, working_size
+from neeco.tracking.drawing import working_size
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.footage_tissue import Report, passing
-from neeco.tracking.motion import Motion
 from neeco.tracking.search import Search
 from neeco.training.config import method_defaults
 from neeco.training.instruments.shadow import find_shadow
@@ -168,7 +167,7 @@ class Adapted:
 
 def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
     """`scene`, of instruments over the tissue of `frames` (`over_tissue`), in their light."""
-    plain, coordinates = _fitter(scene), Coordinates.of(scene)
+    plain, coordinates = Fitter.of(scene), Coordinates.of(scene)
     chosen = [frames[k] for k in evenly_spaced(len(frames), FRAMES)]
     found: list[tuple[Frame, Fit]] = []
     guess = _guessed(plain, chosen)
@@ -182,11 +181,11 @@ def adapted(scene: Scene, frames: Sequence[Frame], report: Report) -> Adapted:
         most = MOST_MISFIT * found[0][1].misfit if found else 0.0
         colors = _colors(plain, [pair for pair in found[: max(1, round(USED * len(found)))] if pair[1].misfit <= most])
         lit = colors.of(scene)
-        fitter = _fitter(lit)
+        fitter = Fitter.of(lit)
         found = [
             (frame, better)
             for frame, fit in found
-            if (better := fitter.fit(_view(frame, fitter, fit.state), fit.state, wide(coordinates, *NEAR)))
+            if (better := fitter.fit(fitter.view(frame, fit.state), fit.state, wide(coordinates, *NEAR)))
         ]
     return Adapted(with_lamps(lit, found), colors)
 
@@ -209,18 +208,14 @@ def with_lamps(scene: Scene, found: Sequence[tuple[Frame, Fit]]) -> Scene:
 
 def _found(scene: Scene, frames: Sequence[Frame], report: Report) -> list[tuple[Frame, Fit]]:
     """Where the instruments of `scene` are in some frames, nothing known."""
-    fitter, found = _fitter(scene), []
-    search = Search(fitter, Motion.of(fitter.coordinates, scene.recorded.states), scene.recorded)
+    fitter, found = Fitter.of(scene), []
+    search = Search.of(fitter)
     for done, frame in enumerate(frames):
         report("looking for the instruments' colours", done, len(frames))
-        fit = search.anywhere(_view(frame, fitter, None))
+        fit = search.anywhere(fitter.view(frame, None))
         if fit is not None:
             found.append((frame, fit))
     return found
-
-
-def _fitter(scene: Scene) -> Fitter:
-    return Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
 
 
 def _guessed(plain: Fitter, frames: Sequence[Frame]) -> Colors:
@@ -247,14 +242,9 @@ def _colors(plain: Fitter, found: Sequence[tuple[Frame, Fit]]) -> Colors:
     """From the instruments as drawn in their recorded colours, and the frames."""
     rendered, seen = [], []
     for frame, fit in found:
-        view = _view(frame, plain, None)
+        view = plain.view(frame, None)
         color, alpha = plain.drawer.draw(fit.state, view.camera)
         solid = torch.from_numpy(binary_erosion((alpha > SOLID).numpy(), iterations=1)) & (view.weight > 0)
         rendered.append(color[solid] / alpha[solid][:, None])
         seen.append(view.image[solid])
     return Colors.fitted(torch.cat(rendered), torch.cat(seen)) if rendered else Colors()
-
-
-def _view(frame: Frame, fitter: Fitter, state: State | None) -> View:
-    camera = working_size(frame.camera, fitter.drawer.scene.recorded)
-    return view_of(frame, camera, fitter.tissue, state)

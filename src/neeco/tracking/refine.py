@@ -23,8 +23,6 @@ from neeco.files import is_vacant, own_folder, read_bytes, read_json
 from neeco.scene import Scene
 from neeco.scene.scene import gaussian_scene
 from neeco.settings import with_fields
-from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue, view_of, working_size
 from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.track import INFO
 from neeco.training.run import stored_config
@@ -118,13 +116,12 @@ def _named_apart(frames: Sequence[Frame], folder: Path) -> list[Frame]:
 def fitted(scene: Scene, capture: Capture, on_progress: Callable[[int, int], None]) -> list[Frame]:
     """The frames of a capture; those trained on with states as the scene explains their images best, near the recorded
     ones."""
-    fitter = Fitter(InstrumentDrawer(scene), Coordinates.of(scene), Tissue(scene))
+    fitter = Fitter.of(scene)
     near, frames = wide(fitter.coordinates, *NEAR), []
     for done, frame in enumerate(capture.frames):
         on_progress(done, len(capture.frames))
         if frame.split == "train":
-            view = view_of(frame, working_size(frame.camera, scene.recorded), fitter.tissue, frame.state)
-            fit = fitter.fit(view, frame.state, near)
+            fit = fitter.fit(fitter.view(frame, frame.state), frame.state, near)
             if fit is not None:
                 frame = replace(frame, state=fit.state)
         frames.append(frame)

@@ -41,6 +41,12 @@ class Search:
     motion: Motion
     recorded: Recorded
 
+    @classmethod
+    def of(cls, fitter: Fitter) -> Search:
+        """By what was recorded of the scene that the fitter draws."""
+        recorded = fitter.drawer.scene.recorded
+        return cls(fitter, Motion.of(fitter.coordinates, recorded.states), recorded)
+
     @property
     def coordinates(self) -> Coordinates:
         return self.fitter.coordinates

@@ -28,16 +28,13 @@ from neeco.scene import Recorded
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import gaussian_scene
 from neeco.tracking.coordinates import Coordinates
-from neeco.tracking.drawing import InstrumentDrawer, Tissue
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.footage_again import learned_again
 from neeco.tracking.footage_scene import adapted, over_tissue
 from neeco.tracking.footage_tissue import Report, learn_tissue
 from neeco.tracking.footage_video import FOOTAGE
-from neeco.tracking.motion import Motion
-from neeco.tracking.search import Search
-from neeco.tracking.trust import Judge, Reference
+from neeco.tracking.trust import Reference
 from neeco.training.run import load_run, stored_config, write_config
 
 if TYPE_CHECKING:
@@ -47,9 +44,9 @@ if TYPE_CHECKING:
 SCHEMA = "neeco-track/1"
 INFO = "track.json"
 STEPS = "steps"  # the folder of what is done, gone at the end
-OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 SECOND = "second"  # in it: steps by tissue and light that were learned again
 RUN = "run"  # the folder of the scene by which footage over another tissue was tracked: a run
+OTHER_TISSUE = 3.0  # times the misfit over the own tissue that instruments have over tissue learned from footage
 MIN_TRUST = 0.5  # of a frame's state, below which the frame is left out
 SURE = 0.8  # trust with which instruments are begun to be followed at once
 BEGINNINGS = 8  # frames in which the instruments are looked for, until one is SURE
@@ -128,19 +125,18 @@ def track_footage(
         stored = read_json(output / INFO) if (output / INFO).exists() else {}
         if not stored.get("complete"):
             write_json(output / INFO, info | {"complete": False})
-            fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
+            fitter = Fitter.of(scene)
             reference = Reference.of(fitter, trained_on.split("train"))
-            allowance = OTHER_TISSUE if tissue == "footage" else 1.0
-            if tissue == "footage":
+            if tissue == "run":
+                follower = Follower.of(frames, fitter, reference)
+                steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
+            else:
                 scene, info["light"] = _over_footage(scene, footage, output / STEPS, on_stage)
-                fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-            work = _Work(output / STEPS, _follower(fitter, frames, reference, allowance), on_progress)
-            steps = work.all_steps(given)
-            if tissue == "footage":
+                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                steps = _Work(output / STEPS, follower, on_progress).all_steps(given)
                 scene = _learned_again(scene, frames, steps, output / STEPS, on_stage)
-                fitter = Fitter(InstrumentDrawer(scene), coordinates, Tissue(scene))
-                work = _Work(output / STEPS / SECOND, _follower(fitter, frames, reference, allowance), on_progress)
-                steps = work.all_steps(given)
+                follower = Follower.of(frames, Fitter.of(scene), reference, OTHER_TISSUE)
+                steps = _Work(output / STEPS / SECOND, follower, on_progress).all_steps(given)
             records = [_record(frames[k], step, coordinates) for k, step in enumerate(steps)]
             info |= {"complete": True, "reference": reference.to_json(), "frames": records}
         else:
@@ -154,13 +150,6 @@ def track_footage(
         if (output / STEPS).exists():
             shutil.rmtree(output / STEPS)
     return Tracked(output, footage, info["frames"], written, min_trust, scene)
-
-
-def _follower(fitter: Fitter, frames: Sequence[Frame], reference: Reference, allowance: float) -> Follower:
-    recorded = fitter.drawer.scene.recorded
-    motion = Motion.of(fitter.coordinates, recorded.states)
-    search = Search(fitter, motion, recorded)
-    return Follower(frames, fitter, motion, search, Judge(fitter, search, reference, allowance))
 
 
 def _learned_again(scene: Scene, frames: Sequence[Frame], steps: Sequence[Step], folder: Path, report: Report) -> Scene:

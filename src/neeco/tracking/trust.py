@@ -28,7 +28,7 @@ from neeco.evaluation.trust import BESIDE, TypicalErrors, estimate_trust, typica
 from neeco.raster.types import Camera
 from neeco.scene import Recorded
 from neeco.tracking.coordinates import DEG, Coordinates, TrackedInstrument
-from neeco.tracking.drawing import LabelledView, view_of, working_size
+from neeco.tracking.drawing import LabelledView
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.search import Search, differ
 
@@ -89,8 +89,7 @@ class Reference:
         judged, misfits, shares = [], [], []
         for frame in chosen:
             start = states.get(frame.name, frame.state)
-            view = view_of(frame, working_size(frame.camera, scene.recorded), fitter.tissue, start)
-            fit = fitter.fit(view, start, near)
+            fit = fitter.fit(fitter.view(frame, start), start, near)
             if fit is None:
                 continue
             drawing = fitter.labelled(fit)
