@@ -12,10 +12,14 @@ from safetensors.torch import save_file
 from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 
 from neeco.errors import NeecoError
+from neeco.raster.types import Camera
 from neeco.scene import Scene
 from neeco.scene.breathing import HARMONICS, Breathing
 from neeco.scene.io import load_scene, save_scene
 
+CAMERAS = [
+    Camera(torch.eye(4) + torch.eye(4)[0][:, None] * torch.eye(4)[3] * x, 100, 100, 32, 32, 64, 64) for x in (0.0, 5.0)
+]
 PERIOD, LATE = 4.0, 1.7e9  # s; clocks may count from 1970
 
 
@@ -41,7 +45,15 @@ def test_the_motion_repeats_and_is_zero_on_the_average() -> None:
     assert moved[0].norm(dim=1).min() > 0.1
     assert torch.allclose(moved[0], moved[8], atol=1e-4)
     assert moved[:8].mean(0).abs().max() < 1e-4
-    assert 0 < float(moved.norm(dim=-1).max().detach()) <= made.describe()["amplitude_mm"] + 0.01
+    assert 0 < float(moved.norm(dim=-1).max().detach()) <= made.describe(CAMERAS)["amplitude_mm"] + 0.01
+
+
+def test_motion_along_the_only_view_is_no_amplitude() -> None:
+    points = torch.tensor([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
+    swing = torch.tensor([[3.0, 0.0, 40.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    told = Breathing.of(points, PERIOD, swing, 0.0).describe(CAMERAS[:1])
+    assert "amplitude_mm" not in told
+    assert 2.5 < told["amplitude_across_mm"] < 3.5
 
 
 def test_gradients_of_swings_and_period_are_those_of_finite_differences() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
+from neeco.raster.types import Camera
 from neeco.scene.deformations.base import floored_decay
 
 HARMONICS = 2  # breath is no pure sine: the pause after breathing out is longer
@@ -66,13 +67,17 @@ class Breathing(nn.Module):
         return weights @ torch.einsum("w,wkd->kd", _waves(breaths), self.swings)
 
     @torch.no_grad()
-    def describe(self) -> dict[str, float]:
-        """The period, and how far the control point that moves most is from rest at most."""
-        moved = [
-            torch.einsum("w,wkd->kd", _waves(share), self.swings) for share in torch.linspace(0, 1, 33).to(self.swings)
-        ]
-        amplitude = float(torch.stack(moved).norm(dim=-1).max())
-        return {"period_s": round(float(self.period), 3), "amplitude_mm": round(amplitude, 2)}
+    def describe(self, cameras: Sequence[Camera]) -> dict[str, float]:
+        """The period, and how far the control point that moves most is from rest at most; where all the cameras that
+        recorded it stood in one place, only across the view from there: motion along it does not show."""
+        shares = torch.linspace(0, 1, 33).to(self.swings)
+        moved = torch.stack([torch.einsum("w,wkd->kd", _waves(share), self.swings) for share in shares])  # [33, K, 3]
+        centres = torch.stack([camera.world_from_camera[:3, 3] for camera in cameras]).to(self.points)
+        name, along = "amplitude_mm", torch.zeros_like(self.points)
+        if bool((centres == centres[0]).all()):
+            name, along = "amplitude_across_mm", nn.functional.normalize(self.points - centres[0], dim=1)
+        across = moved - (moved * along).sum(-1, keepdim=True) * along
+        return {"period_s": round(float(self.period), 3), name: round(float(across.norm(dim=-1).max()), 2)}
 
 
 def _waves(breaths: Tensor) -> Tensor:

@@ -274,7 +274,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             training.instruments.weigh_labels()
         training.instruments.conclude(self)
         if self.breathing is not None:
-            training.scene.diagnostics["breathing"] |= self.breathing.describe()
+            training.scene.diagnostics["breathing"] |= self.breathing.describe(training.scene.recorded.cameras)
         if self.settings.extrapolate_tissue:
             scene = training.scene
             scene.canonical = extrapolate_tissue(scene.canonical, scene.recorded.cameras)

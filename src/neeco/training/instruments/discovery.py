@@ -161,7 +161,9 @@ def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue
     assert isinstance(deformation, BreathingTissue)
     assert deformation.breathing is not None
     breathes.start_breathing(deformation.breathing)
-    scene.diagnostics["breathing"] = deformation.breathing.describe() | {"explained": round(found.explained, 3)}
+    scene.diagnostics["breathing"] = deformation.breathing.describe(scene.recorded.cameras) | {
+        "explained": round(found.explained, 3)
+    }
     return tissue
 
 
