@@ -191,8 +191,12 @@ def print_tables(rows: Sequence[dict[str, Any]], truth: Truth) -> None:
         for split in dict.fromkeys(row["split"] for row in shown):
             print_row([row for row in shown if row["split"] == split], split, kind)
     print_trust(shown)
-    if outside := [row["trust"] >= TOLD for row in rows if not row["inside"]]:
-        print(f"tip outside the image: {len(outside)} frames, {100 * np.mean(outside):.1f} % are trusted by {TOLD}")
+    if outside := [row for row in rows if not row["inside"]]:
+        for row in outside:
+            row |= errors(row["camera"], row["found"] @ offset, row["true"], truth)
+            row["joint"] = float(np.abs(np.array(row["joints"]) - joints).max(initial=0)) / DEG
+        print("tip outside the image:")
+        print_trust(outside)
 
 
 def tip_is_inside(camera: Camera, pose: Tensor, truth: Truth) -> bool:
@@ -217,8 +221,8 @@ def print_row(rows: Sequence[dict[str, Any]], split: str, kind: str) -> None:
 def print_trust(rows: Sequence[dict[str, Any]]) -> None:
     """Who is told: trust against errors, offset taken out."""
     trust = np.array([row["trust"] for row in rows])
-    off = np.array([row["deg"] > WRONG_DEG or row["px"] > LOST_PX for row in rows])
-    for name, those in (("more than 10 degrees or 10 px off", off), ("others", ~off)):
+    off = np.array([max(row["deg"], row["joint"]) > WRONG_DEG or row["px"] > LOST_PX for row in rows])
+    for name, those in (("more than 10 degrees (joints, too) or 10 px off", off), ("others", ~off)):
         told = f"{100 * (trust[those] < TOLD).mean():.1f} % have trust below {TOLD}" if those.any() else "-"
         print(f"{name}: {those.sum()} frames, {told}")
 

@@ -18,14 +18,15 @@ from neeco.capture.images import write_image
 from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.evaluation.trust import TypicalErrors
 from neeco.report.track_page import write_track_page
 from neeco.tracking.coordinates import DEG, Coordinates
 from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, as_drawn, view_of
 from neeco.tracking.fitting import Fitter, wide
-from neeco.tracking.follow import LOOK_EVERY, Step
+from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.motion import Motion
 from neeco.tracking.track import Tracked, _Work, state_of, track_footage
-from neeco.tracking.trust import TrackTrust
+from neeco.tracking.trust import Reference, TrackTrust
 
 
 def fitter_of(run: RecordedRun) -> Fitter:
@@ -267,6 +268,20 @@ def test_a_trust_that_is_no_share_is_reported(tracked: Tracked, tmp_path: Path) 
         (tmp_path / name).symlink_to(tracked.output / name)
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     assert any("trust" in problem.field for problem in errors_only(check_capture(tmp_path)))
+
+
+@pytest.mark.parametrize(("x", "shown"), [(0.0, True), (44.0, False)])
+def test_an_opening_that_the_image_does_not_show_is_not_trusted(
+    tracked_run: RecordedRun, tmp_path: Path, x: float, shown: bool
+) -> None:
+    true, given = grasper_state(x, jaw=0.9), grasper_state(x, jaw=0.8)
+    frame = record(tracked_run.scene, tmp_path, [true], "new").frames[0]
+    reference = Reference(TypicalErrors(0.02, 0.02), 0.1, 1.0)
+    follower = Follower.of([frame], fitter_of(tracked_run), reference)
+    step = follower.begin(0, given)
+    assert step.trust.overlap > 0.9
+    assert (step.trust.determined > 0.95) == shown
+    assert (step.trust.value > 0.5) == shown
 
 
 def test_the_longer_it_is_unseen_the_less_is_known(tracked_run: RecordedRun) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from statistics import median
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from neeco.tracking.drawing import View
 from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.motion import LONGEST, Motion, Moving
 from neeco.tracking.search import Search
-from neeco.tracking.trust import NONE, Judge, Reference, TrackTrust
+from neeco.tracking.trust import NONE, WRONG_DEG, Judge, Reference, TrackTrust
 
 UNUSUAL = 1.3  # times the usual misfit: from there on a fit is doubted
 BETTER = 0.85  # of a doubted fit's misfit: what another has to have
@@ -62,7 +62,7 @@ class Step:
             "covariance": self.moving.covariance.tolist(),
             "misfit": self.misfit,
             "gain": self.gain,
-            "trust": [self.trust.overlap, self.trust.explained, self.trust.observed, self.trust.single],
+            "trust": astuple(self.trust),
             "recent": list(self.recent),
             "seen_at": self.seen_at,
             "searched_at": self.searched_at,
@@ -162,8 +162,9 @@ class Follower:
         if trust.value < POOR and abs(time - searched_at) >= POOR_EVERY:
             best, searched_at = self.search.anywhere(view), time
             if best is not None and best.misfit < BETTER * fit.misfit:
-                fit, how, moving = best, "found", self.motion.begin(replace(best.state, time=time))
+                fit, how, moving = best, "found", self.motion.begin(replace(best.state, time=time), best.information)
                 trust, _ = self.judge.judge(fit)
+        trust = replace(trust, determined=self.motion.likely_within(moving, WRONG_DEG))
         recent = (*before.recent, fit.misfit)[-RECENT:]
         return Step(frame, how, moving, fit.misfit, fit.gain, trust, recent, time, searched_at, unlooked)
 
@@ -181,9 +182,10 @@ class Follower:
     def _begun(self, frame: int, how: How, fit: Fit) -> Step:
         time = self.frames[frame].state.time
         trust, _ = self.judge.judge(fit)
-        moving = self.motion.begin(replace(fit.state, time=time))
+        moving = self.motion.begin(replace(fit.state, time=time), fit.information)
         if is_lost(trust):
             return self._lost(frame, moving, (), NEVER, time)
+        trust = replace(trust, determined=self.motion.likely_within(moving, WRONG_DEG))
         return Step(frame, how, moving, fit.misfit, fit.gain, trust, (fit.misfit,), time, time)
 
     def _lost(self, frame: int, moving: Moving, recent: tuple[float, ...], seen_at: float, searched_at: float) -> Step:

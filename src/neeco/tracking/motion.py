@@ -6,6 +6,7 @@ their pixels give is what is measured, so that prediction and image are weighed 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,6 +23,7 @@ FEWEST = 8  # second differences that tell accelerations
 NORMAL = 1.4826  # standard deviations a median absolute deviation
 STILLEST = (0.05, 0.03, 0.1, 0.05)  # deg, mm, deg and mm of joints: least second difference between frames
 BEGINNING = (2.0, 2.0, 3.0, 1.0)  # the same: standard deviations of a state just found
+UNKNOWN = (60.0, 30.0, 40.0, 10.0)  # deg, mm, deg and mm of joints: of a state that the image says nothing of
 LONGEST = 0.4  # s: what is not seen for longer has to be found anew
 
 
@@ -68,9 +70,12 @@ class Motion:
             velocities = velocities + paces.T @ paces / len(paces)
         return cls(coordinates, deviation**2 / interval**3, velocities, interval)
 
-    def begin(self, state: State) -> Moving:
-        """Just found: its velocity is not known."""
+    def begin(self, state: State, information: Tensor | None = None) -> Moving:
+        """Just found: its velocity is not known. `information` [P, P] that the image gives of the state; None: as much
+        as is usual."""
         place = torch.diag(self.coordinates.each(*BEGINNING) ** 2)
+        if information is not None:  # of jaws outside the image it gives none
+            place = place + torch.linalg.inv(information + torch.diag(self.coordinates.each(*UNKNOWN) ** -2))
         return Moving(state, torch.zeros_like(place[0]), torch.block_diag(place, self.velocities))
 
     def predict(self, moving: Moving, seconds: float) -> Moving:
@@ -107,6 +112,22 @@ class Motion:
         covariance = predicted.covariance - gain @ predicted.covariance[:size]
         return Moving(fit.state, velocity, (covariance + covariance.T) / 2)
 
+    def likely_within(self, moving: Moving, degrees: float) -> float:
+        """How likely rotation and every joint are less far off (joints that slide: as many quarters of a mm), as the
+        covariance says, and the bounds of joints, between which each value is as likely."""
+        variance, bounds = moving.covariance.diagonal(), self.coordinates.each(degrees, math.inf, degrees, degrees / 4)
+        likely = 1.0
+        for item, rows in zip(self.coordinates.instruments, self.coordinates.slices, strict=True):
+            turned = moving.covariance[rows, rows][:3, :3]
+            worst = torch.linalg.eigvalsh(turned)[-1:].clamp_min(0)
+            joints = variance[rows][6:].clamp_min(0)
+            between = ((item.high - item.low) ** 2 / 12).clamp_min(1e-12)  # variance of an even distribution
+            deviation = torch.cat([worst, 1 / (1 / joints.clamp_min(1e-12) + 1 / between)]).sqrt()
+            limits = torch.cat([bounds[rows][:1], bounds[rows][6:]])
+            likely *= float(torch.erf(limits / (math.sqrt(2) * deviation.clamp_min(1e-9))).prod())
+        return likely
+
     def freed(self, moving: Moving) -> Moving:
-        """After a fit that the motion did not foresee: how fast it was is forgotten."""
-        return Moving(moving.state, moving.velocity, moving.covariance + self.begin(moving.state).covariance)
+        """Before the update by a fit that the motion did not foresee: where it was and how fast is forgotten."""
+        place = torch.diag(self.coordinates.each(*UNKNOWN) ** 2)
+        return Moving(moving.state, moving.velocity, moving.covariance + torch.block_diag(place, self.velocities))

@@ -8,6 +8,7 @@ Every step is written beside the output as it is made, so that work that was bro
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -279,7 +280,9 @@ def _record(frame: Frame, step: Step, coordinates: Coordinates) -> dict[str, Any
     for item, rows in zip(coordinates.instruments, coordinates.slices, strict=True):
         state, own = step.moving.state.instruments[item.name], variance[rows].clamp_min(0)
         deviation = {"rotation": float(own[:3].sum().sqrt()), "place": float(own[3:6].sum().sqrt())}
-        deviation |= {f"joint.{name}": float(own[6 + k].sqrt()) for k, name in enumerate(item.joints)}
+        most = (item.high - item.low) / math.sqrt(12)  # of a joint that may be anywhere between its bounds
+        joints = torch.minimum(own[6:].sqrt(), most).tolist()
+        deviation |= {f"joint.{name}": value for name, value in zip(item.joints, joints, strict=True)}
         instruments[item.name] = {
             "pose": state.pose.tolist(),
             "joints": dict(state.joints),

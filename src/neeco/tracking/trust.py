@@ -1,6 +1,6 @@
 """How far a tracked state is trusted: by its place, roll and joints, not by its outline alone.
 
-Trust is a product of four shares, each 1 where nothing speaks against the state:
+Trust is a product of five shares, each 1 where nothing speaks against the state:
 
 - `overlap`: the overlap (IoU) of its label that the image supports (`neeco.evaluation.trust`). An instrument turned by
   25 degrees still explains most of its pixels, so the outline alone says nothing of roll and joints;
@@ -8,14 +8,16 @@ Trust is a product of four shares, each 1 where nothing speaks against the state
   the farther from where it was ever seen, the better they have to be;
 - `observed`: how much of what is seen of the instrument some training frame saw, and from about there. Of sides that
   nobody saw, a scene draws what it likes, and images of them fit wrong rolls as well;
-- `single`: whether another state, turned or opened otherwise, explains the image about as well.
+- `single`: whether another state, turned or opened otherwise, explains the image about as well;
+- `determined`: how likely rotation and joints are within 10 degrees, as images and motion determine them: jaws outside
+  the image may be open or closed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,6 +49,7 @@ NEARBY = (20.0, 5.0, 20.0)  # deg, mm, deg of joints: prior of the other state
 OTHER_DEG, OTHER_JOINT_DEG = 10.0, 8.0  # nearer than this a state is the same
 AS_GOOD = (1.3, 1.0)  # times the misfit: another state takes no trust, or AMBIGUOUS of it
 AMBIGUOUS = 0.6
+WRONG_DEG = 10.0  # of rotation or a joint (or as many quarters of a mm): what is as far off is wrong
 
 
 @dataclass(frozen=True)
@@ -57,18 +60,19 @@ class TrackTrust:
     explained: float
     observed: float
     single: float
+    determined: float = 1.0  # known once the motion is
 
     @property
     def value(self) -> float:
         """In [0, 1]."""
-        return self.overlap * self.explained * self.observed * self.single
+        return math.prod(astuple(self))
 
     def to_json(self) -> dict[str, float]:
         """As plain values, for files."""
         return {"value": round(self.value, 4)} | {name: round(share, 4) for name, share in asdict(self).items()}
 
 
-NONE = TrackTrust(0.0, 0.0, 0.0, 0.0)  # where no state was found
+NONE = TrackTrust(0.0, 0.0, 0.0, 0.0, 0.0)  # where no state was found
 
 
 @dataclass(frozen=True)
