@@ -273,6 +273,25 @@ SCENES |= {
     )
 }
 
+# The bowel's very instrument, sensor, jaw and scope over the stomach: a second tissue of one capture.
+SCENES["stomach-second"] = replace(
+    SCENES["bowel"],
+    organ="stomach",
+    path=replace(
+        SCENES["stomach"].path,
+        trocar=(-104.0, 72.0, 128.0),
+        opening_train=48 * DEGREE,
+        opening_most=74 * DEGREE,
+        roll_middle=150 * DEGREE,
+        roll_train=55 * DEGREE,
+        roll_most=95 * DEGREE,
+    ),
+    seed=61,
+    words="smooth reddish stomach wall; the bowel's scissors, sensor and scope, moved otherwise",
+    world_turn=(1.2, 0.8, -1.6),
+    world_shift=(40.0, -120.0, 95.0),
+)
+
 # The organs under an instrument with a wrist, as robots carry: pitch, then 9 mm further yaw and two unequal jaws.
 NEEDLE_DRIVER = WristedDesign(
     name="needle_driver",

@@ -12,7 +12,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +47,10 @@ class CaptureSummary:
     joints: dict[str, tuple[float, float]]  # "instrument.joint" -> lowest and highest value, rad
     travel_mm: dict[str, float]  # instrument -> diagonal of the box its origin moves in
     still: bool = False  # the scope stood still
+    tissues: dict[str, int] = field(default_factory=dict)  # of several: name -> frames
 
     def as_json(self) -> dict[str, Any]:
-        return asdict(self)
+        return {key: value for key, value in asdict(self).items() if key != "tissues" or value}
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,11 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         _check_frames(parsed)
         _check_images(parsed)
         _check_states(parsed)
-        check_geometry(parsed)
+        for part in parsed.by_tissue():
+            check_geometry(part)
         if motion and not errors_only(report.problems):
-            check_motion(parsed)
+            for part in parsed.by_tissue():
+                check_motion(part)
     return Checked(report.problems, _summary(parsed), capture)
 
 
@@ -103,21 +106,30 @@ def _summary(parsed: Parsed) -> CaptureSummary:
         states = [state for _, state in parsed.states_of(instrument.name)]
         if not states:
             continue
-        origins = np.stack([state.pose[:3, 3].numpy() for state in states])
-        travel[instrument.name] = round(float(np.linalg.norm(np.ptp(origins, axis=0))), 3)
+        boxes = [_box(part, instrument.name) for part in parsed.by_tissue()]  # poses of two worlds tell no distance
+        travel[instrument.name] = round(max(boxes), 3)
         for joint in instrument.joints:
             values = [state.joints[joint] for state in states if joint in state.joints]
             if values:
                 joints[f"{instrument.name}.{key_name(joint)}"] = (min(values), max(values))
-    points = parsed.points
+    clouds = [part.points for part in parsed.by_tissue() if part.points is not None and part.points.measured]
     return CaptureSummary(
         splits=dict(Counter(frame.split for frame in parsed.frames)),
-        points=len(points.positions) if points is not None and points.measured else 0,
+        points=sum(len(cloud.positions) for cloud in clouds),
         registered=parsed.registered,
         joints=joints,
         travel_mm=travel,
         still=parsed.still,
+        tissues={
+            tissue.name: sum(frame.state.tissue == tissue.name for frame in parsed.frames) for tissue in parsed.tissues
+        },
     )
+
+
+def _box(parsed: Parsed, instrument: str) -> float:
+    """Diagonal, mm, of the box that an instrument's origin moves in."""
+    origins = [state.pose[:3, 3].numpy() for _, state in parsed.states_of(instrument)]
+    return float(np.linalg.norm(np.ptp(np.stack(origins), axis=0))) if origins else 0.0
 
 
 def _check_frames(parsed: Parsed) -> None:
@@ -133,7 +145,9 @@ def _check_frames(parsed: Parsed) -> None:
     elif counts["train"] < FEW_TRAIN_FRAMES:
         message = f"few frames: {counts['train']} to train on, fewer than {FEW_TRAIN_FRAMES} give a poor scene"
         frames.warning(message, "record more if you can")
-    _check_still(parsed)
+    for part in parsed.by_tissue():
+        _check_still(part)
+    _check_tissues(parsed)
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
     latest: dict[str, float] = {}
@@ -337,6 +351,15 @@ def _check_coupling(parsed: Parsed, name: str, known: Sequence[str], states: Seq
 def _same_view(one: Camera, other: Camera) -> bool:
     intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in (one, other)]
     return intrinsics[0] == intrinsics[1] and torch.equal(one.world_from_camera, other.world_from_camera)
+
+
+def _check_tissues(parsed: Parsed) -> None:
+    """Every tissue that is listed is learned from some frames."""
+    trained = Counter(frame.state.tissue for frame in parsed.frames if frame.split == "train")
+    for tissue in parsed.tissues:
+        if not trained[tissue.name]:
+            message = f"no frame of split 'train' shows {printable(tissue.name)}"
+            parsed.header("tissues").error(message, "give it training frames, or leave it out")
 
 
 def _check_still(parsed: Parsed) -> None:

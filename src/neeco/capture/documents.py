@@ -227,6 +227,15 @@ class Node:
         return matrix if fault is None else None
 
 
+@dataclass(frozen=True)
+class ParsedTissue:
+    """One of several tissues, as far as it could be read."""
+
+    name: str
+    points: PointCloud | None  # None: none named
+    place: Node  # of the points
+
+
 @dataclass
 class Parsed:
     """A capture as far as it could be read.
@@ -246,6 +255,7 @@ class Parsed:
     says_units: bool = False  # the file names its unit of length
     lens: Lens | None = None  # through which it was recorded
     still: bool = False  # its cameras stood still
+    tissues: list[ParsedTissue] = field(default_factory=list)
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
 
@@ -258,6 +268,19 @@ class Parsed:
         rows = [row for row in range(len(self.frames)) if row not in self.without_camera]
         frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
         return replace(self, frames=frames, places=places, without_camera=set())
+
+    def by_tissue(self) -> list[Parsed]:
+        """What is of each tissue, whose world is its own, and has frames; all of it where there is one."""
+        if not self.tissues:
+            return [self]
+        parts = []
+        for tissue in self.tissues:
+            rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
+            without = {index for index, row in enumerate(rows) if row in self.without_camera}
+            frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
+            part = replace(self, frames=frames, places=places, without_camera=without, tissues=[])
+            parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
+        return parts
 
     def states_of(self, name: str) -> list[tuple[Node, InstrumentState]]:
         """(place of the state, state) of one instrument, over the frames that have it."""

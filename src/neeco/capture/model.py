@@ -61,6 +61,7 @@ class State:
 
     instruments: Mapping[str, InstrumentState] = field(default_factory=dict)
     time: float = 0.0  # s
+    tissue: str | None = None  # over which of several tissues, whose world the poses are in; None: there is one
 
     def __post_init__(self) -> None:
         given = {
@@ -135,6 +136,14 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Tissue:
+    """One of a capture's several tissues: its name, and its sparse points. Each has a world of its own."""
+
+    name: str
+    points: PointCloud
+
+
+@dataclass(frozen=True)
 class Capture:
     """A recording ready to learn from. `read_capture` reads one from a folder, `write_capture` writes one."""
 
@@ -146,9 +155,10 @@ class Capture:
     timed: bool = True  # the recording says when each frame was taken; else `State.time` counts the frames
     lens: Lens | None = None  # through which it was recorded; its distortion is gone from the images
     still: bool = False  # the cameras stood still: nothing shows the tissue's depth from elsewhere
+    tissues: tuple[Tissue, ...] = ()  # where the frames name theirs; `points` are none's then
 
     def __post_init__(self) -> None:
-        for name, kind in {"root": Path, "frames": tuple, "instruments": tuple}.items():
+        for name, kind in {"root": Path, "frames": tuple, "instruments": tuple, "tissues": tuple}.items():
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def split(self, name: str) -> tuple[Frame, ...]:
@@ -161,12 +171,13 @@ class Capture:
         return tuple(dict.fromkeys(frame.split for frame in self.frames))
 
 
-def share_lamps(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-    """The cameras of a still scope, of which the first has the lamps beside it: a second one, of a stereo scope, has
-    none of its own."""
+def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
+    """The cameras of a still scope, of which the first (over each tissue, as `states` say) has the lamps beside it: a
+    second one, of a stereo scope, has none of its own."""
     shared = []
-    for camera in cameras:
-        first = cameras[0].world_from_camera
+    firsts: dict[str | None, Tensor] = {}
+    for camera, state in zip(cameras, states, strict=True):
+        first = firsts.setdefault(state.tissue, camera.world_from_camera)
         beside = torch.equal(camera.world_from_camera, first)
         shared.append(camera if beside else replace(camera, world_from_lamps=first))
     return tuple(shared)

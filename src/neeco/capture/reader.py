@@ -13,8 +13,8 @@ import torch
 from neeco.capture.colmap import find_model, parse_colmap
 from neeco.capture.documents import Node, Parsed, ProblemReport, errors_only, inside
 from neeco.capture.endonerf import is_endonerf_folder, parse_endonerf
-from neeco.capture.model import Capture, Instrument, State, share_lamps
-from neeco.capture.points import points_in_view
+from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share_lamps
+from neeco.capture.points import PointCloud, points_in_view
 from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
 
@@ -40,12 +40,14 @@ def read_capture(path: Path | str, transforms: str = "transforms.json", *, backg
 
 def capture_of(parsed: Parsed) -> Capture:
     """What was read without an error, as a capture, the poses of articulated instruments as those of their roots."""
-    points = parsed.points
-    if points is None:
-        points = points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in parsed.frames]))
     frames, instruments = tuple(parsed.frames), parsed.instruments
+    tissues = tuple(
+        Tissue(tissue.name, _points(tissue.points, [frame for frame in frames if frame.state.tissue == tissue.name]))
+        for tissue in parsed.tissues
+    )
+    points = PointCloud(measured=False) if tissues else _points(parsed.points, frames)
     if parsed.still:
-        lit = share_lamps([frame.camera for frame in frames])
+        lit = share_lamps([frame.camera for frame in frames], [frame.state for frame in frames])
         frames = tuple(replace(frame, camera=camera) for frame, camera in zip(frames, lit, strict=True))
     if any(item.unrecorded for item in instruments):
         frames = tuple(replace(frame, state=_with_unrecorded(frame.state, instruments)) for frame in frames)
@@ -55,7 +57,16 @@ def capture_of(parsed: Parsed) -> Capture:
             item if item.kinematics is None else replace(item, kinematics=replace(item.kinematics, pose_of=None))
             for item in instruments
         )
-    return Capture(parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still)
+    return Capture(
+        parsed.root, frames, instruments, points, parsed.registered, parsed.timed, parsed.lens, parsed.still, tissues
+    )
+
+
+def _points(measured: PointCloud | None, frames: Sequence[Frame]) -> PointCloud:
+    """The points of one world, random ones in view of its frames where none were measured."""
+    if measured is not None or not frames:
+        return measured or PointCloud(measured=False)
+    return points_in_view(np.stack([frame.camera.world_from_camera.double().numpy() for frame in frames]))
 
 
 def _with_unrecorded(state: State, instruments: Sequence[Instrument]) -> State:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
+from neeco.capture.documents import Node, Parsed, ParsedTissue, ProblemReport, inside, printable, relative_name
 from neeco.capture.images import EXTENSIONS, image_size
 from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Frame, State, swap_camera_axes
-from neeco.capture.points import random_points, read_ply
+from neeco.capture.points import PointCloud, random_points, read_ply
 from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
 from neeco.errors import NeecoError
 from neeco.files import read_json
@@ -49,6 +49,7 @@ def parse_transforms(document: Node, folder: Path, root: Path, background: float
     file."""
     parsed = Parsed(root)
     _parse_header(document, parsed)
+    _parse_tissues(document, folder, parsed)
     _parse_frames(document, folder, parsed, background)
     _parse_points(document, folder, parsed)
     parsed.instruments = all_instruments(parsed.frames, declared_instruments(document))
@@ -144,7 +145,7 @@ def _parse_frames(
         mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
         time = node.child("time").number() if node.has("time") else float(index)
         timed += node.has("time")
-        instruments = parse_instruments(node)
+        instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
         if image_path is None:
             continue
         camera = _Intrinsics(node, header.document, image_path).camera()
@@ -158,7 +159,7 @@ def _parse_frames(
         if pose is not None:
             opencv = torch.from_numpy(swap_camera_axes(pose)).to(torch.float32)
             camera = replace(camera, world_from_camera=opencv)
-        parsed.frames.append(Frame(image_path, camera, State(instruments, time), name, mask_path, background))
+        parsed.frames.append(Frame(image_path, camera, State(instruments, time, tissue), name, mask_path, background))
         parsed.places.append(node)
     header.pass_on()
     if nodes.value == []:
@@ -169,22 +170,60 @@ def _parse_frames(
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
 
 
+def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:
+    """Read the names of several tissues and the points of each, if the file lists any."""
+    if not document.has("tissues"):
+        return
+    if document.child("tissues").value == []:
+        document.child("tissues").error("is empty", "list the tissues there, or leave it out where there is one")
+    if document.has("ply_file_path"):
+        document.child("ply_file_path").error("is of no tissue", "name a file of points in each of the tissues")
+    for item in document.child("tissues").items():
+        if not item.is_object():
+            continue
+        place = item.child("name")
+        name = place.text("give every tissue a name")
+        if name in [tissue.name for tissue in parsed.tissues]:
+            place.error(f"{printable(name)} comes twice", "give every tissue its own name")
+        elif name is not None:
+            parsed.tissues.append(ParsedTissue(name, *_points_of(item, folder, parsed.root)))
+
+
+def _tissue_of(frame: Node, parsed: Parsed) -> str | None:
+    """The tissue that a frame shows, of those listed; None where there is one, or, reported, it names none of them."""
+    names, place = [tissue.name for tissue in parsed.tissues], frame.child("tissue")
+    if names and not frame.has("tissue"):
+        place.error("is missing", f"name one of the file's tissues: {', '.join(names)}")
+    elif frame.has("tissue") and (place.text() is not None) and place.value not in names:
+        listed = f"the file's tissues are {', '.join(names)}" if names else "the file lists no tissues"
+        place.error(f"{printable(place.value)} is unknown: {listed}", "correct it, or list it in `tissues`")
+    return place.value if place.value in names else None
+
+
 def _parse_points(document: Node, folder: Path, parsed: Parsed) -> None:
     """Read the point cloud that `ply_file_path` names, if it names one."""
-    parsed.points_place = document.child("ply_file_path")
-    path = _file(parsed.points_place, folder, parsed.root) if document.has("ply_file_path") else None
+    if not parsed.tissues:
+        parsed.points, parsed.points_place = _points_of(document, folder, parsed.root)
+
+
+def _points_of(node: Node, folder: Path, root: Path) -> tuple[PointCloud | None, Node]:
+    """The point cloud that an object's `ply_file_path` names, None where it names none that can be used, and its
+    place."""
+    place = node.child("ply_file_path")
+    path = _file(place, folder, root) if node.has("ply_file_path") else None
     if path is None:
-        return
-    name = relative_name(path, parsed.root)
-    parsed.points_place = Node(None, name, "vertex", document.report)
+        return None, place
+    name = relative_name(path, root)
+    place = Node(None, name, "vertex", node.report)
     try:
-        parsed.points = read_ply(path)
+        points = read_ply(path)
     except NeecoError as error:
-        document.report.error(name, "", str(error).removeprefix(f"{path}: "))
-        return
-    if bad := int((~np.isfinite(parsed.points.positions).all(axis=1)).sum()):
-        parsed.points_place.error(f"{bad} points are NaN or infinite", "remove them from the file")
-        parsed.points = None
+        node.report.error(name, "", str(error).removeprefix(f"{path}: "))
+        return None, place
+    if bad := int((~np.isfinite(points.positions).all(axis=1)).sum()):
+        place.error(f"{bad} points are NaN or infinite", "remove them from the file")
+        return None, place
+    return points, place
 
 
 class _Splits:

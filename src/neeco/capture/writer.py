@@ -32,7 +32,7 @@ def write_capture(
     images: Sequence[Tensor | np.ndarray] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a capture folder: images/, masks/, sparse.ply and, last, transforms.json; every file whole or not at all.
+    """Write a capture folder: images/, masks/, sparse.ply (or one of each tissue) and, last, transforms.json; every file whole or not at all.
 
     Images and masks are copied bit by bit (transparent images are flattened on their background); poses read back
     exactly. Random points are not written. `images`: the pixels of every frame, [H, W, 3] in [0, 1] or uint8,
@@ -71,6 +71,12 @@ def write_capture(
     if capture.points.measured:
         write_ply(path / "sparse.ply", capture.points)
         header["ply_file_path"] = "sparse.ply"
+    for number, tissue in enumerate(capture.tissues, 1):
+        entry = {"name": tissue.name}
+        if tissue.points.measured:
+            entry["ply_file_path"] = f"sparse_{number}.ply"
+            write_ply(path / entry["ply_file_path"], tissue.points)
+        header.setdefault("tissues", []).append(entry)
     write_json(path / "transforms.json", header)
 
 
@@ -100,8 +106,10 @@ def fingerprint(capture: Capture) -> str:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     if capture.still:
         digest.update(b"still")
-    for numbers in (capture.points.positions, capture.points.colors):
-        digest.update(numbers.tobytes())
+    digest.update(json.dumps([tissue.name for tissue in capture.tissues]).encode() if capture.tissues else b"")
+    for points in (capture.points, *(tissue.points for tissue in capture.tissues)):
+        digest.update(points.positions.tobytes())
+        digest.update(points.colors.tobytes())
     return digest.hexdigest()
 
 
@@ -159,6 +167,8 @@ def _write_frame(
         "time": _number(frame.state.time),
         "split": frame.split,
     }
+    if frame.state.tissue is not None:
+        entry["tissue"] = frame.state.tissue
     if frame.mask_path is not None:
         entry["mask_path"] = f"masks/{name}{frame.mask_path.suffix}"
         _copy(frame.mask_path, path / entry["mask_path"])

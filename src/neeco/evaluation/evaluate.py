@@ -63,7 +63,7 @@ class _Context:
     scene: Drawable
     capture: Capture
     networks: Mapping[str, Lpips]
-    coverage: Coverage
+    coverage: Mapping[str | None, Coverage]  # by tissue; None: there is one
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def evaluate_run(
         gaussian_scene(scene, "--align")
     report = progress or (lambda what, done, total: None)
     report("training views", 0, 1)
-    context = _Context(scene, capture, networks, observed_depths(scene, capture.split("train")))
+    context = _Context(scene, capture, networks, _coverage(scene, capture.split("train")))
     report("training views", 1, 1)
     kinds = ("given", "aligned") if align else ("given",)
     names = truth_names(capture.root)
@@ -132,6 +132,15 @@ def evaluate_run(
     return evaluation
 
 
+def _coverage(scene: Drawable, frames: Sequence[Frame]) -> dict[str | None, Coverage]:
+    """What the training frames saw of each tissue."""
+    tissues: tuple[str | None, ...] = scene.recorded.tissues or (None,)
+    return {
+        tissue: observed_depths(scene, [frame for frame in frames if frame.state.tissue == tissue])
+        for tissue in tissues
+    }
+
+
 def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tuple[str, ...]:
     """The splits to score: `splits`, or all but `train`. Raises NeecoError for none, or one that the capture lacks."""
     if splits is None:
@@ -150,7 +159,7 @@ def held_out_splits(capture: Capture, splits: Sequence[str] | None = None) -> tu
 def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) -> None:
     """Draw one frame at its given poses and, where asked, at fitted ones; add the scores to the tallies."""
     scene = context.scene
-    unobserved, tissue = unobserved_tissue(context.coverage, scene, frame)
+    unobserved, tissue = unobserved_tissue(context.coverage[frame.state.tissue], scene, frame)
     reference = load_reference(context.capture, frame)
     image, mask = frame.load_image(), frame.load_mask()
     networks = context.networks if min(image.shape[:2]) >= MIN_SIZE else {}

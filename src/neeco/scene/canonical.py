@@ -16,6 +16,7 @@ from torch import Tensor
 from neeco.raster.reference import SH_C0
 
 SH_COEFFICIENTS = 16  # degree 3
+TISSUE = "tissue"  # extra [N]: which of several tissues, counted from 0, a Gaussian of body 0 is of
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ class CanonicalGaussians:
     def of_instruments(self) -> Tensor:
         """[N] bool, rows of any instrument; not to be changed."""
         return self.bodies > 0
+
+    def of_tissue(self, index: int) -> Tensor:
+        """[N] bool, rows of one of several tissues; of the tissue, where there is one."""
+        tissue = self.bodies == 0
+        return tissue & (self.extras[TISSUE] == index) if TISSUE in self.extras else tissue
 
     def tensors(self) -> dict[str, Tensor]:
         """Every learned tensor by name; extras as `extras.NAME`."""
@@ -120,6 +126,8 @@ def neighbour_spacing(positions: np.ndarray) -> Tensor:
 
 
 def join_bodies(bodies: list[CanonicalGaussians]) -> CanonicalGaussians:
-    """One set out of several single bodies, in order. All must carry the same extras."""
+    """One set out of several single bodies, in order. All must carry the same extras; `TISSUE` only the first."""
+    if TISSUE in bodies[0].extras:
+        bodies = [bodies[0], *(body.with_extras(**{TISSUE: body.means.new_zeros(len(body))}) for body in bodies[1:])]
     tensors = {name: torch.cat([body.tensors()[name] for body in bodies]) for name in bodies[0].tensors()}
     return CanonicalGaussians.from_tensors(tensors, tuple(len(body) for body in bodies))

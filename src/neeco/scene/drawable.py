@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neeco.capture.lens import Lens
-from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, RecordedStates, State
+from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
 from neeco.raster.types import Rendering
 from neeco.scene.articulation import JointMotion
 
@@ -32,6 +32,7 @@ class Recorded:
     lens: Lens | None = None  # whose distortion is gone from the images; None: not known
     scale: float = 1.0  # of the cameras' images, at which the scene was learned
     still: bool = False  # the cameras stood still
+    tissues: tuple[str, ...] = ()  # of several that were recorded, each in a world of its own, as states name them
 
     @classmethod
     def of(
@@ -41,6 +42,7 @@ class Recorded:
         lens: Lens | None = None,
         scale: float = 1.0,
         still: bool = False,
+        tissues: Sequence[Tissue] = (),
     ) -> Recorded:
         """What `frames` record of `instruments`: only these, and of each only the joints named."""
         states = []
@@ -50,15 +52,29 @@ class Recorded:
                 given = frame.state.instruments[instrument.name]
                 joints = {joint: given.joints[joint] for joint in instrument.joints}
                 chosen[instrument.name] = InstrumentState(given.pose, joints)
-            states.append(State(chosen, frame.state.time))
+            states.append(State(chosen, frame.state.time, frame.state.tissue))
         names, splits = tuple(frame.name for frame in frames), tuple(frame.split for frame in frames)
-        return cls(names, splits, tuple(states), tuple(frame.camera for frame in frames), lens, scale, still)
+        cameras, named = tuple(frame.camera for frame in frames), tuple(tissue.name for tissue in tissues)
+        return cls(names, splits, tuple(states), cameras, lens, scale, still, named)
+
+    def over(self, tissue: str) -> Recorded:
+        """The training frames of one of several tissues."""
+        rows = [row for row, state in enumerate(self.states) if state.tissue == tissue]
+        names, splits = tuple(self.names[row] for row in rows), tuple(self.splits[row] for row in rows)
+        states, cameras = tuple(self.states[row] for row in rows), tuple(self.cameras[row] for row in rows)
+        return replace(self, names=names, splits=splits, states=states, cameras=cameras)
+
+    def by_tissue(self) -> tuple[Recorded, ...]:
+        """The training frames of each tissue; all of them where there is one."""
+        return tuple(self.over(tissue) for tissue in self.tissues) or (self,)
 
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
         """A state of the recording with joints that nobody recorded as they were found at the training frames beside
         it: nearest by pose, then by time."""
         if not any(item.unrecorded for item in instruments) or not self.states:
             return state
+        if self.tissues and state.tissue is not None and any(item.tissue != state.tissue for item in self.states):
+            return self.over(state.tissue).with_unrecorded(state, instruments)
         filled = dict(state.instruments)
         for item in instruments:
             if not item.unrecorded or item.name not in filled:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,10 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
         header["scale"] = recorded.scale
     if recorded.still:
         header["still"] = True
+    if recorded.tissues:
+        header["tissues"] = list(recorded.tissues)
+        for entry, state in zip(header["recorded"], recorded.states, strict=True):
+            entry["tissue"] = state.tissue
     header["deformation"] = plain(scene.settings)
     own_tensors, own_fields = scene.pack()
     tensors, header = tensors | own_tensors, header | own_fields
@@ -158,6 +163,9 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     """The instruments and the training frames. Raises ValueError for what cannot have been recorded."""
     instruments = tuple(_instrument(entry) for entry in header["instruments"])
     states, cameras = [], []
+    tissues = tuple(header.get("tissues", ()))
+    if len(set(tissues)) < len(tissues) or not all(isinstance(name, str) for name in tissues):
+        raise ValueError("its tissues are not names, each given once")
     for index, entry in enumerate(header["recorded"]):
         moved = {
             instrument.name: InstrumentState(
@@ -166,7 +174,7 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
             )
             for k, instrument in enumerate(instruments)
         }
-        states.append(State(moved, _number(entry["time"])))
+        states.append(State(moved, _number(entry["time"]), _one_of(entry["tissue"], tissues) if tissues else None))
         pose = _pose(tensors["recorded.cameras"][index], f"camera in frame {index}")
         cameras.append(_camera(pose, *map(_number, entry["intrinsics"])))
     names, splits = (tuple(entry[key] for entry in header["recorded"]) for key in ("name", "split"))
@@ -175,8 +183,14 @@ def _recording(tensors: dict[str, Tensor], header: dict[str, Any]) -> tuple[tupl
     if not 0 < scale <= 1:
         raise ValueError(f"its scale is {scale}, not a share of the images' size")
     still = header.get("still") is True
-    lit = share_lamps(cameras) if still else tuple(cameras)
-    return instruments, Recorded(names, splits, tuple(states), lit, lens, scale, still)
+    lit = share_lamps(cameras, states) if still else tuple(cameras)
+    return instruments, Recorded(names, splits, tuple(states), lit, lens, scale, still, tissues)
+
+
+def _one_of(name: Any, tissues: Sequence[str]) -> str:
+    if name not in tissues:
+        raise ValueError(f"a recorded frame shows {name!r}, which is none of its tissues")
+    return name
 
 
 def _described(instrument: Instrument) -> dict[str, Any]:

@@ -55,6 +55,7 @@ class Method:
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
     needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
     needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
+    learns_tissues: ClassVar[bool] = False  # several in one scene: it moves no tissue, so each Gaussian is of one
     has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; a drawing takes seconds
     large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
 

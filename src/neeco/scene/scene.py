@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any, cast
 
 import torch
@@ -17,7 +19,7 @@ from neeco.raster.devices import CachedPredicate
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
 from neeco.scene.articulation import Skeleton
-from neeco.scene.canonical import SH_COEFFICIENTS, CanonicalGaussians
+from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
 from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
 from neeco.scene.drawable import ArticulatedMotion, Drawable, Recorded
 from neeco.scene.method import Stored
@@ -70,7 +72,7 @@ class Scene(nn.Module):
         self.background = 0.0
         self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
-        self.register_buffer("center", center.float())  # [3] mm, middle of the tissue
+        self.register_buffer("center", center.float())  # [3] mm, middle of the tissue; [T, 3] of several
         self.registration = nn.Parameter(torch.zeros(7))
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
@@ -110,9 +112,11 @@ class Scene(nn.Module):
             {name.removeprefix(prefix): t for name, t in stored.tensors.items() if name.startswith(prefix)},
             _counts(header["counts"], len(stored.instruments)),
         )
-        scene = cls(
-            header["method"], canonical, deformation, stored.instruments, stored.recorded, canonical.means.new_zeros(3)
-        )
+        tissues = len(stored.recorded.tissues)
+        if tissues > 1 and not bool(torch.isin(canonical.extras[TISSUE], torch.arange(float(tissues))).all()):
+            raise ValueError("its Gaussians are of tissues that it does not name")
+        center = canonical.means.new_zeros((tissues, 3) if tissues > 1 else 3)
+        scene = cls(header["method"], canonical, deformation, stored.instruments, stored.recorded, center)
         scene.sh_degree = int(header["sh_degree"])
         if scene.sh_degree < 0 or (scene.sh_degree + 1) ** 2 - 1 > canonical.sh_rest.shape[1]:
             raise ValueError(f"sh_degree is {scene.sh_degree}, which does not fit its harmonics")
@@ -129,22 +133,48 @@ class Scene(nn.Module):
     def at(self, state: State, perturbation: Perturbation = UNPERTURBED) -> Gaussians:
         """Gaussians posed in `state`, float32. Gradients reach instrument poses that require them.
 
-        Raises NeecoError when the state lacks an instrument or joint that the scene has.
+        Those of other tissues than the state's have opacity 0. Raises NeecoError when the state lacks an instrument or
+        joint that the scene has, or names no tissue of it where there are several.
         """
-        canonical = self.canonical
+        canonical, shown = self.canonical, self._shown(state)
         posed = self.deformation.pose(canonical, self.registered(state), perturbation)
+        opacities = torch.sigmoid(canonical.opacity_logits)
         tissue, instruments = canonical.counts[0], len(canonical) - canonical.counts[0]
         falloff = torch.cat([self.falloff[:1].expand(tissue), self.falloff[1:].expand(instruments)])
         return Gaussians(
             means=posed.means,
             quats=posed.quats,
             scales=posed.scales,
-            opacities=torch.sigmoid(canonical.opacity_logits),
+            opacities=opacities if shown is None else opacities * shown,
             sh=canonical.spherical_harmonics(self.sh_degree),
             sh_frames=posed.sh_frames,
             headlight=Headlight(falloff, self.vignette, self._shadow()),
             background=canonical.means.new_full((3,), self.background) if self.background else None,
         )
+
+    def _shown(self, state: State) -> Tensor | None:
+        """[N] float, 0 for the Gaussians of other tissues than the state's; None: there is one. Raises NeecoError."""
+        names, canonical = self.recorded.tissues, self.canonical
+        if state.tissue not in (names or (None,)) and (len(names) > 1 or state.tissue is not None):
+            known = f"name one of {', '.join(names)}" if names else "it has one, without a name"
+            raise NeecoError(f"state: tissue: {state.tissue!r} is not in the scene; {known}")
+        if len(names) < 2:
+            return None
+        return (canonical.of_tissue(names.index(state.tissue)) | canonical.of_instruments).to(canonical.means.dtype)
+
+    def over(self, tissue: str) -> Scene:
+        """The scene of one of several tissues alone, with what was recorded over it."""
+        index = self.recorded.tissues.index(tissue)
+        chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
+        counts = (int(self.canonical.of_tissue(index).sum()), *self.canonical.counts[1:])
+        alone = copy.copy(self)
+        alone._buffers = dict(self._buffers)
+        if self.center.dim() > 1:
+            alone.center = self.center[index]
+        kept = self.canonical.map(lambda tensor: tensor[chosen], counts)
+        alone.canonical = replace(kept, extras={name: t for name, t in kept.extras.items() if name != TISSUE})
+        alone.recorded = replace(self.recorded.over(tissue), tissues=(tissue,))
+        return alone
 
     def visibility(self) -> Tensor:
         """[N, 12] how well the training frames observed each Gaussian (see `neeco.scene.visibility`). Measured at the
@@ -227,6 +257,15 @@ class Scene(nn.Module):
     def skeleton(self) -> Skeleton:
         """Pairs of keypoints' names that a line joins."""
         return self.deformation.skeleton()
+
+
+def one_tissue(scene: Drawable, asked_by: str) -> None:
+    """Raise NeecoError, in the words of the option or verb `asked_by`, for a scene of several tissues."""
+    if len(scene.recorded.tissues) > 1:
+        raise NeecoError(
+            f"{asked_by}: the scene has several tissues ({', '.join(scene.recorded.tissues)}), and this takes one; use "
+            "a run of a capture of one"
+        )
 
 
 def _counts(counts: list[int], instruments: int) -> tuple[int, ...]:

@@ -37,7 +37,7 @@ from neeco.synthesis.camera_effects import (
 )
 from neeco.synthesis.cameras import RECORDED_CAMERAS, DrawnCameras
 from neeco.synthesis.mixing import MixedSampler, Mixture
-from neeco.synthesis.samplers import Sampler, make_sampler
+from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
 from neeco.synthesis.settings import Settings
 from neeco.synthesis.writers.folder import Record, write_sample, write_skipped
 
@@ -118,7 +118,7 @@ class SampleGenerator:
 
     scene: Scene
     labeller: Labeller
-    sampler: Sampler | MixedSampler
+    sampler: Sampler | TissueSampler | MixedSampler
     acceptance: Acceptance
     settings: Settings
     effects: CameraEffects | None = None
@@ -131,7 +131,7 @@ class SampleGenerator:
         """What `settings` ask for: images of `scene`, or of its tissue under the instruments of `instrument_scenes`.
         Raises NeecoError where the scenes cannot give it."""
         cameras = DrawnCameras.of(settings, scene.recorded, scene.recorded.cameras)
-        sampler: Sampler | MixedSampler
+        sampler: Sampler | TissueSampler | MixedSampler
         groups: tuple[frozenset[str], ...] = ()
         gains: tuple[tuple[float, float, float], ...] = ()
         tissue = scene

@@ -27,9 +27,9 @@ from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
 from neeco.scene.deformations.base import Deformation
 from neeco.scene.drawable import Recorded
-from neeco.scene.scene import Scene
+from neeco.scene.scene import Scene, one_tissue
 from neeco.scene.visibility import VISIBILITY
-from neeco.synthesis.samplers import Sampler, make_sampler
+from neeco.synthesis.samplers import Sampler, TissueSampler, make_sampler
 
 if TYPE_CHECKING:
     from neeco.synthesis.settings import Settings
@@ -54,7 +54,13 @@ class Mixture:
 
     @classmethod
     def of(cls, tissue: Scene, instrument_scenes: Sequence[Scene]) -> Mixture:
-        """Raises NeecoError where a scene's instruments cannot be taken out of it, or two have the same name."""
+        """Instruments recorded over several tissues are placed as over the first. Raises NeecoError where a scene's
+        instruments cannot be taken out of it, or two have the same name."""
+        one_tissue(tissue, "--tissue")
+        instrument_scenes = [
+            scene.over(scene.recorded.tissues[0]) if len(scene.recorded.tissues) > 1 else scene
+            for scene in instrument_scenes
+        ]
         for scene in (tissue, *instrument_scenes):
             if not scene.deformation.separates_instruments or scene.method != tissue.method:
                 raise NeecoError(
@@ -144,7 +150,7 @@ class MixedSampler:
     scene draws."""
 
     mixture: Mixture
-    samplers: tuple[Sampler, ...]
+    samplers: tuple[Sampler | TissueSampler, ...]
     prescribed: bool = False
 
     def fixed(self, index: int) -> bool:

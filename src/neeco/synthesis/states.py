@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -90,7 +90,7 @@ def interpolate_state(first: State, second: State, weight: float) -> State:
         instruments[name] = InstrumentState(
             torch.from_numpy(interpolate_pose(to_numpy(a.pose), to_numpy(b.pose), weight)), joints
         )
-    return State(instruments, (1 - weight) * first.time + weight * second.time)
+    return State(instruments, (1 - weight) * first.time + weight * second.time, first.tissue)
 
 
 def joint_ranges(states: Sequence[State]) -> dict[tuple[str, str], JointRange]:
@@ -224,6 +224,8 @@ class PathStates:
     def __init__(self, keys: Sequence[State], count: int) -> None:
         if len(keys) < 2:
             raise NeecoError(f"--states path: {len(keys)} key state(s); a path needs at least two")
+        if len(tissues := {key.tissue or "" for key in keys}) > 1:
+            raise NeecoError(f"--states path: its states are over {' and '.join(sorted(tissues))}; a path is over one")
         self.keys, self.count = list(keys), count
 
     def __call__(self, index: int, rng: Generator) -> State:
@@ -253,7 +255,7 @@ def with_poses(state: State, moved: Callable[[str, np.ndarray], np.ndarray]) -> 
         name: InstrumentState(torch.from_numpy(moved(name, to_numpy(given.pose))), given.joints)
         for name, given in state.instruments.items()
     }
-    return State(instruments, state.time)
+    return replace(state, instruments=instruments)
 
 
 def with_joints(state: State, value: Callable[[str, str], float]) -> State:
@@ -262,4 +264,4 @@ def with_joints(state: State, value: Callable[[str, str], float]) -> State:
         name: InstrumentState(instrument.pose, {joint: value(name, joint) for joint in sorted(instrument.joints)})
         for name, instrument in state.instruments.items()
     }
-    return State(instruments, state.time)
+    return replace(state, instruments=instruments)

@@ -300,7 +300,9 @@ class StoredImages(Dataset[Sample]):
             self.keypoint_names,
         )
         state = State(
-            {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]}, record["time"]
+            {i["name"]: InstrumentState(i["pose"], i["joints"]) for i in record["instruments"]},
+            record["time"],
+            record.get("tissue"),
         )
         world_from_camera = torch.from_numpy(swap_camera_axes(np.array(record["camera"], np.float64)))
         place = Node(

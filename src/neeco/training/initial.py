@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from neeco.capture.images import has_alpha
-from neeco.capture.model import Capture, Frame, Instrument
+from neeco.capture.model import Capture, Frame, Instrument, PointCloud
 from neeco.errors import NeecoError
-from neeco.scene.canonical import neighbour_spacing, seed_gaussians
+from neeco.scene.canonical import TISSUE, CanonicalGaussians, neighbour_spacing, seed_gaussians
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.methods import make_deformation, method_class
 from neeco.scene.scene import Scene
@@ -89,22 +89,42 @@ def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConf
     background = next((frame.background for frame in frames if has_alpha(frame.image_path)), 0.0)
     instruments = tuple(_learned_instrument(item, frames, config, report) for item in capture.instruments)
     # at their recorded size, whatever is learned from
-    recorded = Recorded.of(capture.split("train"), instruments, capture.lens, config.scale, capture.still)
-    positions, colors = _thinned_points(capture, frames, config)
-    tissue = seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
+    recorded = Recorded.of(
+        capture.split("train"), instruments, capture.lens, config.scale, capture.still, capture.tissues
+    )
+    worlds = [tissue.points for tissue in capture.tissues] or [capture.points]
+    clouds = [_thinned_points(points, frames, config) for points in worlds]
+    tissue = _seed_tissue(clouds)
     deformation = make_deformation(config.method, instruments, config.deformation)
     deformation.fit_ranges(list(recorded.states), tissue.means)
-    center = torch.from_numpy(np.median(positions, 0))
+    centers = torch.from_numpy(np.stack([np.median(positions, 0) for positions, _ in clouds]))
+    center = centers if len(centers) > 1 else centers[0]
     tissue = tissue.with_extras(**deformation.initial_extras(tissue))
     scene = Scene(config.method, tissue, deformation, instruments, recorded, center)
     scene.background = background
     return scene
 
 
-def _thinned_points(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+def _seed_tissue(clouds: Sequence[tuple[np.ndarray, np.ndarray]]) -> CanonicalGaussians:
+    """The first Gaussians of the tissue, or of several in one body, from positions [P, 3] mm and colours [P, 3] of
+    each."""
+    seeded = [
+        seed_gaussians(torch.from_numpy(positions), torch.from_numpy(colors), neighbour_spacing(positions))
+        for positions, colors in clouds
+    ]
+    if len(seeded) == 1:
+        return seeded[0]
+    marked = [one.with_extras(**{TISSUE: one.means.new_full((len(one),), index)}) for index, one in enumerate(seeded)]
+    tensors = {name: torch.cat([one.tensors()[name] for one in marked]) for name in marked[0].tensors()}
+    return CanonicalGaussians.from_tensors(tensors, (sum(len(one) for one in marked),))
+
+
+def _thinned_points(
+    points: PointCloud, frames: tuple[Frame, ...], config: TrainConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions [P, 3] mm and colours [P, 3] of at most `config.initial_points` sparse points, and at most as many as
     the tissue may have Gaussians."""
-    positions, colors = capture.points.positions, capture.points.colors
+    positions, colors = points.positions, points.colors
     limit, _ = config.gaussian_limits(mean_pixels(frames))
     most = min(limit, config.initial_points or limit)
     if len(positions) > most:

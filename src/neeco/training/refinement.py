@@ -192,13 +192,15 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     numbers: dict[tuple[object, ...], int] = {}
     shown: list[int] = []
     times: list[float] = []
+    over: list[str | None] = []
     for frame in frames:
         poses = [frame.state.instruments[name].pose.double().numpy().tobytes() for name in instruments]
-        number = numbers.setdefault((frame.state.time, *poses), len(numbers))
+        number = numbers.setdefault((frame.state.tissue, frame.state.time, *poses), len(numbers))
+        over += [frame.state.tissue] if number == len(times) else []
         times += [frame.state.time] if number == len(times) else []
         shown.append(number)
-    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and abs(times[k] - t) < SMOOTH_S] or [i]
-            for i, t in enumerate(times)]  # fmt: skip
+    near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and over[k] == over[i]
+             and abs(times[k] - t) < SMOOTH_S] or [i] for i, t in enumerate(times)]  # fmt: skip
     return shown, near
 
 
@@ -220,11 +222,11 @@ def _velocities(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> Tens
     still."""
     count = len(frames)
     velocity = torch.zeros(count, len(instruments), 6)
-    order = sorted(range(count), key=lambda i: frames[i].state.time)
+    order = sorted(range(count), key=lambda i: (frames[i].state.tissue or "", frames[i].state.time))
     for place, index in enumerate(order):
         before, after = frames[order[max(place - 1, 0)]], frames[order[min(place + 1, count - 1)]]
         elapsed = after.state.time - before.state.time
-        if not 0 < elapsed < 0.5:
+        if not 0 < elapsed < 0.5 or before.state.tissue != after.state.tissue:
             continue
         for k, name in enumerate(instruments):
             earlier, later = before.state.instruments[name].pose.double(), after.state.instruments[name].pose.double()

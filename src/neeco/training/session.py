@@ -258,12 +258,25 @@ class GaussianSession(GaussianTraining):
                 self.resolution.threshold_at(progress, settings.threshold) if grows else math.inf,
                 self.generator,
                 config.density,
-                scene.deformation.prune_mask(scene.canonical, [camera for _, camera in self.given]),
+                self._unsupported(),
             )
             self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
             self.watch_gradients()
         if settings.opacity_reset and self._due(settings.opacity_reset) and progress < config.growth_stop:
             reset_opacity(scene.canonical, self.adam, config.density.reset_opacity)
+
+    def _unsupported(self) -> Tensor | None:
+        """[N] bool: what the method prunes whatever its opacity, of each tissue by the cameras that see it; None:
+        nothing."""
+        canonical, names = self.scene.canonical, self.scene.recorded.tissues
+        found: Tensor | None = None
+        for index, name in enumerate(names or (None,)):
+            cameras = [camera for state, camera in self.given if state.tissue == name]
+            mask = self.scene.deformation.prune_mask(canonical, cameras)
+            if mask is not None and len(names) > 1:
+                mask = mask & canonical.of_tissue(index)
+            found = mask if found is None or mask is None else found | mask
+        return found
 
     def _due(self, interval: int) -> bool:
         """Whether this step reached a multiple of `interval` iterations."""
@@ -314,8 +327,11 @@ def new_session(
 ) -> GaussianSession:
     """A session at iteration 0, on the device of the views; `start` it before the first step."""
     generator = torch.Generator(views.device).manual_seed(config.seed)
-    center = scene.center.cpu()
-    distances = [float((frame.camera.world_from_camera[:3, 3].float() - center).norm()) for frame in views.frames]
+    centers, tissues = scene.center.cpu().view(-1, 3), scene.recorded.tissues
+    distances = []
+    for frame in views.frames:
+        center = centers[tissues.index(frame.state.tissue) if len(centers) > 1 else 0]
+        distances.append(float((frame.camera.world_from_camera[:3, 3].float() - center).norm()))
     extent = 0.5 * float(np.median(distances))
     return GaussianSession(scene, config.length, generator, views, report, config.batch_size, config, extent)
 

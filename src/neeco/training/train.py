@@ -175,7 +175,18 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
         raise NeecoError(
             f"{path}: instruments: no states are recorded; method {config.method} needs them, 3dgs does not"
         )
-    if unmet_need(config.method, capture):
+    if len(capture.tissues) > 1:
+        names = ", ".join(tissue.name for tissue in capture.tissues)
+        if not method_class(config.method).learns_tissues:
+            raise NeecoError(
+                f"{path}: tissues: there are several ({names}); method {config.method} learns one, kinematic several"
+            )
+        if config.refine.registration:
+            raise NeecoError(
+                f"{path}: tissues: there are several ({names}), each in a world of its own; one registration cannot be "
+                "refined for all: leave out refine.registration"
+            )
+    elif unmet_need(config.method, capture):
         raise NeecoError(
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "
             "each frame its `time` in seconds), 3dgs does not"

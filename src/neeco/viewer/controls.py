@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,7 +72,7 @@ def controlled_state(states: Sequence[State], shafts: Mapping[str, Shaft], contr
         name: _moved(recorded, shafts[name], controls.instruments[name]) if name in controls.instruments else recorded
         for name, recorded in state.instruments.items()
     }
-    return State(moved, state.time)
+    return replace(state, instruments=moved)
 
 
 def interpolated_state(states: Sequence[State], frame: float) -> State:
@@ -88,7 +88,7 @@ def interpolated_state(states: Sequence[State], frame: float) -> State:
         pose = interpolate_pose(to_numpy(one.pose), to_numpy(two.pose), share)
         joints = {joint: (1 - share) * value + share * two.joints[joint] for joint, value in one.joints.items()}
         moved[name] = InstrumentState(torch.from_numpy(pose), joints)
-    return State(moved, (1 - share) * start.time + share * end.time)
+    return State(moved, (1 - share) * start.time + share * end.time, start.tissue)
 
 
 def corresponding_frame(frame: float, frames: int, others: int) -> float:

@@ -102,6 +102,7 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
     method = "kinematic"
     Settings = KinematicSettings
     separates_instruments = True
+    learns_tissues = True
     training_defaults: ClassVar[Mapping[str, Any]] = {
         **PLAIN_TRAINING,
         "schedule.sh_interval": 500,
@@ -277,7 +278,8 @@ class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
             training.scene.diagnostics["breathing"] |= self.breathing.describe(training.scene.recorded.cameras)
         if self.settings.extrapolate_tissue:
             scene = training.scene
-            scene.canonical = extrapolate_tissue(scene.canonical, scene.recorded.cameras)
+            for index, recorded in enumerate(scene.recorded.by_tissue()):
+                scene.canonical = extrapolate_tissue(scene.canonical, recorded.cameras, index)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         scale = self.settings.rate_scale * floored_decay(progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -118,7 +119,9 @@ def _shaft(session: GaussianSession, evidence: Evidence, name: str) -> CarvedSha
     shape = carve(evidence, name, generator, search)
     if shape is None:
         return None
-    poses = [frame.state.instruments[name].pose.double().cpu() for frame in session.views.frames]
+    most, _ = Counter(frame.state.tissue for frame in session.views.frames).most_common(1)[0]  # a trocar of one world
+    frames = [frame for frame in session.views.frames if frame.state.tissue == most]
+    poses = [frame.state.instruments[name].pose.double().cpu() for frame in frames]
     line = trocar_line(torch.stack(poses).numpy())
     base = shape.instrument_from_shaft
     if line is not None and line.clear:

@@ -151,6 +151,9 @@ def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue
     """`tissue`, a fit of still tissue, or where that breathes one that was fitted anew with its breathing, with which
     `breathes` begins then."""
     scene, views, config = session.scene, session.views, session.config
+    if len(scene.recorded.tissues) > 1:
+        session.report("several tissues: none of them is taken to breathe")
+        return tissue
     begun = find_breathing(tissue, views)
     if begun is None:
         return tissue
@@ -198,7 +201,8 @@ def fit_tissue(
     deformation = Static()
     if breathing is not None:
         deformation.start_breathing(breathing)
-    tissue = Scene(Static.method, canonical, deformation, (), Recorded(), scene.center)
+    recorded = Recorded(tissues=scene.recorded.tissues)
+    tissue = Scene(Static.method, canonical, deformation, (), recorded, scene.center)
     tissue.background = scene.background  # or the background of transparent images would be evidence
     short = replace(
         config,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -134,7 +135,7 @@ def _moving_weight(
 def _with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
     given = state.instruments[instrument]
     changed = InstrumentState(given.pose, {**given.joints, joint: reading})
-    return State({**state.instruments, instrument: changed}, state.time)
+    return replace(state, instruments={**state.instruments, instrument: changed})
 
 
 def drop_occluded(scene: Scene) -> CanonicalGaussians:

@@ -1,0 +1,106 @@
+"""Several tissues in one capture: one instrument is learned from all of them, and each is drawn alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from capture_files import write_tissues
+
+from neeco.capture.check import check_capture, read_checked
+from neeco.errors import NeecoError
+from neeco.evaluation.evaluate import evaluate_run
+from neeco.raster import rasterize
+from neeco.scene.canonical import TISSUE
+from neeco.scene.io import load_scene
+from neeco.synthesis.dataset import synthesize
+from neeco.synthesis.settings import Settings
+from neeco.training.config import training_config
+from neeco.training.run import load_run
+from neeco.training.train import ProgressRow, train
+
+# everything that a long run does happens within 60 iterations
+EARLY = [
+    "density_start=10", "schedule.plain_density.interval=15", "refine.start=8", "deformation.shaft_roll_start=5",
+    "search.tissue_steps=100", "log_interval=1", "deformation.hinge_start=12", "deformation.shadow_at=[10]",
+    "deformation.label_sharpness_start=14",
+]  # fmt: skip
+CONFIG = training_config("kinematic", {"iterations": 60}, EARLY)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tissues(tmp_path_factory.mktemp("tissues") / "capture")
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path) -> Path:
+    torch.set_num_threads(1)
+    return train(capture, capture.parent / "run", CONFIG)
+
+
+def test_an_interrupted_run_over_two_tissues_ends_in_the_same_bytes(run: Path, capture: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == 23 and not row.note:  # after the hinges began to move and density control acted
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match="at iteration 23"):
+        train(capture, tmp_path / "cut", CONFIG, progress=interrupt)
+    cut = train(capture, tmp_path / "cut", CONFIG, resume=True)
+    assert (cut / "scene.safetensors").read_bytes() == (run / "scene.safetensors").read_bytes()
+
+
+def test_every_frame_is_drawn_over_its_own_tissue(run: Path, capture: Path) -> None:
+    """The walls differ in tint, and each tint is of one tissue's Gaussians alone."""
+    scene = load_scene(run / "scene.safetensors")
+    assert scene.recorded.tissues == ("red", "green")
+    assert scene.canonical.extras[TISSUE].unique().tolist() == [0, 1]
+    for tissue, strong, weak in (("red", 0, 1), ("green", 1, 0)):
+        frame = next(frame for frame in read_checked(capture).split("test") if frame.state.tissue == tissue)
+        drawn, recorded = rasterize(scene.at(frame.state), frame.camera).color, frame.load_image()
+        assert drawn[..., strong].mean() > 1.2 * drawn[..., weak].mean()
+        assert float((drawn - recorded).square().mean()) < 0.02
+        alone = scene.over(tissue)
+        torch.testing.assert_close(rasterize(alone.at(frame.state), frame.camera).color, drawn, rtol=0, atol=1e-5)
+        assert alone.num_gaussians < scene.num_gaussians
+
+
+def test_a_run_over_two_tissues_is_scored_and_draws_data_sets_over_both(
+    run: Path, capture: Path, tmp_path: Path
+) -> None:
+    numbers = evaluate_run(load_run(run), read_checked(capture))["given"]["test"]
+    assert numbers["frames"] == 8
+    assert numbers["psnr"] > 15
+    synthesize(load_run(run), tmp_path / "set", Settings(4, min_share=1e-4, tissue_check=False, max_unobserved=1.0))
+    lines = [json.loads(line) for line in (tmp_path / "set" / "states.jsonl").read_text().splitlines()]
+    assert [line["tissue"] for line in lines] == ["red", "green", "red", "green"]
+
+
+def test_a_state_must_name_one_of_the_tissues(run: Path) -> None:
+    scene = load_scene(run / "scene.safetensors")
+    state = scene.recorded.states[0]
+    for tissue in (None, "blue"):
+        with pytest.raises(NeecoError, match=r"state: tissue: .* is not in the scene; name one of red, green"):
+            scene.at(type(state)(state.instruments, state.time, tissue))
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "message"),
+    [
+        ("neeco", [], "tissues: there are several .* method neeco learns one"),
+        ("kinematic", ["refine.registration=true"], "one registration cannot be refined"),
+    ],
+)
+def test_what_takes_one_tissue_says_so(
+    method: str, changes: list[str], message: str, capture: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(NeecoError, match=message):
+        train(capture, tmp_path / "run", training_config(method, {"iterations": 5}, changes))
+
+
+def test_a_capture_of_two_tissues_has_no_problems(capture: Path) -> None:
+    assert [str(problem) for problem in check_capture(capture) if problem.severity == "error"] == []
