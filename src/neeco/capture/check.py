@@ -150,7 +150,7 @@ def _check_frames(parsed: Parsed) -> None:
     _check_tissues(parsed)
     if not counts["test"]:
         frames.warning("split 'test' is empty", "without it nothing tells how good the scene is")
-    latest: dict[str, float] = {}
+    latest: dict[tuple[str, str | None], float] = {}
     back = []
     instants: dict[tuple[object, ...], Camera] = {}
     for frame, place in zip(parsed.frames, parsed.places, strict=True):
@@ -158,9 +158,9 @@ def _check_frames(parsed: Parsed) -> None:
         seen_by = instants.setdefault((place.file, time, *poses), frame.camera)
         if seen_by is not frame.camera and not _same_view(seen_by, frame.camera):
             continue  # another camera saw the instant
-        if time < latest.get(place.file, time):
+        if time < latest.get((place.file, frame.state.tissue), time):
             back.append(place)
-        latest[place.file] = time
+        latest[place.file, frame.state.tissue] = time
     if not parsed.timed:
         frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
     elif back:

@@ -256,11 +256,13 @@ class Parsed:
     lens: Lens | None = None  # through which it was recorded
     still: bool = False  # its cameras stood still
     tissues: list[ParsedTissue] = field(default_factory=list)
+    over: str | None = None  # which of several tissues all of it is of
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
 
     def header(self, field: str) -> Node:
         """The place `field` of the file that describes the first frame."""
+        field = field if self.over is None else f"{field} over {key_name(self.over)}"
         return Node(None, self.places[0].file, field, self.places[0].report)
 
     def with_cameras(self) -> Parsed:
@@ -278,7 +280,7 @@ class Parsed:
             rows = [row for row, frame in enumerate(self.frames) if frame.state.tissue == tissue.name]
             without = {index for index, row in enumerate(rows) if row in self.without_camera}
             frames, places = [self.frames[row] for row in rows], [self.places[row] for row in rows]
-            part = replace(self, frames=frames, places=places, without_camera=without, tissues=[])
+            part = replace(self, frames=frames, places=places, without_camera=without, tissues=[], over=tissue.name)
             parts += [replace(part, points=tissue.points, points_place=tissue.place)] if rows else []
         return parts
 

@@ -165,6 +165,12 @@ class Capture:
         """The frames of one split, in recorded order."""
         return tuple(frame for frame in self.frames if frame.split == name)
 
+    def over(self, tissue: str) -> Capture:
+        """What was recorded over one of several tissues, as a capture of one."""
+        frames = tuple(frame for frame in self.frames if frame.state.tissue == tissue)
+        points = next(item.points for item in self.tissues if item.name == tissue)
+        return replace(self, frames=frames, points=points, tissues=())
+
     @property
     def splits(self) -> tuple[str, ...]:
         """Names of the splits present, in order of first appearance."""

@@ -32,7 +32,8 @@ def write_capture(
     images: Sequence[Tensor | np.ndarray] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a capture folder: images/, masks/, sparse.ply (or one of each tissue) and, last, transforms.json; every file whole or not at all.
+    """Write a capture folder: images/, masks/, sparse.ply (one for each of several tissues) and, last, transforms.json;
+    every file whole or not at all.
 
     Images and masks are copied bit by bit (transparent images are flattened on their background); poses read back
     exactly. Random points are not written. `images`: the pixels of every frame, [H, W, 3] in [0, 1] or uint8,

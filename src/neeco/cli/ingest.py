@@ -168,7 +168,8 @@ def recordings_of(args: Ingest) -> list[Recording]:
 def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> int:
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
-    from neeco.ingest.pipeline import ingest
+    from neeco.errors import NeecoError
+    from neeco.ingest.pipeline import ingest, ingest_tissues
     from neeco.report.ingest_page import write_ingest_page
     from neeco.report.rerun_log import require_rerun, write_rrd
 
@@ -189,30 +190,51 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
         problems: list[Problem] = []
 
         def complete(result: IngestResult, folder: Path) -> None:
+            complete_tissues({"": result}, folder)
+
+        def complete_tissues(results: dict[str, IngestResult], folder: Path) -> None:
             report("writing the page", 0, 0)
             checked = inspect_capture(folder)
             problems.extend(checked.problems)
             capture = checked.capture or read_capture(folder)
-            write_ingest_page(result, folder / PAGE, capture)
-            if rrd is not None:
-                report("writing for rerun", 0, 0)
-                write_rrd(result, capture, rrd)
+            for tissue, result in results.items():
+                own = capture.over(tissue) if tissue else capture
+                write_ingest_page(result, folder / page_of(tissue), own)
+                if rrd is not None:
+                    report("writing for rerun", 0, 0)
+                    write_rrd(result, own, rrd)
 
         try:
-            result = ingest(recordings, output, report, complete)
+            if any(recording.tissue for recording in recordings):
+                if rrd is not None:
+                    raise NeecoError("--rrd: shows one tissue, and the recordings name theirs; leave it out")
+                results = ingest_tissues(recordings, output, report, complete_tissues)
+            else:
+                results = {"": ingest(recordings, output, report, complete)}
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
     if as_json:
-        print(json.dumps(result.as_json(), indent=2))
+        numbers = {tissue: result.as_json() for tissue, result in results.items()}
+        print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2))
         return 0
-    print_result(result)
+    for tissue, result in results.items():
+        if tissue:
+            print(f"tissue {tissue}:")
+        print_result(result)
     for problem in errors_only(problems):
         print(f"wrong: {problem}")
     print(f"capture: {output}  ({len(problems)} remarks by `neeco check`)")
-    print(f"how good it is: {output / PAGE}")
+    print(f"how good it is: {', '.join(str(output / page_of(tissue)) for tissue in results)}")
     if rrd is not None:
         print(f"to scrub through: rerun {rrd}")
     return 0
+
+
+def page_of(tissue: str) -> str:
+    """The file of the page about one of several tissues; of the only one where it has no name."""
+    from neeco.ingest.episodes import file_name
+
+    return f"{Path(PAGE).stem}_{file_name(tissue)}.html" if tissue else PAGE
 
 
 def print_result(result: IngestResult) -> None:

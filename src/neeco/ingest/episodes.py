@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.basefile import same_base
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.logs import PoseLog, ReadingLog
-from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
+from neeco.ingest.recording import EACH, MIN_FRAMES, IngestSettings, InstrumentLogs, Recording, Splits
 from neeco.ingest.registration import GIVEN, ClockOffset
 from neeco.ingest.sfm import StageProgress
 from neeco.ingest.still import same_place
@@ -27,6 +27,7 @@ from neeco.ingest.synchronized import States, SynchronizedRecording
 
 PAUSE_S = 2.0  # longer than anything that is smooth in time looks beyond an instant
 SAME_PLACE = 0.4  # of the features of one episode's background in place in another's: less is elsewhere
+NAME_TISSUES = "say in every recording over which `tissue` it was taken"
 MOSTLY_ALIKE = 0.7  # less is worth a note
 Log = TypeVar("Log", PoseLog, ReadingLog)
 
@@ -37,11 +38,13 @@ class Episodes:
     Raises NeecoError for recordings that cannot be used, or that cannot be of one capture.
     """
 
-    def __init__(self, recordings: Sequence[Recording], progress: StageProgress) -> None:
+    def __init__(self, recordings: Sequence[Recording], progress: StageProgress, tissue: str | None = None) -> None:
+        self.tissue = tissue  # of several that one capture holds, the one that these were taken over
         self.parts = [SynchronizedRecording(recording, progress) for recording in recordings]
         self.recording = recordings[0]  # what is said once for all: lens, links, frames, splits, settings
         self.names = episode_names(recordings)
-        self._check_alike()
+        check_alike(self.parts)
+        self._check_split_names()
         times: list[np.ndarray] = []
         starts: list[float] = []
         first = [0]
@@ -88,10 +91,11 @@ class Episodes:
     def frame_name(self, frame: int) -> str:
         """What the image of a frame is called in the capture: of several episodes, it begins with the episode's
         name."""
+        of = "" if self.tissue is None else file_name(self.tissue) + "_"
         if self.single:
-            return f"{frame:06d}"
+            return f"{of}{frame:06d}"
         episode = int(self.episode_of(np.array([frame]))[0])
-        return f"{self.names[episode]}_{frame - self.first[episode]:06d}"
+        return f"{of}{self.names[episode]}_{frame - self.first[episode]:06d}"
 
     def refuse_alone(self, placed: np.ndarray) -> None:
         """Raise NeecoError for an episode that structure from motion did not join to the others. placed [M]: the frames
@@ -101,8 +105,8 @@ class Episodes:
             if count < MIN_FRAMES and not self.single:
                 raise NeecoError(
                     f"{part.recording.path}: {name} stands alone: {count} of its frames show enough of what the other "
-                    f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); ingest it "
-                    "alone, or leave it out"
+                    f"recordings show to find their cameras together (at least {MIN_FRAMES} are needed); where it "
+                    f"shows another tissue, {NAME_TISSUES}, else leave it out"
                 )
 
     def refuse_elsewhere(self, backgrounds: Sequence[np.ndarray], episodes: Sequence[int]) -> None:
@@ -114,8 +118,8 @@ class Episodes:
             if share is not None and share < SAME_PLACE:
                 raise NeecoError(
                     f"{part.recording.path}: {self.names[episode]} shows another place than {first}: {share:.0%} of "
-                    "the background is where it was; one capture has one tissue: ingest it alone, and mix the scenes "
-                    "(`neeco synthesize --tissue`)"
+                    f"the background is where it was; where that is another tissue, or the scope stands elsewhere, "
+                    f"{NAME_TISSUES}"
                 )
             if share is not None and share < MOSTLY_ALIKE:
                 self.note(
@@ -263,40 +267,9 @@ class Episodes:
             rows = np.flatnonzero(of == episode)
             yield self.parts[episode], rows, times[rows] - self.starts[episode]
 
-    def _check_alike(self) -> None:
-        """Raise NeecoError for what one capture cannot hold together."""
-        first = self.recording
-        lens, where = first.read_lens()
-        for part in self.parts[1:]:
-            other = part.recording
-
-            def refuse(what: str, path: object = other.path) -> NeecoError:
-                return NeecoError(
-                    f"{path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest "
-                    "it alone"
-                )
-
-            size, own = part.video.size, self.parts[0].video.size
-            if size != own:
-                raise refuse(f"images: are {size[0]}x{size[1]}, not {own[0]}x{own[1]} as")
-            if other.read_lens()[0] != lens:
-                raise refuse(f"intrinsics: are others than {where} gives")
-            for key in ("camera", "laparoscope", "stereo"):
-                mine, theirs = getattr(other, key), getattr(first, key)
-                if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
-                    raise refuse(f"{key}: is not as")
-            names = [item.name for item in other.instruments]
-            if names != [item.name for item in first.instruments]:
-                raise refuse(f"instruments: {', '.join(names) or 'none'} are not those")
-            for mine, theirs in zip(other.instruments, first.instruments, strict=True):
-                if fault := _unlike(mine, theirs):
-                    raise refuse(f"instruments: {mine.name}: {fault} not as")
-                if mine.poses is not None and part.poses[mine.name].frame != self.parts[0].poses[mine.name].frame:
-                    raise refuse(f"instruments: {mine.name}: poses are in another frame than")
-            for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
-                if getattr(other, key) not in (default, getattr(first, key)):
-                    raise refuse(f"{key}: says another than")
-        known = set(self.names)
+    def _check_split_names(self) -> None:
+        """Raise NeecoError for splits that name what is no episode."""
+        first, known = self.recording, set(self.names)
         for episode in first.splits.test_episodes + first.splits.unseen_episodes if first.splits else ():
             if self.single or episode not in known:
                 listed = "one recording has none" if self.single else f"they are {', '.join(self.names)}"
@@ -306,6 +279,88 @@ class Episodes:
                 f"{first.path}: splits: test and unseen count one video's frames, and there are {len(self.parts)} "
                 "recordings; name test_episodes and unseen_episodes"
             )
+
+
+def check_alike(parts: Sequence[SynchronizedRecording], worlds: bool = False) -> None:
+    """Raise NeecoError for recordings that one capture cannot hold together. worlds: each is of a world of its own."""
+    first = parts[0].recording
+    lens, where = first.read_lens()
+    for part in parts[1:]:
+        other = part.recording
+
+        def refuse(what: str, path: object = other.path) -> NeecoError:
+            return NeecoError(
+                f"{path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest "
+                "it alone"
+            )
+
+        size, own = part.video.size, parts[0].video.size
+        if size != own:
+            raise refuse(f"images: are {size[0]}x{size[1]}, not {own[0]}x{own[1]} as")
+        if other.read_lens()[0] != lens:
+            raise refuse(f"intrinsics: are others than {where} gives")
+        for key in ("camera", "laparoscope", "stereo"):
+            mine, theirs = getattr(other, key), getattr(first, key)
+            if (mine is None) != (theirs is None) or (key == "camera" and mine != theirs):
+                raise refuse(f"{key}: is not as")
+        names = [item.name for item in other.instruments]
+        if names != [item.name for item in first.instruments]:
+            raise refuse(f"instruments: {', '.join(names) or 'none'} are not those")
+        for mine, theirs in zip(other.instruments, first.instruments, strict=True):
+            if fault := _unlike(mine, theirs, worlds):
+                raise refuse(f"instruments: {mine.name}: {fault} not as")
+            if mine.poses is not None and part.poses[mine.name].frame != parts[0].poses[mine.name].frame:
+                raise refuse(f"instruments: {mine.name}: poses are in another frame than")
+        for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
+            if getattr(other, key) not in (default, getattr(first, key)):
+                raise refuse(f"{key}: says another than")
+
+
+def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recording]]:
+    """The recordings of every tissue, by its name; all under None where none names one. What the first says for all
+    (splits, frames, settings) is said in each. Raises NeecoError."""
+    if not any(recording.tissue for recording in recordings):
+        return {None: list(recordings)}
+    named = [replace(item, episode=name) for item, name in zip(recordings, episode_names(recordings), strict=True)]
+    worlds: dict[str | None, list[Recording]] = {}
+    for item in named:
+        if item.tissue is None:
+            others = ", ".join(dict.fromkeys(other.tissue for other in named if other.tissue))
+            raise NeecoError(f"{item.path}: tissue: is missing, where other recordings name theirs: {others}; name it")
+        worlds.setdefault(item.episode if item.tissue == EACH else item.tissue, []).append(item)
+    if len({file_name(tissue or "") for tissue in worlds}) < len(worlds):
+        raise NeecoError(
+            f"{named[0].path}: tissue: two of {', '.join(map(str, worlds))} make one file's name; rename one"
+        )
+    first = named[0]
+    for tissue, own in worlds.items():
+        splits = first.splits and _splits_of(first.splits, named, own, str(tissue))
+        worlds[tissue] = [replace(own[0], splits=splits, frames=first.frames, settings=first.settings), *own[1:]]
+    return worlds
+
+
+def _splits_of(splits: Splits, named: Sequence[Recording], own: Sequence[Recording], tissue: str) -> Splits:
+    """What the splits of all mean for the recordings of one tissue. Raises NeecoError."""
+    names, known = [item.episode for item in own], {item.episode for item in named}
+    tested, unseen = splits.test_episodes, splits.unseen_episodes
+    for episode in tested + unseen:
+        if episode not in known:
+            listed = ", ".join(item.episode for item in named)
+            raise NeecoError(f"{named[0].path}: splits: no episode is called {episode!r}; they are {listed}")
+    if splits.test or splits.unseen:
+        raise NeecoError(
+            f"{named[0].path}: splits: test and unseen count one video's frames, and there are {len(named)} "
+            "recordings; name test_episodes and unseen_episodes"
+        )
+    if set(names) <= set(tested + unseen):
+        raise NeecoError(f"{named[0].path}: splits: leave no recording of the tissue {tissue} to train on; change them")
+    found = replace(
+        splits,
+        test_episodes=tuple(name for name in tested if name in names),
+        unseen_episodes=tuple(name for name in unseen if name in names),
+    )
+    found = replace(found, test_every=0) if tested and not found.test_episodes else found
+    return replace(found, unseen_fraction=0.0) if unseen and not found.unseen_episodes else found
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -361,7 +416,7 @@ def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     names: list[str] = []
     for recording in recordings:
         of_file = recording.path.stem if len(stems) > 1 else recording.path.resolve().parent.name
-        name = re.sub(r"[^A-Za-z0-9.-]+", "_", recording.episode or of_file).strip("_.") or "recording"
+        name = file_name(recording.episode or of_file) or "recording"
         number = 2
         while name in names:
             name, number = f"{name.removesuffix(f'_{number - 1}')}_{number}", number + 1
@@ -369,8 +424,14 @@ def episode_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
-    """In what an instrument differs from that of another recording; None: in nothing that a capture states once."""
+def file_name(text: str) -> str:
+    """As files of a capture may be called."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("_.")
+
+
+def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs, worlds: bool) -> str | None:
+    """In what an instrument differs from that of another recording; None: in nothing that a capture states once, or
+    `worlds`, each once."""
     if (mine.poses is None) != (theirs.poses is None):
         return "poses are"
     limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
@@ -380,7 +441,7 @@ def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs) -> str | None:
         return "limits of its joints are"
     if mine.kinematics != theirs.kinematics:
         return "kinematics are"
-    if not same_base(mine.base, theirs.base):
+    if not worlds and not same_base(mine.base, theirs.base):
         return "the place of its base is"
     return None
 

@@ -107,10 +107,12 @@ def assign_splits(
     joints: dict[str, np.ndarray],
     rule: Splits,
     episodes: Mapping[str, tuple[int, int]] | None = None,
+    everywhere: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, str]:
     """Splits [N] (LEFT_OUT: too close to an unseen frame to train on) of video frames [N] (their numbers), and the rule
     in words. poses [N, 4, 4] of the instrument and readings [N] rad per joint: what unseen frames are chosen by;
-    episodes: the frames (first, last) of each, where there are several."""
+    episodes: the frames (first, last) of each, where there are several; everywhere: where there are several tissues, the
+    readings over all of them: what is unseen of a joint is so over all."""
     episodes = episodes or {}
     whole = rule.test_episodes
     if episodes and not (whole or rule.test or rule.test_every is not None):
@@ -136,7 +138,7 @@ def assign_splits(
         return splits, f"{words}; unseen: video frames {_ranges(rule.unseen)}"
     if rule.unseen_fraction == 0:
         return splits, f"{words}; unseen: none"
-    unseen, why = _extremes(poses, joints, rule.unseen_fraction, rule.unseen_by)
+    unseen, why = _extremes(poses, joints, everywhere or joints, rule.unseen_fraction, rule.unseen_by)
     if not unseen.any():
         return splits, f"{words}; unseen: none, as nothing moves"
     splits[unseen] = "unseen"
@@ -158,15 +160,19 @@ def _ranges(ranges: tuple[tuple[int, int], ...]) -> str:
 
 
 def _extremes(
-    poses: np.ndarray, joints: dict[str, np.ndarray], fraction: float, by: str | None
+    poses: np.ndarray,
+    joints: dict[str, np.ndarray],
+    everywhere: Mapping[str, np.ndarray],
+    fraction: float,
+    by: str | None,
 ) -> tuple[np.ndarray, str]:
     """The far end of one joint, of the instrument's turn from its mean direction, or half of each."""
-    moving = [name for name, values in joints.items() if np.ptp(values) > MIN_RANGE]
+    moving = [name for name, values in everywhere.items() if np.ptp(values) > MIN_RANGE]
     joint = by or (moving[0] if moving else None)
     share = fraction if by or joint is None else fraction / 2
     unseen, words = np.zeros(len(poses), dtype=bool), []
     if joint is not None:
-        limit = float(np.quantile(joints[joint], 1 - share))
+        limit = float(np.quantile(everywhere[joint], 1 - share))
         unseen |= joints[joint] > limit
         words.append(f"{joint} above {np.degrees(limit):.0f} deg")
     if by is None:

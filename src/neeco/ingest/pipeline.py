@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +13,14 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Border, Lens
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, Tissue, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
 from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
-from neeco.ingest.episodes import Episodes, separate
+from neeco.ingest.episodes import Episodes, by_tissue, check_alike, separate
 from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
@@ -47,18 +47,96 @@ def ingest(
     NeecoError for unusable input: file, row or key, and what to do.
     """
     recordings = separate([recording] if isinstance(recording, Recording) else recording)
+    named = [recording for recording in recordings if recording.tissue is not None]
+    if named:
+        raise NeecoError(f"{named[0].path}: tissue: {named[0].tissue} is named; `ingest_tissues` makes such a capture")
     with staged(output) as folder:
-        result = _Ingest(recordings, folder, progress).run(output)
+        one = _Ingest(recordings, folder, progress)
+        capture, result = one.finish(output, one.place())
+        write_capture(capture, folder / "capture")
         complete(result, folder / "capture")
         return result
+
+
+def ingest_tissues(
+    recordings: Sequence[Recording],
+    output: Path,
+    progress: StageProgress,
+    complete: Callable[[dict[str, IngestResult], Path], None] = lambda results, folder: None,
+) -> dict[str, IngestResult]:
+    """As `ingest`, of recordings that name their tissues: each tissue gets a world of its own, found from its own
+    recordings; what was found of each, by its name."""
+    worlds = by_tissue(separate(recordings))
+    with staged(output) as folder:
+        parts = {}
+        for number, (tissue, own) in enumerate(worlds.items()):
+            (folder / f"world_{number}").mkdir()
+            parts[str(tissue)] = _Ingest(own, folder / f"world_{number}", progress, str(tissue))
+        check_alike([part for one in parts.values() for part in one.data.parts], worlds=True)
+        placed = {tissue: one.place() for tissue, one in parts.items()}
+        readings = _joined_readings(list(placed.values()))
+        found = {tissue: one.finish(output, placed[tissue], readings) for tissue, one in parts.items()}
+        write_capture(_joined({tissue: capture for tissue, (capture, _) in found.items()}), folder / "capture")
+        results = {tissue: result for tissue, (_, result) in found.items()}
+        complete(results, folder / "capture")
+        return results
+
+
+def _joined(captures: dict[str, Capture]) -> Capture:
+    """One capture of several tissues, from that of each. Raises NeecoError for what it can only state once."""
+    parts = list(captures.values())
+    frames = tuple(
+        replace(frame, state=replace(frame.state, tissue=tissue))
+        for tissue, capture in captures.items()
+        for frame in capture.frames
+    )
+    for tissue, capture in captures.items():
+        for what, one, first in (
+            ("registered", capture.registered, parts[0].registered),
+            ("of a scope that stands still", capture.still, parts[0].still),
+        ):
+            if one != first:
+                word = "is" if one else "is not"
+                raise NeecoError(
+                    f"tissue: {tissue} {word} {what}, unlike {next(iter(captures))}; one capture has the same of all: "
+                    "ingest it alone"
+                )
+    lens = parts[0].lens if all(capture.lens == parts[0].lens for capture in parts) else None  # each was estimated
+    tissues = tuple(Tissue(tissue, capture.points) for tissue, capture in captures.items())
+    return replace(parts[0], frames=frames, points=PointCloud(measured=False), lens=lens, tissues=tissues)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """What is known of one world before its frames are split: cameras, and states [M] at their times."""
+
+    sfm: SfmResult
+    pinhole: Lens
+    registration: Registration | None
+    shapes: dict[str, RoughShape]
+    states: States
+    usable: np.ndarray  # [M] bool
+    right: RightCamera | None = None
+    tissue: str | None = None  # how a still scope's tissue got its depth
+
+
+def _joined_readings(placed: Sequence[_Placed]) -> dict[str, dict[str, np.ndarray]]:
+    """By instrument and joint, what was read over all tissues."""
+    names = {name: list(joints) for name, (_, joints) in placed[0].states.items()}
+    return {
+        name: {joint: np.concatenate([one.states[name][1][joint][one.usable] for one in placed]) for joint in joints}
+        for name, joints in names.items()
+    }
 
 
 class _Ingest:
     """One ingest under way, with a folder for everything temporary."""
 
-    def __init__(self, recordings: Sequence[Recording], folder: Path, progress: StageProgress) -> None:
+    def __init__(
+        self, recordings: Sequence[Recording], folder: Path, progress: StageProgress, tissue: str | None = None
+    ) -> None:
         self.folder, self.progress = folder, progress
-        self.data = Episodes(recordings, progress)
+        self.data = Episodes(recordings, progress, tissue)
         self.recording = self.data.recording
         self.settings = self.recording.settings
         self.size = self.data.video.size
@@ -74,10 +152,10 @@ class _Ingest:
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
 
-    def run(self, output: Path) -> IngestResult:
-        """Find cameras, registration and states, and write the capture."""
+    def place(self) -> _Placed:
+        """Find cameras, registration and states."""
         if self._is_still():
-            return self._run_still(output)
+            return self._place_still()
         refuse_frames(self.data, moving=True)
         self.motion = StructureFromMotion(
             self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
@@ -99,7 +177,8 @@ class _Ingest:
         self._place_bases_seen_from(sfm, self.pinhole, registration)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
-        return self._finish(output, sfm, self.pinhole, self._register(sfm), shapes)
+        registration = self._register(sfm)  # first: it may find clocks
+        return _Placed(sfm, self.pinhole, registration, shapes, *self.data.states_at(self._times(sfm)))
 
     def _is_still(self) -> bool:
         """Whether the scope stood still: as the recording says, else as its images do."""
@@ -129,7 +208,7 @@ class _Ingest:
         """uint8 [H, W, 3], one of the chosen frames."""
         return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
 
-    def _run_still(self, output: Path) -> IngestResult:
+    def _place_still(self) -> _Placed:
         """The same for a scope that stands still: its frame is the world."""
         data, pinhole = self.data, self.pinhole
         if pinhole is None:
@@ -154,7 +233,8 @@ class _Ingest:
             data.note(note)
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
-        return self._finish(output, placed, pinhole, None, found.shapes, right, found.how)
+        states, usable = data.states_at(self._times(placed))
+        return _Placed(placed, pinhole, None, found.shapes, states, usable, right, found.how)
 
     def _refuse_other_places(self) -> None:
         """Raise NeecoError when a still scope looked at something else in one episode than in another."""
@@ -357,41 +437,35 @@ class _Ingest:
                 )
         return on_instruments, shapes
 
-    def _finish(
-        self,
-        output: Path,
-        sfm: SfmResult,
-        pinhole: Lens,
-        registration: Registration | None,
-        shapes: dict[str, RoughShape],
-        right: RightCamera | None = None,
-        tissue: str | None = None,
-    ) -> IngestResult:
-        """States at every frame's time, splits, and the capture on disk."""
-        data = self.data
+    def finish(
+        self, output: Path, placed: _Placed, everywhere: dict[str, dict[str, np.ndarray]] | None = None
+    ) -> tuple[Capture, IngestResult]:
+        """Splits, and the capture, whose images are in the ingest's folder. everywhere: the readings over all tissues,
+        by instrument and joint, where there are several."""
+        data, sfm, registration, tissue = self.data, placed.sfm, placed.registration, placed.tissue
+        states, usable = placed.states, placed.usable
         for index in set(range(len(self.selected))) - set(sfm.indices.tolist()):
             self.dropped[int(self.selected[index])] = "no camera: too few of its features match other frames"
         frames, times = self.selected[sfm.indices], self._times(sfm)
         cameras, points = self._placed(sfm, registration)
-        states, usable = data.states_at(times)
         for frame in frames[~usable]:
             self.dropped[int(frame)] = "no instrument state at its time (gap in a log)"
-        splits, rule = self._split(frames, states, usable)
+        splits, rule = self._split(frames, states, usable, everywhere)
         chosen = np.flatnonzero(usable & (splits != LEFT_OUT))
         for frame in frames[usable & (splits == LEFT_OUT)]:
             self.dropped[int(frame)] = "beside an unseen frame"
         capture_frames = tuple(
             Frame(
                 self._named_image(int(frames[i])),
-                pinhole.camera(cameras[i]),
+                placed.pinhole.camera(cameras[i]),
                 _state(states, i, float(times[i])),
                 splits[i],
                 self.visible / f"{frames[i]:06d}.png.png" if self.visible else None,
             )
             for i in chosen.tolist()
         )
-        if right is not None:  # one camera more to learn from; what is tested stays one
-            capture_frames += seen_by(right, capture_frames, sfm.indices[chosen].tolist())
+        if placed.right is not None:  # one camera more to learn from; what is tested stays one
+            capture_frames += seen_by(placed.right, capture_frames, sfm.indices[chosen].tolist())
         reliable = sfm.reliable_points()
         if not reliable.any():
             reliable = np.ones(len(sfm.points), dtype=bool)
@@ -408,10 +482,9 @@ class _Ingest:
         capture = Capture(
             self.folder, capture_frames, instruments, cloud, registered, lens=lens, still=tissue is not None
         )
-        write_capture(capture, self.folder / "capture")
         position = {row: index for index, row in enumerate(chosen.tolist())}
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []
-        return IngestResult(
+        result = IngestResult(
             output,
             ", ".join(dict.fromkeys(str(part.recording.path) for part in data.parts)),
             len(data.times),
@@ -425,7 +498,7 @@ class _Ingest:
             np.array(registered_rows),
             None if tissue is not None else sfm.reprojection_px,
             int(reliable.sum()),
-            shapes,
+            placed.shapes,
             tissue,
             rule,
             tuple(data.notes),
@@ -437,6 +510,7 @@ class _Ingest:
             data.ranges,
             dict(zip(data.ranges, data.starts.tolist(), strict=False)),
         )
+        return capture, result
 
     def _named_image(self, frame: int) -> Path:
         """The image of a frame, under the name that it has in the capture."""
@@ -461,10 +535,17 @@ class _Ingest:
         cameras[:, :3, 3] *= scale
         return cameras, sfm.points * scale
 
-    def _split(self, frames: np.ndarray, states: States, usable: np.ndarray) -> tuple[np.ndarray, str]:
+    def _split(
+        self,
+        frames: np.ndarray,
+        states: States,
+        usable: np.ndarray,
+        everywhere: dict[str, dict[str, np.ndarray]] | None,
+    ) -> tuple[np.ndarray, str]:
         """Splits [M] by the first tracked instrument (LEFT_OUT without a state), and the rule in words."""
         poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
         where, rule = self.recording.path, self.recording.splits
+        known = next(iter((everywhere or {}).values()), {})
         by = rule.unseen_by if rule else None
         if by is not None and by not in joints:  # another instrument's
             owner = next((values for _, values in states.values() if by in values), None)
@@ -473,9 +554,10 @@ class _Ingest:
                     f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another"
                 )
             joints = owner
+            known = next((values for values in (everywhere or {}).values() if by in values), {})
         rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
         readings = {joint: values[usable] for joint, values in joints.items()}
-        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, self.data.ranges)
+        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, self.data.ranges, known)
         if "train" not in assigned:
             raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
         for name in rule.test_episodes + rule.unseen_episodes:

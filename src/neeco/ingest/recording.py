@@ -17,6 +17,7 @@ from neeco.ingest.stereofile import read_stereo
 from neeco.ingest.video import open_images, open_video
 
 STILL, MOVING = "still", "moving"  # what `camera` may say of a scope
+EACH = "each"  # what `tissue` says where every recording has a world of its own
 MIN_FRAMES = 10  # that cameras can be found from
 
 
@@ -88,7 +89,7 @@ class Recording:
     calibration file, (fl_x, fl_y, cx, cy) px or None (the file's own, else estimated); sync: t_log = t_video + offset s
     of each clock that is known; frames: how many to keep; camera: STILL, MOVING or None (to be noticed); episodes: by
     number, those of its data set that are meant instead of the one that its streams name; episode: what this one of
-    several is called, where the file says it."""
+    several is called, where the file says it; tissue: over which of several it was taken, EACH: one of its own."""
 
     path: Path
     video: Path | None = None
@@ -108,6 +109,7 @@ class Recording:
     stereo: StereoPartner | None = None
     episodes: tuple[int, ...] = ()
     episode: str = ""
+    tissue: str | None = None
 
     @property
     def clocks(self) -> tuple[str, ...]:

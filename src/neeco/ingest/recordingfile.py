@@ -49,6 +49,7 @@ def read_recording(path: Path) -> Recording:
         "camera",
         "stereo",
         "episodes",
+        "tissue",
         "intrinsics",
         "instruments",
         BASE_KEY,
@@ -72,7 +73,7 @@ def read_recording(path: Path) -> Recording:
     return Recording(
         path, video, images, fps, times, _intrinsics(top), instruments, scope, sync,
         top.integer("frames", MIN_FRAMES), _splits(top, instruments), notes, _settings(top), stream,
-        camera, _stereo(top), _episodes(top),
+        camera, _stereo(top), _episodes(top), tissue=top.text("tissue"),
     )  # fmt: skip
 
 
