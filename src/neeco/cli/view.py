@@ -31,6 +31,8 @@ class Arguments:
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
     sh: int = 3
     """Degree of the spherical harmonics that an exported file keeps, 0 to 3; lower is smaller."""
+    tissue: str | None = None
+    """Which tissue to show of a run that has several; the first when not given."""
     device: Device = "auto"
 
 
@@ -48,8 +50,12 @@ def run(arguments: Arguments) -> int:
     from neeco.viewer.server import ViewerServer
 
     device = device_of(arguments.device)
-    with ViewerServer(arguments.runs, arguments.host, arguments.port, device, arguments.size) as viewer:
+    with ViewerServer(
+        arguments.runs, arguments.host, arguments.port, device, arguments.size, arguments.tissue
+    ) as viewer:
         try:
+            if len(shown := viewer.runs.loaded[0].tissues) > 1:
+                print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
             print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
             if not arguments.no_browser:
                 import webbrowser
@@ -67,5 +73,5 @@ def _export(arguments: Arguments, output: Path) -> int:
 
     if len(arguments.runs) != 1:
         raise NeecoError(f"--export: {len(arguments.runs)} runs given; a file shows one")
-    print(export_page(arguments.runs[0], output, arguments.sh, device_of(arguments.device)))
+    print(export_page(arguments.runs[0], output, arguments.sh, device_of(arguments.device), arguments.tissue))
     return 0

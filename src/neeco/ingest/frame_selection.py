@@ -111,8 +111,8 @@ def assign_splits(
 ) -> tuple[np.ndarray, str]:
     """Splits [N] (LEFT_OUT: too close to an unseen frame to train on) of video frames [N] (their numbers), and the rule
     in words. poses [N, 4, 4] of the instrument and readings [N] rad per joint: what unseen frames are chosen by;
-    episodes: the frames (first, last) of each, where there are several; everywhere: where there are several tissues, the
-    readings over all of them: what is unseen of a joint is so over all."""
+    episodes: the frames (first, last) of each, where there are several; everywhere: of several tissues the readings
+    over all: what is unseen of a joint is so over all."""
     episodes = episodes or {}
     whole = rule.test_episodes
     if episodes and not (whole or rule.test or rule.test_every is not None):

@@ -259,6 +259,16 @@ class Scene(nn.Module):
         return self.deformation.skeleton()
 
 
+def over_one(scene: Drawable, tissue: str | None) -> Drawable:
+    """The scene over one tissue: that of this name, else the first; as it is where it has one. Raises NeecoError for a
+    name that is none of its."""
+    names = scene.recorded.tissues
+    if tissue is not None and tissue not in names:
+        known = f"its tissues are {', '.join(names)}" if names else "it has one tissue, without a name"
+        raise NeecoError(f"--tissue: {tissue!r} is not in the scene; {known}")
+    return cast(Scene, scene).over(tissue or names[0]) if len(names) > 1 else scene
+
+
 def one_tissue(scene: Drawable, asked_by: str) -> None:
     """Raise NeecoError, in the words of the option or verb `asked_by`, for a scene of several tissues."""
     if len(scene.recorded.tissues) > 1:

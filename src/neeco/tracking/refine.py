@@ -21,7 +21,7 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_bytes, read_json
 from neeco.scene import Scene
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.scene import gaussian_scene, one_tissue
 from neeco.settings import with_fields
 from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.track import INFO
@@ -56,6 +56,7 @@ def refine_run(
         raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on in it")
     if not (folder / "transforms.json").exists():
         scene, own = gaussian_scene(run.scene, "refine"), run.capture()
+        one_tissue(scene, "refine")
         frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
         with own_folder(output):
             own, frames = without_twice(own, frames)

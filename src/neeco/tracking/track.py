@@ -27,7 +27,7 @@ from neeco.errors import NeecoError
 from neeco.files import LOCK, is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
 from neeco.scene import Recorded
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.scene import gaussian_scene, one_tissue
 from neeco.tracking.coordinates import Coordinates
 from neeco.tracking.fitting import Fitter
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
@@ -104,6 +104,9 @@ def track_footage(
     if not 0 <= min_trust <= 1:
         raise NeecoError(f"--min-trust: {min_trust} is not a share; give 0 to 1")
     scene = gaussian_scene(run.scene, "track")
+    one_tissue(scene, "track")
+    if footage.tissues:
+        raise NeecoError(f"{footage.root}: tissues: footage is of one; track each tissue's by itself")
     coordinates = Coordinates.of(scene)
     frames = sorted(footage.frames, key=lambda frame: frame.state.time)
     given = _first_state(footage, frames[0], scene) if start == "first" else None

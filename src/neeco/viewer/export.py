@@ -32,7 +32,7 @@ from neeco.labels.labellers import threshold_of
 from neeco.raster.reference import SH_C0
 from neeco.scene import Drawable, Scene
 from neeco.scene.drawable import ArticulatedMotion
-from neeco.scene.scene import gaussian_scene
+from neeco.scene.scene import gaussian_scene, over_one
 from neeco.training.run import Run, load_run
 from neeco.viewer.controls import perpendicular_axes, shafts_of, slider_ranges
 
@@ -52,16 +52,17 @@ SCORES = (
 )
 
 
-def export_page(run: Path, output: Path, sh_degree: int, device: torch.device) -> str:
+def export_page(run: Path, output: Path, sh_degree: int, device: torch.device, tissue: str | None = None) -> str:
     """Write the page of a run to `output`; returns a line that says what was written.
 
-    sh_degree: of the spherical harmonics that are kept, 0 to 3. Raises NeecoError for a run that is unfinished or whose
-    method asks a network for every state, and where the file cannot be written.
+    sh_degree: of the spherical harmonics that are kept, 0 to 3; tissue: which of several, None: the first. Raises
+    NeecoError for a run that is unfinished or whose method asks a network for every state, and where the file cannot be
+    written.
     """
     if not 0 <= sh_degree <= MAX_DEGREE:
         raise NeecoError(f"--sh: {sh_degree} is no degree of harmonics; give 0 to {MAX_DEGREE}")
     trained = load_run(run, device)
-    page = page_of_run(trained, sh_degree)
+    page = page_of_run(trained, sh_degree, tissue)
     write_text(Path(output), page)
     return f"{output}: {len(page) / 1e6:.2f} MB, {trained.scene.num_gaussians:,} Gaussians; open it in any browser"
 
@@ -71,17 +72,20 @@ def embedded_page(run: Run) -> str | None:
     return None if why_not(run.scene) else page_of_run(run, EMBEDDED_DEGREE)
 
 
-def page_of_run(run: Run, sh_degree: int) -> str:
-    """The page of a run, harmonics up to `sh_degree`. Raises NeecoError where a page cannot hold it (`why_not`)."""
+def page_of_run(run: Run, sh_degree: int, tissue: str | None = None) -> str:
+    """The page of a run over one tissue (None: the first), harmonics up to `sh_degree`. Raises NeecoError where
+    a page cannot hold it (`why_not`)."""
     if refusal := why_not(run.scene):
         raise NeecoError(f"--export: {refusal}")
-    scene = gaussian_scene(run.scene, "--export")
+    scene = gaussian_scene(over_one(run.scene, tissue), "--export")
     facts = [
         ("capture", Path(run.config["capture"]).name),
         ("method", scene.method),
         ("Gaussians", f"{len(scene.canonical):,}"),
         ("frames trained on", str(len(scene.recorded.names))),
     ]
+    if len(names := run.scene.recorded.tissues) > 1:
+        facts.append(("tissue", f"{scene.recorded.tissues[0]}, of {', '.join(names)}"))
     iterations = scene.diagnostics.get("iterations")
     if isinstance(iterations, int):
         facts.append(("iterations", f"{iterations:,}"))

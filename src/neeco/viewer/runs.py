@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
@@ -24,7 +24,8 @@ from neeco.evaluation.mask_folders import load_reference
 from neeco.evaluation.mask_metrics import iou
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
-from neeco.scene.drawable import Recorded
+from neeco.scene.drawable import Learned, Recorded
+from neeco.scene.scene import over_one
 from neeco.scene.io import load_scene
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
@@ -57,6 +58,7 @@ class LoadedRun:
     shafts: dict[str, Shaft]
     iteration: int | None  # that training had reached; None: it has finished
     trouble: str = ""  # why the capture is not at hand
+    tissues: tuple[str, ...] = ()  # of several that the run has, of which the scene is over one
 
     @cached_property
     def labels(self) -> Tensor | None:
@@ -86,9 +88,10 @@ class LoadedRun:
 class WatchedRun:
     """Reads a run folder, and again when it has changed. Any thread may ask for what was read last."""
 
-    def __init__(self, path: Path, device: torch.device | None = None) -> None:
-        """Raises NeecoError where `path` holds no scene, finished or not."""
-        self.path, self.device = Path(path), device
+    def __init__(self, path: Path, device: torch.device | None = None, tissue: str | None = None) -> None:
+        """tissue: which of several is looked at; None: the first. Raises NeecoError where `path` holds no scene,
+        finished or not."""
+        self.path, self.device, self.tissue = Path(path), device, tissue
         self._refreshing = threading.Lock()
         self._stamp = self._current_stamp()
         self.loaded = self._load()  # replaced as a whole: a reader never sees half of a change
@@ -138,6 +141,9 @@ class WatchedRun:
         if self.device is not None:
             scene = scene.to(self.device)
         capture, trouble = _read_capture_of(config)
+        names, scene = scene.recorded.tissues, cast(Learned, over_one(scene, self.tissue))
+        if capture is not None and len(names) > 1:
+            capture = capture.over(scene.recorded.tissues[0])
         if not scene.recorded.states and capture is None:
             raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
         frames = () if capture is None else capture.frames
@@ -156,6 +162,7 @@ class WatchedRun:
             shafts=shafts_of(scene),
             iteration=iteration,
             trouble=trouble,
+            tissues=names,
         )
 
 
@@ -269,9 +276,9 @@ def spread_order(count: int) -> list[int]:
 class ViewedRuns:
     """The runs that all browsers of a server share, and what is known of their frames. Any thread may use it."""
 
-    def __init__(self, paths: Sequence[Path], device: torch.device | None = None) -> None:
+    def __init__(self, paths: Sequence[Path], device: torch.device | None = None, tissue: str | None = None) -> None:
         """Raises NeecoError where a run folder holds nothing to look at."""
-        self.watched = [WatchedRun(path, device) for path in paths]
+        self.watched = [WatchedRun(path, device, tissue) for path in paths]
         self.distance = self.loaded[0].distance  # mm
         self.unit = DISTANCE_UNITS / self.distance  # viser's units per mm
         self.timelines = [Timeline(loaded) for loaded in self.loaded]

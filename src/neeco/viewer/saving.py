@@ -58,7 +58,7 @@ class SavedStates:
         """What is saved, checked against the scene. Raises NeecoError."""
         if not self.states_path.exists():
             return []
-        return read_states(self.states_path, loaded.scene.instruments)
+        return read_states(self.states_path, loaded.scene.instruments, loaded.scene.recorded.tissues)
 
     def save_image(self, loaded: LoadedRun, state: State, world_from_camera: np.ndarray) -> Path:
         """Write one labelled image as `synthesize` does, of the recorded cameras' intrinsics, as large as was asked;

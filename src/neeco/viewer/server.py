@@ -52,13 +52,14 @@ class ViewerServer:
         port: int = PORT,
         device: torch.device | None = None,
         size: SizeSettings = RECORDED_SIZE,
+        tissue: str | None = None,
     ) -> None:
         """One run, or two to compare. port: or the next that is free. size: of saved images, and sharp pictures are as
-        high. Raises NeecoError."""
+        high. tissue: which of several is shown; None: the first. Raises NeecoError."""
         if not 1 <= len(runs) <= MAX_RUNS:
             raise NeecoError(f"view: {len(runs)} runs given; give one, or two to compare")
         require_viser()
-        self.runs = ViewedRuns(runs, device)
+        self.runs = ViewedRuns(runs, device, tissue)
         camera = self.runs.loaded[0].recorded.cameras[0]
         height = size.of(camera.width, camera.height)[1]
         self._sharp_px = None if size == RECORDED_SIZE else height

@@ -55,7 +55,7 @@ def exported_state(scene: Scene, frame: int, states: Path | None) -> tuple[State
     state, camera = scene.recorded.states[frame], scene.recorded.cameras[frame]
     if states is None:
         return state, camera
-    line = read_states(states, scene.instruments)[0]
+    line = read_states(states, scene.instruments, scene.recorded.tissues)[0]
     if line.world_from_camera is not None:
         camera = replace(camera, world_from_camera=torch.from_numpy(line.world_from_camera))
     return line.state, camera
@@ -63,7 +63,9 @@ def exported_state(scene: Scene, frame: int, states: Path | None) -> tuple[State
 
 @torch.no_grad()
 def splats_of(scene: Scene, state: State, camera: Camera) -> Splats:
-    """The scene in `state`, lit as `camera` has it."""
+    """The scene in `state`, over its tissue, lit as `camera` has it."""
+    if state.tissue is not None and len(scene.recorded.tissues) > 1:
+        scene = scene.over(state.tissue)
     posed = shadowed(scene.at(state), camera, rasterize)
     sh = _in_world(posed)
     if posed.headlight is not None:
