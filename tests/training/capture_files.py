@@ -100,7 +100,7 @@ def write_tissues(root: Path) -> Path:
     """The grasper before a red wall and before a green one, whose world is another: one capture of two tissues."""
     frames, tissues, pixels = [], [], []
     for number, (name, tint) in enumerate({"red": (1.2, 0.6, 0.6), "green": (0.6, 1.2, 0.6)}.items()):
-        own = read_capture(write_grasper(root.parent / f"{root.name}-{name}", seed=5 + number, tint=tint))
+        own = read_capture(write_grasper(root.parent / f"{root.name}-{name}", frames=18, seed=5 + number, tint=tint))
         moved = rigid_from_vector(number * torch.tensor([0.4, 2.0, -0.3, 30, -80, 20], dtype=torch.float64))
         for frame in own.frames:
             camera = replace(frame.camera, world_from_camera=moved.float() @ frame.camera.world_from_camera)

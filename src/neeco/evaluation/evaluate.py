@@ -90,7 +90,8 @@ def evaluate_run(
     """Score a trained run on splits of its capture (see `held_out_splits`) and write `evaluation.json` into its folder.
 
     Returns {"given": {split: numbers}, "aligned": {split: numbers} when `align`, "notes": [why a number is null],
-    "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}. None is
+    "labels": {how masks were made and compared}, "per_frame": {kind: {split: [row]}}}, and of several tissues
+    "by_tissue": {kind: {split: {tissue: means of what a frame is scored by}}}. None is
     "not known", never zero. psnr* in dB. networks: of `find_lpips`; they keep the threads that torch had when they were
     found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
     unreadable frames.
@@ -109,6 +110,7 @@ def evaluate_run(
     result: dict[str, Any] = {kind: {} for kind in kinds}
     pair_assignment: dict[str, Any] = {kind: {} for kind in kinds}
     per_frame: dict[str, Any] = {kind: {} for kind in kinds}
+    by_tissue: dict[str, Any] = {kind: {} for kind in kinds}
     for split in splits:
         frames = capture.split(split)
         tallies = {kind: _Tally(PartTally(names)) for kind in kinds}
@@ -121,13 +123,17 @@ def evaluate_run(
             numbers, pair_assignment[kind][split] = _summary(scene, tally)
             result[kind][split] = numbers | {"fps": fps, "num_gaussians": count, "frames": len(frames)}
             per_frame[kind][split] = tally.rows
+            by_tissue[kind][split] = _by_tissue(frames, tally.scores)
         notes += _split_notes(split, result["given"][split])
+        if len(scene.recorded.tissues) > 1:
+            notes += [_tissue_note(split, *found) for found in by_tissue["given"][split].items()]
     labels = {
         "threshold": threshold_of(scene),
         "names": [list(name) for name in scene.label_names],
         "pair_assignment": pair_assignment,
     }
-    evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame})
+    parts = {"by_tissue": by_tissue} if len(scene.recorded.tissues) > 1 else {}
+    evaluation: dict[str, Any] = finite(result | {"notes": notes, "labels": labels, "per_frame": per_frame} | parts)
     write_json(run.path / EVALUATION_FILE, evaluation)
     return evaluation
 
@@ -222,6 +228,30 @@ def _summary(scene: Drawable, tally: _Tally) -> tuple[dict[str, Any], dict[str, 
         parts |= {part: value for part, value in means.items() if part in known}
     numbers["part_iou"] = parts
     return numbers, {pair: way for pair, way in assignment.items() if pair in known}
+
+
+def _by_tissue(frames: Sequence[Frame], scores: Sequence[dict[str, float | None]]) -> dict[str, Any]:
+    """Means over the frames of every tissue."""
+    groups: dict[str, list[dict[str, float | None]]] = {}
+    for frame, row in zip(frames, scores, strict=True):
+        groups.setdefault(frame.state.tissue or "", []).append(row)
+    return {
+        tissue: {key: mean_of([row[key] for row in rows]) for key in rows[0]} | {"frames": len(rows)}
+        for tissue, rows in groups.items()
+    }
+
+
+def _tissue_note(split: str, tissue: str, numbers: Mapping[str, Any]) -> str:
+    known = [
+        f"{name} {numbers[key]:{form}}"
+        for key, name, form in (
+            ("psnr", "PSNR", ".2f"),
+            ("psnr_instrument", "on the instrument", ".2f"),
+            ("mask_iou", "mask IoU", ".3f"),
+        )
+        if not math.isnan(numbers[key])
+    ]
+    return f"{split} over {tissue}: {numbers['frames']} frames, {', '.join(known)}"
 
 
 @torch.no_grad()

@@ -209,15 +209,21 @@ class Scene(nn.Module):
             return state
         correction = rigid_from_vector(self.registration[:6])
         scale = self.registration[6].exp()
-        moved = {}
+        center, moved = self._center_of(state), {}
         for name, given in state.instruments.items():
             pose = given.pose.to(correction)
-            arm = (pose[:3, 3] - self.center) * scale
+            arm = (pose[:3, 3] - center) * scale
             rotation = correction[:3, :3] @ pose[:3, :3]
-            translation = correction[:3, :3] @ arm + self.center + correction[:3, 3]
+            translation = correction[:3, :3] @ arm + center + correction[:3, 3]
             top = torch.cat([rotation, translation[:, None]], 1)
             moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
         return dataclasses.replace(state, instruments=moved)
+
+    def _center_of(self, state: State) -> Tensor:
+        """[3] mm, middle of the state's tissue."""
+        if self.center.dim() == 1 or state.tissue is None:
+            return self.center.view(-1, 3)[0]
+        return self.center[self.recorded.tissues.index(state.tissue)]
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""

@@ -64,7 +64,10 @@ def export_page(run: Path, output: Path, sh_degree: int, device: torch.device, t
     trained = load_run(run, device)
     page = page_of_run(trained, sh_degree, tissue)
     write_text(Path(output), page)
-    return f"{output}: {len(page) / 1e6:.2f} MB, {trained.scene.num_gaussians:,} Gaussians; open it in any browser"
+    shown = over_one(trained.scene, tissue)
+    names = trained.scene.recorded.tissues
+    over = f" over {shown.recorded.tissues[0]} (of {', '.join(names)})" if len(names) > 1 else ""
+    return f"{output}: {len(page) / 1e6:.2f} MB, {shown.num_gaussians:,} Gaussians{over}; open it in any browser"
 
 
 def embedded_page(run: Run) -> str | None:

@@ -25,8 +25,8 @@ from neeco.evaluation.mask_metrics import iou
 from neeco.labels.drawing import draw
 from neeco.raster.types import Camera
 from neeco.scene.drawable import Learned, Recorded
-from neeco.scene.scene import over_one
 from neeco.scene.io import load_scene
+from neeco.scene.scene import over_one
 from neeco.training.run import checkpoint_path, read_checkpoint, read_config
 from neeco.viewer.controls import Shaft, shafts_of
 
@@ -141,8 +141,8 @@ class WatchedRun:
         if self.device is not None:
             scene = scene.to(self.device)
         capture, trouble = _read_capture_of(config)
-        names, scene = scene.recorded.tissues, cast(Learned, over_one(scene, self.tissue))
-        if capture is not None and len(names) > 1:
+        tissues, scene = scene.recorded.tissues, cast(Learned, over_one(scene, self.tissue))
+        if capture is not None and len(tissues) > 1:
             capture = capture.over(scene.recorded.tissues[0])
         if not scene.recorded.states and capture is None:
             raise NeecoError(f"{self.path}: the scene remembers no frames, and its capture is gone; train again")
@@ -162,7 +162,7 @@ class WatchedRun:
             shafts=shafts_of(scene),
             iteration=iteration,
             trouble=trouble,
-            tissues=names,
+            tissues=tissues,
         )
 
 
