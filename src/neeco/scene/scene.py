@@ -171,8 +171,8 @@ class Scene(nn.Module):
         alone._buffers = dict(self._buffers)
         if self.center.dim() > 1:
             alone.center = self.center[index]
-        kept = self.canonical.map(lambda tensor: tensor[chosen], counts)
-        alone.canonical = replace(kept, extras={name: t for name, t in kept.extras.items() if name != TISSUE})
+        canonical = self.canonical.map(lambda tensor: tensor[chosen], counts)
+        alone.canonical = replace(canonical, extras={name: t for name, t in canonical.extras.items() if name != TISSUE})
         alone.recorded = replace(self.recorded.over(tissue), tissues=(tissue,))
         return alone
 
