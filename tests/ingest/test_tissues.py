@@ -13,8 +13,8 @@ from neeco.capture import read_capture
 from neeco.capture.check import inspect_capture
 from neeco.cli.ingest import Ingest, run
 from neeco.errors import NeecoError
-from neeco.ingest.episodes import by_tissue
 from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.tissues import by_tissue
 
 
 def recordings(folder: Path, *tissues: str | None, seeds: tuple[int, ...] = (1, 7)) -> list[Path]:
@@ -42,6 +42,19 @@ def test_recordings_of_two_tissues_become_one_capture(tmp_path: Path, capsys: py
     assert (tmp_path / "capture" / "ingest_liver.html").is_file()
     assert (tmp_path / "capture" / "ingest_small_bowel.html").is_file()
     assert not inspect_capture(tmp_path / "capture").problems
+
+
+def test_what_the_first_says_of_splits_holds_for_every_tissue(tmp_path: Path) -> None:
+    paths = recordings(tmp_path, "liver", "liver", "bowel", seeds=(1, 1, 7))
+    change(paths[0], splits={"test_episodes": ["take_1"], "unseen_fraction": 0.2}, frames=20)
+    liver, bowel = by_tissue([read_recording(path) for path in paths]).values()
+    assert [item.episode for item in liver + bowel] == ["take_0", "take_1", "take_2"]
+    assert {item.splits.test_episodes for item in liver} == {("take_1",)}
+    assert (bowel[0].splits.test_episodes, bowel[0].splits.test_every) == ((), 0)  # no frame of it was asked for
+    assert {(item.frames, item.splits.unseen_fraction) for item in liver + bowel} == {(20, 0.2)}
+    change(paths[2], frames=30)
+    with pytest.raises(NeecoError, match=r"take 2/recording\.yaml: frames: says another than in .*take 0"):
+        by_tissue([read_recording(path) for path in paths])
 
 
 def test_each_recording_may_have_a_world_of_its_own(tmp_path: Path) -> None:

@@ -169,7 +169,8 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
     from neeco.errors import NeecoError
-    from neeco.ingest.pipeline import ingest, ingest_tissues
+    from neeco.ingest.pipeline import ingest
+    from neeco.ingest.tissues import ingest_tissues
     from neeco.report.ingest_page import write_ingest_page
     from neeco.report.rerun_log import require_rerun, write_rrd
 

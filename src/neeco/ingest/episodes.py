@@ -19,7 +19,7 @@ from neeco.errors import NeecoError
 from neeco.ingest.basefile import same_base
 from neeco.ingest.formats import VideoSource, format_of
 from neeco.ingest.logs import PoseLog, ReadingLog
-from neeco.ingest.recording import EACH, MIN_FRAMES, IngestSettings, InstrumentLogs, Recording, Splits
+from neeco.ingest.recording import MIN_FRAMES, IngestSettings, InstrumentLogs, Recording
 from neeco.ingest.registration import GIVEN, ClockOffset
 from neeco.ingest.sfm import StageProgress
 from neeco.ingest.still import same_place
@@ -289,10 +289,7 @@ def check_alike(parts: Sequence[SynchronizedRecording], worlds: bool = False) ->
         other = part.recording
 
         def refuse(what: str, path: object = other.path) -> NeecoError:
-            return NeecoError(
-                f"{path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest "
-                "it alone"
-            )
+            return _refusal(path, what, first)
 
         size, own = part.video.size, parts[0].video.size
         if size != own:
@@ -311,56 +308,20 @@ def check_alike(parts: Sequence[SynchronizedRecording], worlds: bool = False) ->
                 raise refuse(f"instruments: {mine.name}: {fault} not as")
             if mine.poses is not None and part.poses[mine.name].frame != parts[0].poses[mine.name].frame:
                 raise refuse(f"instruments: {mine.name}: poses are in another frame than")
-        for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
-            if getattr(other, key) not in (default, getattr(first, key)):
-                raise refuse(f"{key}: says another than")
+        refuse_other_words(other, first)
 
 
-def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recording]]:
-    """The recordings of every tissue, by its name; all under None where none names one. What the first says for all
-    (splits, frames, settings) is said in each. Raises NeecoError."""
-    if not any(recording.tissue for recording in recordings):
-        return {None: list(recordings)}
-    named = [replace(item, episode=name) for item, name in zip(recordings, episode_names(recordings), strict=True)]
-    worlds: dict[str | None, list[Recording]] = {}
-    for item in named:
-        if item.tissue is None:
-            others = ", ".join(dict.fromkeys(other.tissue for other in named if other.tissue))
-            raise NeecoError(f"{item.path}: tissue: is missing, where other recordings name theirs: {others}; name it")
-        worlds.setdefault(item.episode if item.tissue == EACH else item.tissue, []).append(item)
-    if len({file_name(tissue or "") for tissue in worlds}) < len(worlds):
-        raise NeecoError(
-            f"{named[0].path}: tissue: two of {', '.join(map(str, worlds))} make one file's name; rename one"
-        )
-    first = named[0]
-    for tissue, own in worlds.items():
-        splits = first.splits and _splits_of(first.splits, named, own, str(tissue))
-        worlds[tissue] = [replace(own[0], splits=splits, frames=first.frames, settings=first.settings), *own[1:]]
-    return worlds
+def refuse_other_words(other: Recording, first: Recording) -> None:
+    """Raise NeecoError where a recording says another thing of all than the first."""
+    for key, default in (("frames", None), ("splits", None), ("settings", IngestSettings())):
+        if getattr(other, key) not in (default, getattr(first, key)):
+            raise _refusal(other.path, f"{key}: says another than", first)
 
 
-def _splits_of(splits: Splits, named: Sequence[Recording], own: Sequence[Recording], tissue: str) -> Splits:
-    """What the splits of all mean for the recordings of one tissue. Raises NeecoError."""
-    names, known = [item.episode for item in own], {item.episode for item in named}
-    tested, unseen = splits.test_episodes, splits.unseen_episodes
-    for episode in tested + unseen:
-        if episode not in known:
-            listed = ", ".join(item.episode for item in named)
-            raise NeecoError(f"{named[0].path}: splits: no episode is called {episode!r}; they are {listed}")
-    if splits.test or splits.unseen:
-        raise NeecoError(
-            f"{named[0].path}: splits: test and unseen count one video's frames, and there are {len(named)} "
-            "recordings; name test_episodes and unseen_episodes"
-        )
-    if set(names) <= set(tested + unseen):
-        raise NeecoError(f"{named[0].path}: splits: leave no recording of the tissue {tissue} to train on; change them")
-    found = replace(
-        splits,
-        test_episodes=tuple(name for name in tested if name in names),
-        unseen_episodes=tuple(name for name in unseen if name in names),
+def _refusal(path: object, what: str, first: Recording) -> NeecoError:
+    return NeecoError(
+        f"{path}: {what} in {first.path}: recordings of one capture have the same; correct it, or ingest it alone"
     )
-    found = replace(found, test_every=0) if tested and not found.test_episodes else found
-    return replace(found, unseen_fraction=0.0) if unseen and not found.unseen_episodes else found
 
 
 def separate(recordings: Sequence[Recording]) -> tuple[Recording, ...]:

@@ -13,14 +13,14 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Border, Lens
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, Tissue, evenly_spaced
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
 from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
-from neeco.ingest.episodes import Episodes, by_tissue, check_alike, separate
+from neeco.ingest.episodes import Episodes, separate
 from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
 from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
@@ -51,63 +51,15 @@ def ingest(
     if named:
         raise NeecoError(f"{named[0].path}: tissue: {named[0].tissue} is named; `ingest_tissues` makes such a capture")
     with staged(output) as folder:
-        one = _Ingest(recordings, folder, progress)
+        one = WorldIngest(recordings, folder, progress)
         capture, result = one.finish(output, one.place())
         write_capture(capture, folder / "capture")
         complete(result, folder / "capture")
         return result
 
 
-def ingest_tissues(
-    recordings: Sequence[Recording],
-    output: Path,
-    progress: StageProgress,
-    complete: Callable[[dict[str, IngestResult], Path], None] = lambda results, folder: None,
-) -> dict[str, IngestResult]:
-    """As `ingest`, of recordings that name their tissues: each tissue gets a world of its own, found from its own
-    recordings; what was found of each, by its name."""
-    worlds = by_tissue(separate(recordings))
-    with staged(output) as folder:
-        parts = {}
-        for number, (tissue, own) in enumerate(worlds.items()):
-            (folder / f"world_{number}").mkdir()
-            parts[str(tissue)] = _Ingest(own, folder / f"world_{number}", progress, str(tissue))
-        check_alike([part for one in parts.values() for part in one.data.parts], worlds=True)
-        placed = {tissue: one.place() for tissue, one in parts.items()}
-        readings = _joined_readings(list(placed.values()))
-        found = {tissue: one.finish(output, placed[tissue], readings) for tissue, one in parts.items()}
-        write_capture(_joined({tissue: capture for tissue, (capture, _) in found.items()}), folder / "capture")
-        results = {tissue: result for tissue, (_, result) in found.items()}
-        complete(results, folder / "capture")
-        return results
-
-
-def _joined(captures: dict[str, Capture]) -> Capture:
-    """One capture of several tissues, from that of each. Raises NeecoError for what it can only state once."""
-    parts = list(captures.values())
-    frames = tuple(
-        replace(frame, state=replace(frame.state, tissue=tissue))
-        for tissue, capture in captures.items()
-        for frame in capture.frames
-    )
-    for tissue, capture in captures.items():
-        for what, one, first in (
-            ("registered", capture.registered, parts[0].registered),
-            ("of a scope that stands still", capture.still, parts[0].still),
-        ):
-            if one != first:
-                word = "is" if one else "is not"
-                raise NeecoError(
-                    f"tissue: {tissue} {word} {what}, unlike {next(iter(captures))}; one capture has the same of all: "
-                    "ingest it alone"
-                )
-    lens = parts[0].lens if all(capture.lens == parts[0].lens for capture in parts) else None  # each was estimated
-    tissues = tuple(Tissue(tissue, capture.points) for tissue, capture in captures.items())
-    return replace(parts[0], frames=frames, points=PointCloud(measured=False), lens=lens, tissues=tissues)
-
-
 @dataclass(frozen=True)
-class _Placed:
+class Placed:
     """What is known of one world before its frames are split: cameras, and states [M] at their times."""
 
     sfm: SfmResult
@@ -120,17 +72,9 @@ class _Placed:
     tissue: str | None = None  # how a still scope's tissue got its depth
 
 
-def _joined_readings(placed: Sequence[_Placed]) -> dict[str, dict[str, np.ndarray]]:
-    """By instrument and joint, what was read over all tissues."""
-    names = {name: list(joints) for name, (_, joints) in placed[0].states.items()}
-    return {
-        name: {joint: np.concatenate([one.states[name][1][joint][one.usable] for one in placed]) for joint in joints}
-        for name, joints in names.items()
-    }
-
-
-class _Ingest:
-    """One ingest under way, with a folder for everything temporary."""
+class WorldIngest:
+    """The ingest of one world under way, with a folder for everything temporary. tissue: that of the world, where there
+    are several."""
 
     def __init__(
         self, recordings: Sequence[Recording], folder: Path, progress: StageProgress, tissue: str | None = None
@@ -152,7 +96,7 @@ class _Ingest:
         self.visible = self._write_visible()
         self.pinhole = self.lens.pinhole(self.size) if self.lens else None
 
-    def place(self) -> _Placed:
+    def place(self) -> Placed:
         """Find cameras, registration and states."""
         if self._is_still():
             return self._place_still()
@@ -178,7 +122,7 @@ class _Ingest:
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
         registration = self._register(sfm)  # first: it may find clocks
-        return _Placed(sfm, self.pinhole, registration, shapes, *self.data.states_at(self._times(sfm)))
+        return Placed(sfm, self.pinhole, registration, shapes, *self.data.states_at(self._times(sfm)))
 
     def _is_still(self) -> bool:
         """Whether the scope stood still: as the recording says, else as its images do."""
@@ -208,7 +152,7 @@ class _Ingest:
         """uint8 [H, W, 3], one of the chosen frames."""
         return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
 
-    def _place_still(self) -> _Placed:
+    def _place_still(self) -> Placed:
         """The same for a scope that stands still: its frame is the world."""
         data, pinhole = self.data, self.pinhole
         if pinhole is None:
@@ -234,7 +178,7 @@ class _Ingest:
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
         placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
         states, usable = data.states_at(self._times(placed))
-        return _Placed(placed, pinhole, None, found.shapes, states, usable, right, found.how)
+        return Placed(placed, pinhole, None, found.shapes, states, usable, right, found.how)
 
     def _refuse_other_places(self) -> None:
         """Raise NeecoError when a still scope looked at something else in one episode than in another."""
@@ -438,7 +382,7 @@ class _Ingest:
         return on_instruments, shapes
 
     def finish(
-        self, output: Path, placed: _Placed, everywhere: dict[str, dict[str, np.ndarray]] | None = None
+        self, output: Path, placed: Placed, everywhere: dict[str, dict[str, np.ndarray]] | None = None
     ) -> tuple[Capture, IngestResult]:
         """Splits, and the capture, whose images are in the ingest's folder. everywhere: the readings over all tissues,
         by instrument and joint, where there are several."""

@@ -163,9 +163,10 @@ def _size_note(frames: tuple[Frame, ...], config: TrainConfig) -> str:
     tissue, instrument = config.gaussian_limits(pixels)
     stored, working = 1.5 * 3 * pixels * len(frames), WORKING_BYTES * pixels  # full images and those half their size
     width, height = round(config.scale * camera.width), round(config.scale * camera.height)
+    each = "each " if len({frame.state.tissue for frame in frames}) > 1 else ""
     return (
-        f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of tissue and {instrument} of each "
-        f"instrument; about {(BASE_BYTES + stored + working) / 1e9:.1f} GB of memory"
+        f"{len(frames)} images of {width}x{height}; at most {tissue} Gaussians of {each}tissue and {instrument} of "
+        f"each instrument; about {(BASE_BYTES + stored + working) / 1e9:.1f} GB of memory"
     )
 
 

@@ -1,0 +1,125 @@
+"""Recordings over several tissues: each tissue is a world of its own, and one capture holds them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from neeco.capture.model import Capture, PointCloud, Tissue
+from neeco.capture.writer import write_capture
+from neeco.errors import NeecoError
+from neeco.ingest.convert import staged
+from neeco.ingest.episodes import check_alike, episode_names, file_name, refuse_other_words, separate
+from neeco.ingest.pipeline import Placed, WorldIngest
+from neeco.ingest.recording import EACH, Recording, Splits
+from neeco.ingest.result import IngestResult
+from neeco.ingest.sfm import StageProgress
+
+
+def ingest_tissues(
+    recordings: Sequence[Recording],
+    output: Path,
+    progress: StageProgress,
+    complete: Callable[[dict[str, IngestResult], Path], None] = lambda results, folder: None,
+) -> dict[str, IngestResult]:
+    """As `ingest`, of recordings that name their tissues: each tissue gets a world of its own, found from its own
+    recordings; what was found of each, by its name."""
+    worlds = by_tissue(separate(recordings))
+    with staged(output) as folder:
+        parts = {}
+        for number, (tissue, own) in enumerate(worlds.items()):
+            (folder / f"world_{number}").mkdir()
+            parts[str(tissue)] = WorldIngest(own, folder / f"world_{number}", progress, str(tissue))
+        check_alike([part for one in parts.values() for part in one.data.parts], worlds=True)
+        placed = {tissue: one.place() for tissue, one in parts.items()}
+        readings = _joined_readings(list(placed.values()))
+        found = {tissue: one.finish(output, placed[tissue], readings) for tissue, one in parts.items()}
+        write_capture(_joined({tissue: capture for tissue, (capture, _) in found.items()}), folder / "capture")
+        results = {tissue: result for tissue, (_, result) in found.items()}
+        complete(results, folder / "capture")
+        return results
+
+
+def _joined(captures: dict[str, Capture]) -> Capture:
+    """One capture of several tissues, from that of each. Raises NeecoError for what it can only state once."""
+    parts = list(captures.values())
+    frames = tuple(
+        replace(frame, state=replace(frame.state, tissue=tissue))
+        for tissue, capture in captures.items()
+        for frame in capture.frames
+    )
+    for tissue, capture in captures.items():
+        for what, one, first in (
+            ("registered", capture.registered, parts[0].registered),
+            ("of a scope that stands still", capture.still, parts[0].still),
+        ):
+            if one != first:
+                word = "is" if one else "is not"
+                raise NeecoError(
+                    f"tissue: {tissue} {word} {what}, unlike {next(iter(captures))}; one capture has the same of all: "
+                    "ingest it alone"
+                )
+    lens = parts[0].lens if all(capture.lens == parts[0].lens for capture in parts) else None  # each was estimated
+    tissues = tuple(Tissue(tissue, capture.points) for tissue, capture in captures.items())
+    return replace(parts[0], frames=frames, points=PointCloud(measured=False), lens=lens, tissues=tissues)
+
+
+def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recording]]:
+    """The recordings of every tissue, by its name; all under None where none names one. What the first says for all
+    (splits, frames, settings) is said in each. Raises NeecoError."""
+    if not any(recording.tissue for recording in recordings):
+        return {None: list(recordings)}
+    named = [replace(item, episode=name) for item, name in zip(recordings, episode_names(recordings), strict=True)]
+    worlds: dict[str | None, list[Recording]] = {}
+    for item in named:
+        if item.tissue is None:
+            others = ", ".join(dict.fromkeys(other.tissue for other in named if other.tissue))
+            raise NeecoError(f"{item.path}: tissue: is missing, where other recordings name theirs: {others}; name it")
+        worlds.setdefault(item.episode if item.tissue == EACH else item.tissue, []).append(item)
+    if len({file_name(tissue or "") for tissue in worlds}) < len(worlds):
+        raise NeecoError(
+            f"{named[0].path}: tissue: two of {', '.join(map(str, worlds))} make one file's name; rename one"
+        )
+    first = named[0]
+    for item in named[1:]:
+        refuse_other_words(item, first)
+    for tissue, own in worlds.items():
+        splits = first.splits and _splits_of(first.splits, named, own, str(tissue))
+        worlds[tissue] = [replace(item, splits=splits, frames=first.frames, settings=first.settings) for item in own]
+    return worlds
+
+
+def _splits_of(splits: Splits, named: Sequence[Recording], own: Sequence[Recording], tissue: str) -> Splits:
+    """What the splits of all mean for the recordings of one tissue. Raises NeecoError."""
+    names, known = [item.episode for item in own], {item.episode for item in named}
+    tested, unseen = splits.test_episodes, splits.unseen_episodes
+    for episode in tested + unseen:
+        if episode not in known:
+            listed = ", ".join(item.episode for item in named)
+            raise NeecoError(f"{named[0].path}: splits: no episode is called {episode!r}; they are {listed}")
+    if splits.test or splits.unseen:
+        raise NeecoError(
+            f"{named[0].path}: splits: test and unseen count one video's frames, and there are {len(named)} "
+            "recordings; name test_episodes and unseen_episodes"
+        )
+    if set(names) <= set(tested + unseen):
+        raise NeecoError(f"{named[0].path}: splits: leave no recording of the tissue {tissue} to train on; change them")
+    found = replace(
+        splits,
+        test_episodes=tuple(name for name in tested if name in names),
+        unseen_episodes=tuple(name for name in unseen if name in names),
+    )
+    found = replace(found, test_every=0) if tested and not found.test_episodes else found
+    return replace(found, unseen_fraction=0.0) if unseen and not found.unseen_episodes else found
+
+
+def _joined_readings(placed: Sequence[Placed]) -> dict[str, dict[str, np.ndarray]]:
+    """By instrument and joint, what was read over all tissues."""
+    names = {name: list(joints) for name, (_, joints) in placed[0].states.items()}
+    return {
+        name: {joint: np.concatenate([one.states[name][1][joint][one.usable] for one in placed]) for joint in joints}
+        for name, joints in names.items()
+    }
