@@ -34,6 +34,7 @@ def two_tissues(method: str = "kinematic") -> Scene:
     states = tuple(replace(state, tissue="ab"[k % 2]) for k, state in enumerate(scene.recorded.states))
     scene.recorded = replace(scene.recorded, states=states, tissues=("a", "b"))
     scene.center = scene.center.expand(2, 3).clone()
+    scene.registration = torch.nn.Parameter(torch.zeros(2, 7))
     return scene
 
 
@@ -111,3 +112,14 @@ def test_what_shows_one_tissue_takes_the_first_or_the_one_named() -> None:
         over_one(scene, "c")
     with pytest.raises(NeecoError, match=r"track: the scene has several tissues \(a, b\), and this takes one"):
         one_tissue(scene, "track")
+
+
+def test_each_tissue_corrects_its_poses_by_its_own_registration() -> None:
+    scene = two_tissues().requires_grad_(False)
+    scene.registration[1, 3:6] = torch.tensor([1.0, 2.0, 3.0])
+    first, second = scene.recorded.states[:2]
+    place = second.instruments["grasper"].pose[:3, 3].float()
+    assert torch.equal(scene.registered(first).instruments["grasper"].pose, first.instruments["grasper"].pose.float())
+    moved = scene.registered(second).instruments["grasper"].pose[:3, 3]
+    torch.testing.assert_close(moved, place + torch.tensor([1.0, 2.0, 3.0]))
+    torch.testing.assert_close(scene.over("b").registered(second).instruments["grasper"].pose[:3, 3], moved)

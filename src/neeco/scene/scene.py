@@ -41,10 +41,11 @@ class Scene(nn.Module):
     """A learned scene of Gaussians: `at` poses them in a state, for every method; `render` draws them.
 
     `registration` [7] is one constant tracker-to-world correction (rotation vector in rad about `center`, translation
-    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. `falloff` (tissue,
-    instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`, `shadow_strengths` (0: no such
-    lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`). `background` in [0, 1] is the grey
-    behind everything. `label_threshold` in (0, 1) is the share of a pixel from which it is labelled an instrument;
+    in mm, log scale about `center`), applied to every instrument pose; zero unless refined. Of several tissues each has
+    one, [T, 7], which is always refined: the instrument's shape takes on the constant error of one world, but not of
+    several. `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
+    `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
+    `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which it is labelled an instrument;
     None: by what shadows the scene draws (see `neeco.labels.labellers`).
     """
 
@@ -73,7 +74,7 @@ class Scene(nn.Module):
         self.label_threshold: float | None = None
         self.diagnostics: dict[str, Any] = {}
         self.register_buffer("center", center.float())  # [3] mm, middle of the tissue; [T, 3] of several
-        self.registration = nn.Parameter(torch.zeros(7))
+        self.registration = nn.Parameter(torch.zeros(*center.shape[:-1], 7))
         self.falloff = nn.Parameter(torch.zeros(2))
         self.vignette = nn.Parameter(torch.zeros(2))
         self.shadow_offsets = nn.Parameter(torch.zeros(LAMPS, 3))
@@ -154,13 +155,18 @@ class Scene(nn.Module):
 
     def _shown(self, state: State) -> Tensor | None:
         """[N] float, 0 for the Gaussians of other tissues than the state's; None: there is one. Raises NeecoError."""
-        names, canonical = self.recorded.tissues, self.canonical
+        index, canonical = self._tissue_index(state), self.canonical
+        if index is None:
+            return None
+        return (canonical.of_tissue(index) | canonical.of_instruments).to(canonical.means.dtype)
+
+    def _tissue_index(self, state: State) -> int | None:
+        """Which of several tissues the state names; None: there is one. Raises NeecoError for one that there is not."""
+        names = self.recorded.tissues
         if state.tissue not in (names or (None,)) and (len(names) > 1 or state.tissue is not None):
             known = f"name one of {', '.join(names)}" if names else "it has one, without a name"
             raise NeecoError(f"state: tissue: {state.tissue!r} is not in the scene; {known}")
-        if len(names) < 2:
-            return None
-        return (canonical.of_tissue(names.index(state.tissue)) | canonical.of_instruments).to(canonical.means.dtype)
+        return names.index(str(state.tissue)) if len(names) > 1 else None
 
     def over(self, tissue: str) -> Scene:
         """The scene of one of several tissues alone, with what was recorded over it."""
@@ -168,9 +174,11 @@ class Scene(nn.Module):
         chosen = self.canonical.of_tissue(index) | self.canonical.of_instruments
         counts = (int(self.canonical.of_tissue(index).sum()), *self.canonical.counts[1:])
         alone = copy.copy(self)
-        alone._buffers = dict(self._buffers)
+        alone._buffers, alone._parameters = dict(self._buffers), dict(self._parameters)
         if self.center.dim() > 1:
             alone.center = self.center[index]
+            alone.registration = nn.Parameter(self.registration[index].detach(), requires_grad=False)
+            alone._corrects = CachedPredicate(self._corrects.question)
         canonical = self.canonical.map(lambda tensor: tensor[chosen], counts)
         alone.canonical = replace(canonical, extras={name: t for name, t in canonical.extras.items() if name != TISSUE})
         alone.recorded = replace(self.recorded.over(tissue), tissues=(tissue,))
@@ -207,9 +215,11 @@ class Scene(nn.Module):
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)
         if not state.instruments or not corrects:
             return state
-        correction = rigid_from_vector(self.registration[:6])
-        scale = self.registration[6].exp()
-        center, moved = self._center_of(state), {}
+        index, center, moved = self._tissue_index(state), self.center, {}
+        if index is not None:
+            registration, center = registration[index], center[index]
+        correction = rigid_from_vector(registration[:6])
+        scale = registration[6].exp()
         for name, given in state.instruments.items():
             pose = given.pose.to(correction)
             arm = (pose[:3, 3] - center) * scale
@@ -218,12 +228,6 @@ class Scene(nn.Module):
             top = torch.cat([rotation, translation[:, None]], 1)
             moved[name] = InstrumentState(torch.cat([top, pose[3:]]), given.joints)
         return dataclasses.replace(state, instruments=moved)
-
-    def _center_of(self, state: State) -> Tensor:
-        """[3] mm, middle of the state's tissue."""
-        if self.center.dim() == 1 or state.tissue is None:
-            return self.center.view(-1, 3)[0]
-        return self.center[self.recorded.tissues.index(state.tissue)]
 
     def render(self, state: State, camera: Camera, labels: bool = False) -> Rendering:
         """`state` as the recorded `camera` sees it, differentiable; `labels`: with label channels, where it has any."""

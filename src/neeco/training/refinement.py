@@ -56,6 +56,11 @@ class Refinement:
         self.posed: list[list[int]] = [[] for _ in range(max(self.pose_rows, default=-1) + 1)]  # frames of each pose
         for frame, row in enumerate(self.pose_rows):
             self.posed[row].append(frame)
+        over = [frames[shown[0]].state.tissue for shown in self.posed]
+        self.worlds = {  # poses of each tissue
+            tissue: torch.tensor([row for row, other in enumerate(over) if other == tissue], device=device)
+            for tissue in dict.fromkeys(over)
+        }
         self.joints = torch.zeros(len(self.beside), len(self.readings), device=device)
         self.poses = torch.zeros(len(self.posed), len(names), 6, device=device)
         self.cameras = torch.zeros(len(frames), 6, device=device)
@@ -144,12 +149,14 @@ class Refinement:
 
     @torch.no_grad()
     def center(self) -> None:
-        """Take the mean correction out: a constant one belongs to the instrument's shape (and to
-        `Scene.registration`)."""
+        """Take the mean correction out, of every tissue's poses: a constant one belongs to the instrument's shape (and
+        to `Scene.registration`)."""
         seen = (self.frame_steps > 0).nonzero()[:, 0]
         if len(seen):
             rows = torch.tensor(sorted({self.pose_rows[frame] for frame in seen.tolist()}), device=self.poses.device)
-            self.poses[rows] -= self.poses[rows].mean(0)
+            for world in self.worlds.values():
+                own = rows[torch.isin(rows, world)]
+                self.poses[own] -= self.poses[own].mean(0)
             self.joints -= torch.where(self.unrecorded, 0.0, self.joints.mean(0))
             seen = seen.to(self.cameras.device)
             self.cameras[seen] -= self.cameras[seen].mean(0)

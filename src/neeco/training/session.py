@@ -90,7 +90,8 @@ class GaussianSession(GaussianTraining):
         scene = self.scene
         self.statistics = GradientStatistics(len(scene.canonical), scene.center.device)
         scene.requires_grad_(True)
-        scene.registration.requires_grad_(self.config.refine.registration)
+        several = scene.registration.dim() > 1 and bool(scene.instruments)
+        scene.registration.requires_grad_(self.config.refine.registration or several)
         self.watch_gradients()
 
     def watch_gradients(self) -> None:

@@ -182,11 +182,6 @@ def _training_frames(capture: Capture, path: Path, config: TrainConfig) -> tuple
             raise NeecoError(
                 f"{path}: tissues: there are several ({names}); method {config.method} learns one, kinematic several"
             )
-        if config.refine.registration:
-            raise NeecoError(
-                f"{path}: tissues: there are several ({names}), each in a world of its own; one registration cannot be "
-                "refined for all: leave out refine.registration"
-            )
     elif unmet_need(config.method, capture):
         raise NeecoError(
             f"{path}: time: the recording does not say when frames were taken; method {config.method} needs it (give "

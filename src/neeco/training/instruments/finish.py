@@ -64,7 +64,7 @@ def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> N
         )
     session.scene.diagnostics["joints"] = verdicts
     session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
-    session.scene.diagnostics["registration"] = [float(v) for v in session.scene.registration]
+    session.scene.diagnostics["registration"] = session.scene.registration.tolist()
 
 
 def settle_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
