@@ -45,8 +45,8 @@ class Scene(nn.Module):
     one, [T, 7], which is always refined: the instrument's shape takes on the constant error of one world, but not of
     several. `falloff` (tissue, instruments) and `vignette` are the headlight (see `Headlight`), `shadow_offsets`,
     `shadow_strengths` (0: no such lamp) and `shadow_width` the instruments' shadows on the tissue (see `Shadow`).
-    `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which it is labelled an instrument;
-    None: by what shadows the scene draws (see `neeco.labels.labellers`).
+    `background` in [0, 1] is the grey behind everything. `label_threshold` in (0, 1) is the share of a pixel from which
+    it is labelled an instrument; None: by what shadows the scene draws (see `neeco.labels.labellers`).
     """
 
     has_gaussians = True
