@@ -33,19 +33,23 @@ def wrong_base(truth: Array, poses: Array, mm: float, degrees: float, seed: int)
 def base_errors(found: Array, truth: Array, poses: Array) -> dict[str, float]:
     """What a base [4, 4] is off, of a still scope's camera, over poses [F, 4, 4] in its frame, root mean square: mm by
     which the instrument is drawn beside its place, across the view and in all, once the best constant offset of its own
-    frame is taken out; mm without that (raw); and degrees."""
+    frame is taken out; mm without that (raw), and what of them lies across the view (seen); and degrees."""
     right = truth @ poses
     raw = ((found - truth) @ poses)[:, :3, 3]
     local = np.einsum("fji,fj->fi", right[:, :3, :3], raw)
     beside = np.einsum("fij,fj->fi", right[:, :3, :3], local - local.mean(0))
     view = right[:, :3, 3] / np.linalg.norm(right[:, :3, 3], axis=1)[:, None]
     across = beside - (beside * view).sum(1)[:, None] * view
-    across_mm, beside_mm, raw_mm = (float(np.sqrt(np.square(part).sum(1).mean())) for part in (across, beside, raw))
+    seen = raw - (raw * view).sum(1)[:, None] * view
+    across_mm, beside_mm, raw_mm, seen_mm = (
+        float(np.sqrt(np.square(part).sum(1).mean())) for part in (across, beside, raw, seen)
+    )
     turn = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T)
     return {
         "across_mm": across_mm,
         "beside_mm": beside_mm,
         "raw_mm": raw_mm,
+        "seen_mm": seen_mm,
         "turned_deg": float(np.degrees(turn.magnitude())),
     }
 

@@ -31,6 +31,7 @@ from neeco.ingest.base_fit import (
     refine,
     sureness,
 )
+from neeco.ingest.base_layers import LayerFit, ShaftLine
 from neeco.ingest.base_marks import with_marks
 from neeco.ingest.base_search import Candidates, Seen, rotations_about, search, uniform_rotations
 from neeco.ingest.base_shape import MOTION, SHIFTS, Fit, Problem, instrument_in_base, outlines, pivot_of, resized
@@ -74,12 +75,13 @@ class BaseRegistration:
     open_directions: tuple[str, ...]
     moved_mm: float  # from what was given; NaN where nothing was
     turned_deg: float
-    overlap: float  # of the instrument's fitted shape with what moves, intersection over union
+    overlap: float  # of the instrument's fitted shape with what moves, intersection over union; NaN without masks
     overlap_before: float  # of the same shape under what was given; NaN where nothing was
     residual_px: float  # median, of the outlines, in the masks' pixels
     frames: int  # that it was found from
-    fit: Fit
-    problem: Problem
+    fit: Fit | None = None  # None: found without masks, from what stands still behind it
+    problem: Problem | None = None
+    explained: float = np.nan  # then: the share of the change in the images that the shaft explains
 
     def as_json(self) -> dict[str, Any]:
         """Numbers for scripts: mm, degrees, s; None where a direction is open and nothing was given."""
@@ -95,7 +97,8 @@ class BaseRegistration:
             "clock_sd_s": self.clock_sd_s,
             "moved_mm": known(np.array([self.moved_mm]))[0],
             "turned_deg": known(np.array([self.turned_deg]))[0],
-            "overlap": self.overlap,
+            "overlap": known(np.array([self.overlap]))[0],
+            "explained": known(np.array([self.explained]))[0],
             "overlap_before": known(np.array([self.overlap_before]))[0],
             "open": list(self.open_directions),
         }
@@ -367,6 +370,8 @@ def _sureness_in_words(
     variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / values**2 + sure.noise / values
     posterior = np.linalg.inv(vectors @ np.diag(1 / variances) @ vectors.T + prior + 1e-12 * np.eye(len(prior)))
     covariance = posterior * np.outer(units, units)
+    shaft = (fit.world_from_base[:3, :3] @ instrument_in_base(problem, fit)[:, :3, :3] @ fit.axis).mean(0)
+    shaft /= np.linalg.norm(shaft)
     words = []
     far = float(np.linalg.norm(away)) * size_sd
     if far > OPEN_MM or (known.sd_mm is not None and far > OPEN_SHARE * known.sd_mm):
@@ -381,7 +386,7 @@ def _sureness_in_words(
         if np.square(vector[:6]).sum() < 0.5:
             continue
         if alone > OPEN_MM or (given > 0 and alone > OPEN_SHARE * given**-0.5):
-            words.append(_direction(problem, fit, vector[:6]))
+            words.append(_direction(problem.camera_from_world[0, :3, :3], shaft, vector[:6]))
     if known.sd_mm is None and words:
         covariance[:6, :6] = np.where(np.abs(covariance[:6, :6]) > 1e6, np.nan, covariance[:6, :6])
     clock_sd = float(np.sqrt(covariance[6, 6])) if known.sd_clock > 0 else 0.0
@@ -391,11 +396,9 @@ def _sureness_in_words(
 _BY_SIZE = "a shift towards where the instrument comes in, together with its size"
 
 
-def _direction(problem: Problem, fit: Fit, vector: np.ndarray) -> str:
-    """A direction in which the base may move, at LEVER: turns and shifts [6], world, as words."""
-    view = problem.camera_from_world[0, :3, :3]
-    shaft = (fit.world_from_base[:3, :3] @ instrument_in_base(problem, fit)[:, :3, :3] @ fit.axis).mean(0)
-    shaft /= np.linalg.norm(shaft)
+def _direction(view: np.ndarray, shaft: np.ndarray, vector: np.ndarray) -> str:
+    """A direction in which the base may move, at LEVER: turns and shifts [6], world, as words. view: camera_from_world
+    [3, 3]; shaft [3]: its direction, world."""
     turns = np.square(vector[:3]).sum() > 0.5 * np.square(vector).sum()
     way = vector[:3] if turns else vector[3:]
     way = way / np.linalg.norm(way)
@@ -409,3 +412,32 @@ def _direction(problem: Problem, fit: Fit, vector: np.ndarray) -> str:
         return f"{what} {at} {names[largest]}"
     parts = ", ".join(f"{value:+.1f}" for value in seen)
     return f"{what} {at} ({parts}) (right, down, forward)"
+
+
+def base_from_layers(
+    prior: tuple[np.ndarray, float, float],
+    found: LayerFit,
+    world_from_camera: np.ndarray,
+    poses: np.ndarray,
+    line: ShaftLine,
+) -> BaseRegistration:
+    """What two layers show of a base before a still camera, given a prior as `find_base` takes it. poses [F, 4, 4]:
+    base_from_instrument."""
+    base, given = world_from_camera @ found.camera_from_base, prior[0]
+    middle = poses[:, :3, 3].mean(0)
+    moved = (base[:3, :3] - given[:3, :3]) @ middle + base[:3, 3] - given[:3, 3]
+    turned = Rotation.from_matrix(base[:3, :3] @ given[:3, :3].T).magnitude()
+    shaft = (found.camera_from_base[:3, :3] @ poses[:, :3, :3] @ line.axis).mean(0)
+    units = np.array([1 / LEVER] * 3 + [1.0] * 3)
+    after, before = found.covariance[:6, :6] / np.outer(units, units), np.square(found.given[:6] / units)
+    values, vectors = np.linalg.eigh(after)
+    words = [
+        _direction(np.eye(3), shaft / np.linalg.norm(shaft), vector)
+        for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
+        if value > OPEN_SHARE**2 / (np.square(vector) @ (1 / before))
+    ]
+    return BaseRegistration(
+        base, found.clock, float(np.sqrt(found.covariance[6, 6])), np.sqrt(np.diag(found.covariance)[3:6]),
+        np.degrees(np.sqrt(np.diag(found.covariance)[:3])), tuple(dict.fromkeys(words)), float(np.linalg.norm(moved)),
+        float(np.degrees(turned)), np.nan, np.nan, np.nan, found.frames, explained=found.explained,
+    )  # fmt: skip

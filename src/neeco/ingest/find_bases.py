@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from neeco.capture.lens import Lens
 from neeco.capture.model import REFERENCE_PIXELS, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.base import BaseRegistration, find_base
+from neeco.ingest.base import FEWEST, BaseRegistration, base_from_layers, find_base
+from neeco.ingest.base_fit import CLOCK_SD
+from neeco.ingest.base_layers import covered_by, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.base_shape import SHIFTS
 from neeco.ingest.basefile import StatedBase
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.episodes import Episodes
@@ -114,27 +118,71 @@ def place_bases(
     if not unknown:
         return placed
     rows = np.array(evenly_spaced(len(times), FRAMES))
-    masks, images = moving(rows), np.stack([reduced(load(int(row))) for row in rows])
+    images = np.stack([reduced(load(int(row))) for row in rows])
     lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
-    for item in unknown:
-        assert item.base is not None
-        registration, clock = _find(data, item, item.base, (masks, images), lens, times[rows], cameras[rows], hidden)
-        placed[item.name] = PlacedBase(registration.world_from_base, clock, registration)
-        data.note(describe(item.name, registration))
+    seen = _Seen(images, lens, times[rows], cameras[rows], hidden, lambda: moving(rows))
+    arms = [_arm(data, item, seen) for item in unknown]
+    for arm in sorted(
+        arms, key=lambda arm: -arm.travel
+    ):  # what moves most is found most easily, and then out of the way
+        registration = _find(arm, seen, alone=len(arms) == 1)
+        clock = arm.clock
+        if clock.source not in KNOWN:
+            clock = ClockOffset(clock.seconds + registration.clock_s, registration.clock_sd_s, FOUND)
+        placed[arm.item.name] = PlacedBase(registration.world_from_base, clock, registration)
+        data.note(describe(arm.item.name, registration))
     return placed
 
 
-def _find(
-    data: Episodes,
-    item: InstrumentLogs,
-    stated: StatedBase,
-    seen: tuple[np.ndarray, np.ndarray],
-    lens: Lens,
-    times: np.ndarray,
-    cameras: np.ndarray,
-    hidden: np.ndarray | None,
-) -> tuple[BaseRegistration, ClockOffset]:
-    log = data.poses[item.name]
+class _Seen:
+    """Images uint8 [F, h, w, 3] that bases are found from, with their times [F] s and cameras [F, 4, 4], what of them
+    lies beyond a round border, and, once it is asked for, what moves in them."""
+
+    def __init__(
+        self,
+        images: np.ndarray,
+        lens: Lens,
+        times: np.ndarray,
+        cameras: np.ndarray,
+        hidden: np.ndarray | None,
+        moving: Callable[[], np.ndarray],
+    ) -> None:
+        self.images, self.lens, self.times, self.cameras, self.hidden = images, lens, times, cameras, hidden
+        self.still = float(np.ptp(cameras, axis=0).max()) < 1e-6
+        self.usable = np.ones(images.shape[:3], bool) if hidden is None else np.tile(~hidden, (len(images), 1, 1))
+        self._moving = moving
+
+    @cached_property
+    def masks(self) -> np.ndarray:
+        return self._moving()
+
+    @cached_property
+    def lit(self) -> np.ndarray:
+        return evenly_lit(self.images)
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """An instrument whose base is to be found, and what its log says."""
+
+    item: InstrumentLogs
+    where: str
+    clock: ClockOffset
+    readings: dict[str, np.ndarray]  # [F] of each joint
+    prior: tuple[np.ndarray, float, float] | None  # as `find_base` takes it
+    poses_at: Callable[[float], np.ndarray]  # base_from_instrument [F, 4, 4], so many s later; with links, the root's
+
+    @property
+    def travel(self) -> float:
+        """mm, the root mean square distance from where it is on average."""
+        places = self.poses_at(0.0)[:, :3, 3]
+        places = places[np.isfinite(places[:, 0])]
+        return float(np.sqrt(places.var(0).sum())) if len(places) else 0.0
+
+
+def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
+    log, times, stated = data.poses[item.name], seen.times, item.base
+    assert stated is not None
     clock = data.clocks.get(log.clock, ClockOffset(0.0, float("nan"), "assumed equal to the video's"))
     readings = {
         joint: readings_at(reading, times + data.clocks.get(reading.clock, clock).seconds)[0]
@@ -155,18 +203,52 @@ def _find(
     if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
-        prior = (_in_world(stated, cameras), stated.sd_mm, stated.sd_deg)
+        prior = (_in_world(stated, seen.cameras), stated.sd_mm, stated.sd_deg)
+    return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft)
+
+
+def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration:
+    """From outlines of what moves, which are exact, where one arm is there and they show it; else from what stands
+    still behind."""
+    if not alone and (found := _without_masks(arm, seen)) is not None:
+        return found
+    readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
     try:
-        found = find_base(
-            item.name, seen[0], lens.intrinsics, np.linalg.inv(cameras), base_from_shaft, times, prior,
-            readings=np.stack(list(readings.values()), -1) if readings else None, hidden=hidden,
-            images=seen[1], clock_known=clock.source in KNOWN,
+        return find_base(
+            arm.item.name, seen.masks, seen.lens.intrinsics, np.linalg.inv(seen.cameras), arm.poses_at, seen.times,
+            arm.prior, readings=readings, hidden=seen.hidden, images=seen.images, clock_known=arm.clock.source in KNOWN,
         )  # fmt: skip
     except NeecoError as error:
-        raise NeecoError(f"{data.recording.path}: {error}") from error
-    if clock.source not in KNOWN:
-        clock = ClockOffset(clock.seconds + found.clock_s, found.clock_sd_s, FOUND)
-    return found, clock
+        if alone and (found := _without_masks(arm, seen)) is not None:
+            return found
+        raise NeecoError(f"{arm.where}: {error}") from error
+
+
+def _without_masks(arm: _Arm, seen: _Seen) -> BaseRegistration | None:
+    """The base by `base_layers`; from then on, what it covers is nobody else's. None where that cannot tell: the scope
+    moves, nothing is given, or no line goes through a trocar; or where other moments' poses explain the images as
+    well."""
+    if arm.prior is None or not seen.still:
+        return None
+    poses = np.stack([arm.poses_at(float(shift)) for shift in SHIFTS])
+    known = np.flatnonzero(np.isfinite(poses).all((0, 2, 3)))
+    if arm.clock.source in KNOWN:  # no other clock is tried
+        poses = np.tile(arm.poses_at(0.0), (len(SHIFTS), 1, 1, 1))
+        known = np.flatnonzero(np.isfinite(poses[0]).all((1, 2)))
+    line = line_through_trocar(poses[len(SHIFTS) // 2, known]) if len(known) >= FEWEST else None
+    if line is None:
+        return None
+    world_from_camera, (given, sd_mm, sd_deg) = seen.cameras[0], arm.prior
+    prior = (np.linalg.inv(world_from_camera) @ given, sd_mm, sd_deg)
+    sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD
+    found = fit_layers(
+        seen.lit[known], seen.lens.intrinsics, poses[:, known], line, prior, sd_clock, seen.usable[known],
+        np.random.default_rng(0),
+    )  # fmt: skip
+    if not found.found:
+        return None
+    seen.usable[known] &= ~covered_by(found, seen.images.shape[1:3], seen.lens.intrinsics, poses[:, known], line)
+    return base_from_layers(arm.prior, found, world_from_camera, poses[len(SHIFTS) // 2, known], line)
 
 
 def _in_world(stated: StatedBase, cameras: np.ndarray) -> np.ndarray:
@@ -184,10 +266,11 @@ def describe(name: str, found: BaseRegistration) -> str:
     words = f"instrument {name!r}: its base was found from what moves in {found.frames} frames"
     if np.isfinite(found.moved_mm):
         words += f", {found.moved_mm:.1f} mm and {found.turned_deg:.1f} deg from what was given"
-    words += (
-        f"; sure to {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the camera); "
-        f"its outline and what moves overlap by {found.overlap:.2f}"
-    )
+    words += f"; sure to {listed(found.sd_mm)} mm and {listed(found.sd_deg)} deg (right, down, forward of the camera); "
+    if found.fit is None:
+        words += f"without outlines: its shaft explains {found.explained:.0%} of what changes in the images"
+    else:
+        words += f"its outline and what moves overlap by {found.overlap:.2f}"
     if np.isfinite(found.overlap_before):
         words += f" ({found.overlap_before:.2f} as given)"
     if found.open_directions:
