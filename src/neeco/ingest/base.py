@@ -135,8 +135,8 @@ def find_base(
     if shows.sum() < FEWEST:
         raise NeecoError(
             f"instrument {name!r}: camera_from_base: what moves looks like a shaft in {int(shows.sum())} of "
-            f"{len(shows)} frames, at least {FEWEST} are needed; give the exact transform, or a recording that shows "
-            "more of it"
+            f"{len(shows)} frames, at least {FEWEST} are needed; give the transform, exactly or, before a "
+            "still scope, of an arm with a trocar, roughly (sd_mm, sd_deg), or a recording that shows more of it"
         )
     problem = problem.take(np.flatnonzero(shows))
     quick = problem.take(np.array(evenly_spaced(len(problem.blocks), QUICK)))

@@ -24,6 +24,7 @@ from neeco.ingest.registration import GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.still import reduced
 
 FRAMES = 140  # looked at, evenly spaced
+HARDLY_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
 
@@ -125,8 +126,16 @@ def place_bases(
     for arm in sorted(
         arms, key=lambda arm: -arm.travel
     ):  # what moves most is found most easily, and then out of the way
-        registration = _find(arm, seen, alone=len(arms) == 1)
-        clock = arm.clock
+        registration, clock = _find(arm, seen, alone=len(arms) == 1), arm.clock
+        if registration is None:
+            assert arm.prior is not None
+            _, sd_mm, sd_deg = arm.prior
+            placed[arm.item.name] = PlacedBase(arm.prior[0])
+            data.note(
+                f"instrument {arm.item.name!r}: it moves by {arm.travel:.1f} mm only, too little to find its base, "
+                f"which stays as given, sure to {sd_mm:.1f} mm and {sd_deg:.1f} deg"
+            )
+            continue
         if clock.source not in KNOWN:
             clock = ClockOffset(clock.seconds + registration.clock_s, registration.clock_sd_s, FOUND)
         placed[arm.item.name] = PlacedBase(registration.world_from_base, clock, registration)
@@ -207,9 +216,9 @@ def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
     return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft)
 
 
-def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration:
+def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration | None:
     """From outlines of what moves, which are exact, where one arm is there and they show it; else from what stands
-    still behind."""
+    still behind. None for one of several arms that hardly moves: what is given has to do."""
     if not alone and (found := _without_masks(arm, seen)) is not None:
         return found
     readings = np.stack(list(arm.readings.values()), -1) if arm.readings else None
@@ -221,6 +230,8 @@ def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration:
     except NeecoError as error:
         if alone and (found := _without_masks(arm, seen)) is not None:
             return found
+        if not alone and arm.prior is not None and arm.travel < HARDLY_MM:
+            return None
         raise NeecoError(f"{arm.where}: {error}") from error
 
 

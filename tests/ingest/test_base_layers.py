@@ -1,0 +1,193 @@
+"""A base found without masks: dark shafts before a background that is dark in places, posed by arms about trocars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neeco.capture.lens import Lens
+from neeco.errors import NeecoError
+from neeco.ingest.base_layers import Layers, evenly_lit, fit_layers, line_through_trocar
+from neeco.ingest.base_shape import SHIFTS
+from neeco.ingest.basefile import StatedBase
+from neeco.ingest.find_bases import place_bases
+from neeco.ingest.logs import PoseLog
+from neeco.ingest.recording import InstrumentLogs
+from neeco.ingest.registration import GIVEN, ClockOffset
+
+WIDTH, HEIGHT, FOCAL = 80, 64, 100.0
+INTRINSICS = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+RADIUS = 4.0  # mm
+TIMES = np.arange(16) / 2.5
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm whose base is at its trocar, and whose shaft ends where it logs."""
+
+    camera_from_base: np.ndarray
+    pace: float
+
+    def poses_at(self, times: np.ndarray) -> np.ndarray:
+        """base_from_instrument [F, 4, 4]; the shaft along z."""
+        turns = Rotation.from_euler(
+            "XYZ", np.stack([0.09 * np.sin(self.pace * times), 0.07 * np.cos(1.3 * self.pace * times), 0.5 * times], -1)
+        )
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, :3, :3] = turns.as_matrix()
+        depth = 90 + 9 * np.sin(0.8 * self.pace * times + 1)
+        poses[:, :3, 3] = poses[:, :3, 2] * depth[:, None]
+        return poses
+
+    def wrong(self, mm: float, degrees: float) -> np.ndarray:
+        turned = self.camera_from_base.copy()
+        middle = turned[:3, :3] @ (0, 0, 90) + turned[:3, 3]
+        turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+        turned[:3, :3] = turn @ turned[:3, :3]
+        turned[:3, 3] = turn @ (turned[:3, 3] - middle) + middle + mm * np.array([0.6, -0.6, 0.53])
+        return turned
+
+    def beside(self, found: np.ndarray) -> float:
+        """mm, the root mean square distance across the view at which a base puts the shaft beside itself, at all times.
+        Along it nothing tells where the logged frame is: where the shaft ends is not known."""
+        poses = self.camera_from_base @ self.poses_at(TIMES)
+        worst = 0.0
+        for behind in (0.0, 40.0):
+            places = self.poses_at(TIMES) @ (0.0, 0.0, -behind, 1.0)
+            right = places @ self.camera_from_base.T
+            sides = np.cross(poses[:, :3, 2], right[:, :3])
+            sides /= np.linalg.norm(sides, axis=1)[:, None]
+            off = (((places @ found.T) - right)[:, :3] * sides).sum(1)
+            worst = max(worst, float(np.sqrt(np.square(off).mean())))
+        return worst
+
+
+def _towards(start: tuple[float, float, float], end: tuple[float, float, float]) -> np.ndarray:
+    """camera_from_base [4, 4] at `start`, its z towards `end`."""
+    z = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
+    x = np.cross((0.0, 1.0, 0.2), z)
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = np.stack([x, np.cross(z, x), z], -1), start
+    return matrix
+
+
+LEFT = Arm(_towards((-85.0, -40.0, 85.0), (0.0, -5.0, 115.0)), 1.1)
+RIGHT = Arm(_towards((80.0, 45.0, 90.0), (15.0, 20.0, 130.0)), 0.6)
+
+
+def _images(*arms: Arm) -> np.ndarray:
+    """uint8 [F, H, W, 3]: dark tubes before tissue with a dark clamp."""
+    generator = np.random.default_rng(3)
+    tissue = cv2.GaussianBlur(generator.normal(0, 1, (HEIGHT, WIDTH)), (0, 0), 2.0)[..., None] * 70 + (190, 130, 100)
+    tissue[:, 25:33] = 25  # black, as the shafts
+    images = []
+    for row, time in enumerate(TIMES):
+        image = tissue.copy()
+        for arm in arms:
+            pose = arm.camera_from_base @ arm.poses_at(TIMES[row : row + 1])[0]
+            ends = np.stack([pose[:3, 3], pose[:3, 3] - 88 * pose[:3, 2]])
+            pixels = FOCAL * ends[:, :2] / ends[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+            way = np.diff(pixels, axis=0)[0] / np.linalg.norm(np.diff(pixels, axis=0))
+            side = FOCAL * RADIUS / ends[:, 2:] * (-way[1], way[0])
+            corners = np.concatenate([pixels + side, (pixels - side)[::-1]]) - 0.5
+            cv2.fillPoly(image, [np.rint(corners * 8).astype(np.int32)], (22, 22, 25), cv2.LINE_AA, 3)
+        image = image * (1 + 0.1 * np.sin(time))  # the exposure changes
+        images.append(np.clip(image + generator.normal(0, 2, image.shape), 0, 255).astype(np.uint8))
+    return np.stack(images)
+
+
+def test_a_log_about_a_trocar_tells_where_the_shaft_lies():
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_rotvec((0.3, -0.2, 0.1)).as_matrix()
+    moved[:3, 3] = 3.0, -2.0, 5.0
+    line = line_through_trocar(LEFT.poses_at(TIMES) @ moved)
+    assert line is not None
+    axis = moved[:3, :3].T @ (0, 0, 1)
+    point = -moved[:3, :3].T @ moved[:3, 3]
+    assert np.allclose(line.axis, axis, atol=1e-6)
+    assert np.allclose(line.point, point - (point @ axis) * axis, atol=1e-5)
+
+
+def test_a_wrist_that_bends_behind_what_is_logged_leaves_no_line():
+    bend = np.tile(np.eye(4), (len(TIMES), 1, 1))
+    bend[:, :3, :3] = Rotation.from_rotvec(np.outer(0.6 * np.sin(2.1 * TIMES), (0.0, 1.0, 0.0))).as_matrix()
+    tip = np.eye(4)
+    tip[2, 3] = 9.0
+    assert line_through_trocar(LEFT.poses_at(TIMES) @ bend @ tip) is None
+
+
+def test_a_dark_shaft_is_found_before_a_dark_clamp_without_masks_while_another_arm_moves():
+    images, poses = evenly_lit(_images(LEFT, RIGHT)), np.tile(LEFT.poses_at(TIMES), (len(SHIFTS), 1, 1, 1))
+    line, given = line_through_trocar(poses[0]), LEFT.wrong(6, 4)
+    assert line is not None
+    usable = np.ones(images.shape[:3], bool)
+    layers = Layers(images, INTRINSICS, poses, line, usable, WIDTH)
+    right, wrong = (layers.losses(base, 0.0, RADIUS, 0.0).mean() for base in (LEFT.camera_from_base, given))
+    assert right < 0.8 * wrong
+    found = fit_layers(images, INTRINSICS, poses, line, (given, 5.0, 3.0), 0.0, usable, np.random.default_rng(0))
+    assert LEFT.beside(given) > 4
+    assert LEFT.beside(found.camera_from_base) < 1.0
+    assert found.found
+    assert abs(found.radius - RADIUS) < 0.8
+    sds = np.sqrt(np.diag(found.covariance))
+    assert (sds[:6] < found.given[:6]).all()
+
+
+def _log(arm: Arm) -> PoseLog:
+    times = np.arange(-0.4, TIMES[-1] + 0.4, 0.02)
+    poses = arm.poses_at(times)
+    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    return PoseLog(path=None, clock="ros", times=times, positions=poses[:, :3, 3], quats=quats, gaps=(), notes=())
+
+
+def _data(arms: dict[str, Arm], bases: dict[str, StatedBase]) -> SimpleNamespace:
+    notes: list[str] = []
+    instruments = tuple(InstrumentLogs(name, base=base) for name, base in bases.items())
+    return SimpleNamespace(
+        recording=SimpleNamespace(path="recording.yaml", instruments=instruments),
+        poses={name: _log(arm) for name, arm in arms.items()}, joints={name: {} for name in arms},
+        clocks={"ros": ClockOffset(0.0, 0.0, GIVEN)}, notes=notes, note=notes.append,
+    )  # fmt: skip
+
+
+def _place(data: SimpleNamespace, images: np.ndarray) -> dict:
+    lens = Lens(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (), (WIDTH, HEIGHT))
+    cameras = np.tile(np.eye(4), (len(TIMES), 1, 1))
+
+    def no_masks(rows: np.ndarray) -> np.ndarray:
+        return np.zeros((len(rows), HEIGHT, WIDTH), bool)
+
+    return place_bases(data, TIMES, cameras, lens, lambda row: images[row], no_masks)
+
+
+@pytest.mark.slow
+def test_the_bases_of_two_arms_in_one_view_are_found_and_told():
+    arms = {"psm1": LEFT, "psm2": RIGHT}
+    data = _data(arms, {name: StatedBase(arm.wrong(6, 4), 5.0, 3.0) for name, arm in arms.items()})
+    placed = _place(data, _images(LEFT, RIGHT))
+    for name, arm in arms.items():
+        assert arm.beside(placed[name].world_from_base) < 1.0
+    assert all("without outlines: its shaft explains" in note for note in data.notes)
+
+
+def test_of_several_arms_one_that_hardly_moves_keeps_what_is_given():
+    resting = Arm(RIGHT.camera_from_base, 0.0)
+    arms = {"psm1": resting, "psm2": resting}
+    data = _data(arms, {name: StatedBase(RIGHT.wrong(6, 4), 5.0, 3.0) for name in arms})
+    placed = _place(data, _images(resting))
+    assert np.array_equal(placed["psm1"].world_from_base, RIGHT.wrong(6, 4))
+    assert "too little to find its base, which stays as given, sure to 5.0 mm and 3.0 deg" in data.notes[0]
+
+
+def test_one_that_moves_and_is_not_seen_is_refused():
+    data = _data({"psm1": RIGHT, "psm2": RIGHT}, {"psm1": StatedBase(), "psm2": StatedBase()})
+    with pytest.raises(
+        NeecoError, match=r"recording\.yaml: instrument 'psm1': camera_from_base: what moves looks like"
+    ):
+        _place(data, _images(LEFT))
