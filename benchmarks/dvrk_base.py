@@ -6,13 +6,14 @@ found is from its registration.
     python benchmarks/dvrk_base.py score DVRK INGEST.json [--camera p1_left]
     python benchmarks/dvrk_base.py references DVRK CAPTURE [--camera p1_left]      # then train and evaluate CAPTURE
 
-`write` makes a recording of a still scope: images, their times, and for each arm poses and wrist in the frame of its own
-base, the clock exact. The base is stated as it was registered (exact), as unknown, or so many mm and degrees off where the
-instrument is, in a direction drawn with the seed. The jaws' opening is not recorded: they are one end effector. All three
-trials follow each other; frames are `test` and `unseen` as in `dvrk`.
+`write` makes a recording of a still scope: images, their times, and for each arm poses and wrist in the frame of
+its base, the clock exact. BASE is how that is stated: as it was registered (exact), unknown, or MMxDEG off where the
+instrument is, in a direction drawn with the seed (8x5). The jaws' opening is not recorded: they are one end effector.
+All three trials follow each other; frames are `test` and `unseen` as in `dvrk`.
 
-`score` prints for each arm what `ingest` found, and what was given, against the registration, as
-`benchmarks/base_registration.py` does. `references` puts the hand-made masks of that camera into an ingested capture.
+`score` prints for each arm how far what `ingest` found is from the registration, as `benchmarks/base_registration.py`
+does, and how far the shaft is drawn beside itself. `references` puts that camera's hand-made masks into an ingested
+capture.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from neeco.evaluation.mask_folders import REFERENCE_FOLDER
 WRIST = {"wrist_pitch": "wrist_pitch_rad", "wrist_yaw": "wrist_yaw_rad"}
 REGISTERED = "transforms_registered.json"
 PAUSE_S = 5.0  # between two trials
+SHAFT_MM = 40.0  # of a shaft, that are looked at
 LOG_S = 0.02  # between two rows of a log
 
 
@@ -91,7 +93,7 @@ class _Trials:
         for row, frame in enumerate(self.frames):
             shutil.copyfile(frame.image_path, output / "images" / f"{row:03d}_{frame.image_path.name}")
         _write_table(output / "times.csv", ["time_s"], self.times[:, None])
-        for number, (name, poses) in enumerate(self.poses.items()):
+        for number, name in enumerate(self.poses):
             header = ["t_s", *(f"m{i}{j}" for i in range(4) for j in range(4)), *WRIST.values()]
             _write_table(output / f"{name}.csv", header, self._log(name))
             columns: dict[str, Any] = {"time": "t_s", "matrix": header[1:17]}
@@ -147,7 +149,9 @@ class _Trials:
     def score(self, printed: dict[str, Any]) -> None:
         """Print errors of the bases in what `neeco ingest --json` printed."""
         for name, base in printed["bases"].items():
-            errors = base_errors(np.array(base["world_from_base"]), self.bases[name], self.poses[name])
+            found = np.array(base["world_from_base"])
+            errors = base_errors(found, self.bases[name], self.poses[name])
+            errors["sideways_mm"] = _sideways(found, self.bases[name], self.poses[name])
             print(name, ", ".join(f"{key} {value:.2f}" for key, value in errors.items()))
 
     def copy_references(self, ingested: Path) -> None:
@@ -162,6 +166,19 @@ class _Trials:
 def _poses(frames: list[Frame], name: str) -> np.ndarray:
     """[F, 4, 4] of an instrument, as recorded."""
     return np.array([np.asarray(frame.state.instruments[name].pose, np.float64) for frame in frames])
+
+
+def _sideways(found: np.ndarray, truth: np.ndarray, poses: np.ndarray) -> float:
+    """mm, root mean square, by which a base puts the shaft beside itself across the view, at its end and SHAFT_MM
+    behind: towards its trocar, where the frame of a dVRK's base is."""
+    squares = []
+    for behind in (0.0, SHAFT_MM):
+        places = poses[:, :3, 3] * (1 - behind / np.linalg.norm(poses[:, :3, 3], axis=1))[:, None]
+        right, off = (places @ base[:3, :3].T + base[:3, 3] for base in (truth, found))
+        sides = np.cross(right - truth[:3, 3], right)
+        sides /= np.linalg.norm(sides, axis=1)[:, None]
+        squares.append(np.square(((off - right) * sides).sum(1)).mean())
+    return float(np.sqrt(np.mean(squares)))
 
 
 def _closed(tool: Path) -> KinematicTree:

@@ -39,6 +39,7 @@ ELITE = 15  # of them at most, a third at least, about which the next are tried
 PARAMETERS = 9  # turn rad [3], shift mm [3], clock s, logarithm of the radius, mm ahead
 NEAR = 0.5  # standard deviations about what is found, within which exchanged poses are tried
 PROBE, PROBES = 0.25, 140  # standard deviations by which, and how often, the loss is looked at about its least
+SIZE_BIAS, END_BIAS, EDGE_BIAS = 0.03, 4.0, 1.0  # of the distance, mm along the shaft, and mm anywhere
 FLAT = 1e-4  # curvature from which a direction is told
 GROWN, BEYOND = 1.3, 10.0  # times its radius, and mm beyond its end, that a shaft found is taken to cover
 EXCHANGED = (0.37, 0.61)  # of the recording, by which poses are exchanged
@@ -252,9 +253,9 @@ def fit_layers(
         best, _ = _narrowed(other, mean, NEAR**2 * np.eye(PARAMETERS), ROUNDS[1], generator)
         certain = min(certain, _certainty(other.losses(best) - losses))
     mean, spread = _narrowed(fine, mean, AGAIN**2 * spread, ROUNDS[2], generator)
-    covariance = _covariance(fine, mean, generator) * np.outer(sds, sds)
+    covariance = _covariance(fine, mean, generator) * np.outer(sds, sds)[:7, :7]
     explained = 1 - float(losses.mean() / nothing.mean())
-    return LayerFit(*fine.at(mean), explained, certain, covariance[:7, :7], sds[:7], len(images))
+    return LayerFit(*fine.at(mean), explained, certain, covariance, sds[:7], len(images))
 
 
 def covered_by(
@@ -291,8 +292,8 @@ def _certainty(differences: np.ndarray) -> float:
 
 
 def _covariance(trial: _Trial, mean: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """[PARAMETERS, PARAMETERS] after the images, in standard deviations of what was given: from how the loss curves,
-    and from how its gradient scatters over stretches of the recording."""
+    """[7, 7] of the base and the clock after the images, in standard deviations of what was given: from how the loss
+    curves, how its gradient scatters over stretches of the recording, and what is alike in all of them."""
     tried = PROBE * generator.normal(size=(PROBES, PARAMETERS))
     losses = np.stack([trial.losses(mean + x) for x in tried])  # [N, F]
     pairs = np.triu_indices(PARAMETERS)
@@ -304,8 +305,20 @@ def _covariance(trial: _Trial, mean: np.ndarray, generator: np.random.Generator)
     values, vectors = np.linalg.eigh(curves + curves.T)
     scatter = BLOCKS * np.cov(slopes.T)
     variances = np.einsum("ip,ij,jp->p", vectors, scatter, vectors) / np.maximum(values, FLAT) ** 2
+    images = (vectors @ np.diag(np.maximum(variances, 1e-6)) @ vectors.T)[:7, :7]
+    images[3:6, 3:6] += _alike(trial, mean) / np.outer(trial.sds[3:6], trial.sds[3:6])
+    return np.asarray(np.linalg.inv(np.linalg.inv(images) + np.eye(7)))
+
+
+def _alike(trial: _Trial, mean: np.ndarray) -> np.ndarray:
+    """[3, 3] mm^2 of shifts by which a base is off however many images there are: along the shaft, as its end is not
+    known, along the view, as its size is hardly, and everywhere by what edges blur."""
+    base = trial.at(mean)[0]
+    place = base[:3, :3] @ trial.middle + base[:3, 3]
+    shaft = base[:3, :3] @ (trial.layers.poses[len(SHIFTS) // 2, :, :3, :3] @ trial.layers.line.axis).mean(0)
+    shaft = shaft / np.linalg.norm(shaft)
     return np.asarray(
-        np.linalg.inv(vectors @ np.diag(1 / np.maximum(variances, 1e-6)) @ vectors.T + np.eye(PARAMETERS))
+        SIZE_BIAS**2 * np.outer(place, place) + END_BIAS**2 * np.outer(shaft, shaft) + EDGE_BIAS**2 * np.eye(3)
     )
 
 
