@@ -24,11 +24,12 @@ LEAST_LEVER = 40.0  # mm from the instrument to its trocar
 LINE_MM = 0.3  # by which a trocar may miss the line: beyond, what is logged bends against the shaft
 LEAST_TRAVEL = 2.0  # mm in and out, from which a line has a direction
 RADIUS, RADIUS_SD = 3.8, 0.2  # mm of a shaft, and of its logarithm
-AHEAD, AHEAD_SD = 8.0, 6.0  # mm from the logged frame's place to where the shaft, with its wrist, ends
+AHEAD, AHEAD_SD = 8.0, 6.0  # mm from the logged frame's place to where the instrument ends
 LENGTH = 140.0  # mm of the shaft that are looked at
 WIDTHS = 40, 80, 160  # px of images, one after the other
 FRAMES = 30, 36, 48  # looked at, in each
 SPREAD = 20.0  # of 255, the deviation from which a colour counts as another
+WRIST = 40.0  # mm of what lies beyond the bend, at most
 STEP_MM, COLUMNS = 2.0, 5  # of the shaft's colours along it, and how many across
 FEWEST = 2.0  # images that show a pixel's background, to know it
 PRIOR = 1e-4  # of the mean loss: what a parameter one standard deviation off costs
@@ -90,8 +91,10 @@ class Layers:
         line: ShaftLine,
         usable: np.ndarray,
         width: int,
+        wrists: np.ndarray | None = None,
     ) -> None:
-        """images: uint8 [F, H, W, 3]; poses [S, F, 4, 4] at SHIFTS; usable: bool [F, H, W], which pixels count."""
+        """images: uint8 [F, H, W, 3]; poses [S, F, 4, 4] at SHIFTS; usable: bool [F, H, W], which pixels count;
+        wrists: [F, 3] mm in the shaft's frame, to where it bends (None: it goes straight on)."""
         count, height, full = images.shape[:3]
         size = (min(width, full), max(1, round(height * min(width, full) / full)))
         self.size = size
@@ -103,12 +106,14 @@ class Layers:
         self.intrinsics = intrinsics[0] * x, intrinsics[1] * y, intrinsics[2] * x, intrinsics[3] * y
         rows, columns = np.mgrid[: size[1], : size[0]].astype(np.float32) + 0.5
         self.pixels = np.stack([columns.ravel(), rows.ravel()], -1)
-        self.poses, self.line = poses, line
+        self.poses, self.line, self.wrists = poses, line, wrists
 
     def exchanged(self, share: float) -> Layers:
         """The same images with the poses of other moments, so much of the recording away."""
         other = copy.copy(self)
-        other.poses = np.roll(self.poses, round(share * self.poses.shape[1]), axis=1)
+        away = round(share * self.poses.shape[1])
+        other.poses = np.roll(self.poses, away, axis=1)
+        other.wrists = None if self.wrists is None else np.roll(self.wrists, away, axis=0)
         return other
 
     def covered(
@@ -118,14 +123,25 @@ class Layers:
         place = np.clip((clock - SHIFTS[0]) / (SHIFTS[1] - SHIFTS[0]), 0, len(SHIFTS) - 1.001)
         low = int(place)
         poses = camera_from_base @ (self.poses[low] + (place - low) * (self.poses[low + 1] - self.poses[low]))
-        fx, fy, cx, cy = self.intrinsics
         axis = poses[:, :3, :3] @ self.line.axis
         middle = poses[:, :3, :3] @ self.line.point + poses[:, :3, 3]
-        ends = [middle + ahead * axis, middle - LENGTH * axis]
-        depths = [np.maximum(end[:, 2], NEAREST) for end in ends]
+        back = middle - LENGTH * axis
+        if self.wrists is None:
+            return self._tube(middle + ahead * axis, back, radius)
+        inside, mm, across = self._tube(middle, back, radius)
+        tips = np.einsum("fij,fj->fi", poses[:, :3, :3], self.wrists) + poses[:, :3, 3]
+        beyond = (tips - middle) / np.maximum(np.linalg.norm(tips - middle, axis=1), 1e-3)[:, None]
+        other, before, beside = self._tube(tips + ahead * beyond, middle, radius)
+        wrist = other > inside
+        return np.where(wrist, other, inside), np.where(wrist, before, mm + WRIST), np.where(wrist, beside, across)
+
+    def _tube(self, start: np.ndarray, end: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `covered`, of a tube from `start` to `end`, both [F, 3] mm in the camera's frame."""
+        fx, fy, cx, cy = self.intrinsics
+        depths = [np.maximum(point[:, 2], NEAREST) for point in (start, end)]
         front, back = (
-            np.stack([end[:, 0] / depth * fx + cx, end[:, 1] / depth * fy + cy], -1).astype(np.float32)
-            for end, depth in zip(ends, depths, strict=True)
+            np.stack([point[:, 0] / depth * fx + cx, point[:, 1] / depth * fy + cy], -1).astype(np.float32)
+            for point, depth in zip((start, end), depths, strict=True)
         )
         length = np.maximum(np.linalg.norm(back - front, axis=1), 1e-3)
         ways = (back - front) / length[:, None]
@@ -137,7 +153,8 @@ class Layers:
         half = np.maximum((near + share * (far - near)).astype(np.float32), 0.3)
         inside = np.clip(np.minimum(half - np.abs(across), behind) + 0.5, 0, 1) * (share < 1)
         first, last = (depth[:, None].astype(np.float32) for depth in depths)
-        mm = share * first / np.maximum(last + share * (first - last), 1e-3) * (ahead + LENGTH)
+        whole = np.linalg.norm(end - start, axis=1)[:, None].astype(np.float32)
+        mm = share * first / np.maximum(last + share * (first - last), 1e-3) * whole
         return inside * (depths[0] > NEAREST)[:, None], mm, across / half
 
     def losses(self, camera_from_base: np.ndarray, clock: float, radius: float, ahead: float) -> np.ndarray:
@@ -224,19 +241,29 @@ def fit_layers(
     sd_clock: float,
     usable: np.ndarray,
     generator: np.random.Generator,
+    wrists: np.ndarray | None = None,
 ) -> LayerFit:
     """The base of one arm before a still camera, about a prior: (camera_from_base, sd mm at the instrument, sd
     degrees).
 
     images: uint8 [F, H, W, 3], seen through a pinhole of `intrinsics`, evenly lit (`evenly_lit`); poses [S, F, 4, 4]:
-    base_from_instrument at SHIFTS; sd_clock s: 0 where the clock is known; usable: bool [F, H, W].
+    base_from_instrument at SHIFTS; sd_clock s: 0 where the clock is known; usable: bool [F, H, W]; wrists as `Layers`
+    has them.
     """
     sds = np.array([np.radians(prior[2])] * 3 + [prior[1]] * 3 + [sd_clock, RADIUS_SD, AHEAD_SD])
     middle = poses[len(SHIFTS) // 2, :, :3, 3].mean(0)
 
     def trial(width: int, count: int) -> _Trial:
         rows = np.unique(np.linspace(0, len(images) - 1, min(count, len(images))).astype(int))
-        layers = Layers(images[rows], intrinsics, poses[:, rows], line, usable[rows], width)
+        layers = Layers(
+            images[rows],
+            intrinsics,
+            poses[:, rows],
+            line,
+            usable[rows],
+            width,
+            None if wrists is None else wrists[rows],
+        )
         return _Trial(layers, prior[0], middle, sds)
 
     coarse, middle_sized, fine = (trial(width, count) for width, count in zip(WIDTHS, FRAMES, strict=True))
@@ -264,10 +291,11 @@ def covered_by(
     intrinsics: tuple[float, float, float, float],
     poses: np.ndarray,
     line: ShaftLine,
+    wrists: np.ndarray | None = None,
 ) -> np.ndarray:
     """bool [F, H, W]: where images of such a size (H, W) show the shaft of a fit, and its wrist."""
     none = np.zeros((poses.shape[1], *size, 3), np.uint8)
-    layers = Layers(none, intrinsics, poses, line, none[..., 0] == 0, size[1])
+    layers = Layers(none, intrinsics, poses, line, none[..., 0] == 0, size[1], wrists)
     inside, _, _ = layers.covered(fit.camera_from_base, fit.clock, GROWN * fit.radius, fit.ahead + BEYOND)
     return (inside > 0).reshape(-1, *size)
 

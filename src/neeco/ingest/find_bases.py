@@ -24,6 +24,7 @@ from neeco.ingest.registration import GIVEN, SCOPE_MOTION, ClockOffset
 from neeco.ingest.still import reduced
 
 FRAMES = 140  # looked at, evenly spaced
+STRAIGHT_MM = 2.0  # from the root to the link that is logged: nearer, nothing bends there
 HARDLY_MM = 2.0  # root mean square, from which an arm counts as moving
 KNOWN, FOUND = (GIVEN, SCOPE_MOTION), "found with the base"  # sources of clocks
 
@@ -180,6 +181,7 @@ class _Arm:
     readings: dict[str, np.ndarray]  # [F] of each joint
     prior: tuple[np.ndarray, float, float] | None  # as `find_base` takes it
     poses_at: Callable[[float], np.ndarray]  # base_from_instrument [F, 4, 4], so many s later; with links, the root's
+    wrists: np.ndarray | None  # [F, 3] mm in the root's frame, with links: where the link is whose pose is logged
 
     @property
     def travel(self) -> float:
@@ -199,21 +201,29 @@ def _arm(data: Episodes, item: InstrumentLogs, seen: _Seen) -> _Arm:
     }
     readings = {joint: values for joint, values in readings.items() if np.isfinite(values).all()}
 
+    tree = item.kinematics
+    bends = tree is not None and tree.pose_of is not None and set(tree.readings) <= set(readings)
+    states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
+
     def base_from_shaft(shift: float) -> np.ndarray:
         poses, _ = poses_at(log, times + clock.seconds + shift)
-        tree = item.kinematics
-        if tree is None or tree.pose_of is None or not set(tree.readings) <= set(readings):
+        if not bends:
             return poses
-        states = [{joint: float(values[row]) for joint, values in readings.items()} for row in range(len(times))]
-        roots = [tree.world_from_root(pose, state) for pose, state in zip(poses, states, strict=True)]
-        return np.stack(roots)
+        assert tree is not None
+        return np.stack([tree.world_from_root(pose, state) for pose, state in zip(poses, states, strict=True)])
 
+    wrists = None
+    if bends:
+        assert tree is not None
+        assert tree.pose_of is not None
+        wrists = np.stack([tree.poses(state)[tree.pose_of][:3, 3] for state in states])
+        wrists = wrists if np.linalg.norm(wrists, axis=1).min() > STRAIGHT_MM else None
     prior = None
     if stated.matrix is not None:
         assert stated.sd_mm is not None
         assert stated.sd_deg is not None
         prior = (_in_world(stated, seen.cameras), stated.sd_mm, stated.sd_deg)
-    return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft)
+    return _Arm(item, str(data.recording.path), clock, readings, prior, base_from_shaft, wrists)
 
 
 def _find(arm: _Arm, seen: _Seen, *, alone: bool) -> BaseRegistration | None:
@@ -249,16 +259,19 @@ def _without_masks(arm: _Arm, seen: _Seen) -> BaseRegistration | None:
     line = line_through_trocar(poses[len(SHIFTS) // 2, known]) if len(known) >= FEWEST else None
     if line is None:
         return None
+    wrists = None if arm.wrists is None else arm.wrists[known]
     world_from_camera, (given, sd_mm, sd_deg) = seen.cameras[0], arm.prior
     prior = (np.linalg.inv(world_from_camera) @ given, sd_mm, sd_deg)
     sd_clock = 0.0 if arm.clock.source in KNOWN else CLOCK_SD
     found = fit_layers(
         seen.lit[known], seen.lens.intrinsics, poses[:, known], line, prior, sd_clock, seen.usable[known],
-        np.random.default_rng(0),
+        np.random.default_rng(0), wrists,
     )  # fmt: skip
     if not found.found:
         return None
-    seen.usable[known] &= ~covered_by(found, seen.images.shape[1:3], seen.lens.intrinsics, poses[:, known], line)
+    seen.usable[known] &= ~covered_by(
+        found, seen.images.shape[1:3], seen.lens.intrinsics, poses[:, known], line, wrists
+    )
     return base_from_layers(arm.prior, found, world_from_camera, poses[len(SHIFTS) // 2, known], line)
 
 
