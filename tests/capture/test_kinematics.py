@@ -108,6 +108,14 @@ def test_a_tool_of_the_dvrk_stands_as_denavit_and_hartenberg_say(tmp_path: Path)
     assert np.allclose(poses["jaw_right"], wrist @ frame(9.1, yaw - jaw / 2))
 
 
+def test_a_tool_file_with_the_older_names_of_joints_makes_the_same_tree(tmp_path: Path) -> None:
+    trees = []
+    for name, text in (("new.json", TOOL), ("old.json", TOOL.replace('"wrist_', '"outer_wrist_'))):
+        (tmp_path / name).write_text(text)
+        trees.append(read_dvrk_tool(tmp_path / name).to_json())
+    assert trees[0] == trees[1]
+
+
 def test_a_tool_without_jaws_has_one_end_effector(tmp_path: Path) -> None:
     file = tmp_path / "HOOK.json"
     file.write_text(TOOL.replace('"ftmax": 0.16', '"ftmax": 0.0'))

@@ -38,7 +38,8 @@ def read_dvrk_tool(path: Path | str, readings: Mapping[str, str] | None = None) 
     if frames.child("convention").value != "modified":
         found = printable(frames.child("convention").value)
         frames.child("convention").error(f"is {found}, not 'modified'", "give a tool file of the dVRK")
-    joints = {item.child("name").text(): item for item in frames.child("joints").items()}
+    # older files call them outer_wrist_pitch and outer_wrist_yaw
+    joints = {(item.child("name").text() or "").removeprefix("outer_"): item for item in frames.child("joints").items()}
     # hooks and spatulas have an entry for jaws, too, which no force moves
     has_jaws = document.has("jaw") and document.child("jaw").child("ftmax").value != 0
     for joint in READINGS[:2]:
