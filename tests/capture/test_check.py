@@ -63,6 +63,15 @@ def _joint(index, value):
     return lambda document: document["frames"][index]["instruments"][0]["joints"].__setitem__("jaw_angle", value)
 
 
+def _uncertainty(**changes):
+    given = {"translation_mm": [0.2, 0.2, 1.0], "rotation_deg": [1, 1, 180], **changes}
+    return lambda document: document["frames"][3]["instruments"][0].update(uncertainty=given)
+
+
+def _from_video(value):
+    return lambda document: document["instruments"][0].update(from_video=value)
+
+
 def _head(key, value):
     return lambda document: document.__setitem__(key, value)
 
@@ -99,6 +108,12 @@ EDITS = [
         "frames[5].instruments[0].joints.jaw_angle",
         "missing",
     ),
+    (_uncertainty(translation_mm=[1, 2]), "frames[3].instruments[0].uncertainty.translation_mm", "3 numbers"),
+    (_uncertainty(rotation_deg=[1, -1, 2]), "frames[3].instruments[0].uncertainty.rotation_deg", "standard deviation"),
+    (_uncertainty(joints_deg={"x": 1}), "frames[3].instruments[0].uncertainty.joints_deg.x", "no such joint"),
+    (_uncertainty(joints_deg=[]), "frames[3].instruments[0].uncertainty.joints_deg", "expected an object"),
+    (_from_video({"shaft_diameter_mm": 0}), "instruments[0].from_video.shaft_diameter_mm", "out of range"),
+    (_from_video({"shaft_diameter_mm": 5}), "instruments[0].from_video.working_length_mm", "expected a number"),
     (_head("cx", 900), "cx", "outside the image"),
     (_head("fl_x", 0), "fl_x", "positive"),
     (_head("camera_model", "OPENCV_FISHEYE"), "camera_model", "only PINHOLE"),

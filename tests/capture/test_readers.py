@@ -17,7 +17,17 @@ from scipy.spatial.transform import Rotation
 from neeco.capture import check_capture, errors_only, read_capture, write_capture
 from neeco.capture.images import read_image, read_labels, read_mask, write_image, write_labels
 from neeco.capture.lens import Lens
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
+from neeco.capture.model import (
+    Capture,
+    Frame,
+    FromVideo,
+    Instrument,
+    InstrumentState,
+    PointCloud,
+    State,
+    Uncertainty,
+    evenly_spaced,
+)
 from neeco.capture.points import points_in_view, read_ply
 from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
@@ -71,6 +81,23 @@ def test_the_lens_of_a_recording_is_written_and_read_back(folder, tmp_path, lens
     copy = read_capture(tmp_path / "copy")
     assert copy.lens == lens
     assert fingerprint(copy) != fingerprint(replace(copy, lens=None)) == fingerprint(capture)
+
+
+def test_what_was_found_in_video_is_written_and_read_back(folder, tmp_path):
+    capture = read_capture(folder.root)
+    instruments = (replace(capture.instruments[0], from_video=FromVideo(5.0, 26.0)),)
+    (name, state), *_ = capture.frames[0].state.instruments.items()
+    sure = Uncertainty((0.2, 0.1, 1.5), (0.5, 0.7, 180.0), {"jaw_angle": 6.0})
+    first = replace(capture.frames[0], state=State({name: replace(state, uncertainty=sure)}))
+    changed = replace(capture, instruments=instruments, frames=(first, *capture.frames[1:]))
+    write_capture(changed, tmp_path / "copy")
+    copy = read_capture(tmp_path / "copy")
+    assert copy.instruments == instruments
+    assert copy.frames[0].state.instruments[name].uncertainty == sure
+    assert copy.frames[1].state.instruments[name].uncertainty is None
+    assert fingerprint(copy) == fingerprint(changed) != fingerprint(replace(changed, instruments=capture.instruments))
+    unsure = replace(changed, frames=(capture.frames[0], *capture.frames[1:]))
+    assert fingerprint(unsure) != fingerprint(changed)
 
 
 def test_the_sample_round_trips_and_has_truth(tmp_path):

@@ -29,6 +29,15 @@ _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
+class Uncertainty:
+    """How far an instrument's state may be off: standard deviations."""
+
+    translation_mm: tuple[float, float, float]  # of the origin, in the camera's axes: across, across, depth
+    rotation_deg: tuple[float, float, float]  # about the instrument's x, y, z: tilt, tilt, roll; 180: nobody knows it
+    joints_deg: Mapping[str, float] = field(default_factory=dict)  # name -> degrees (mm for sliding joints)
+
+
+@dataclass(frozen=True)
 class InstrumentState:
     """Where one instrument is and how its joints stand.
 
@@ -39,11 +48,16 @@ class InstrumentState:
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
     joints: Mapping[str, float] = field(default_factory=dict)  # name -> rad (mm for sliding joints, named *_mm)
     trust: float | None = None  # in [0, 1], how far `track` trusts it; None: it was recorded
+    uncertainty: Uncertainty | None = None  # None: nobody said
 
     if TYPE_CHECKING:  # what may be given
 
         def __init__(
-            self, pose: ArrayLike | Tensor, joints: Mapping[str, float] = ..., trust: float | None = ...
+            self,
+            pose: ArrayLike | Tensor,
+            joints: Mapping[str, float] = ...,
+            trust: float | None = ...,
+            uncertainty: Uncertainty | None = ...,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -77,16 +91,28 @@ class State:
 
 
 @dataclass(frozen=True)
+class FromVideo:
+    """What is known of a rigid instrument whose poses were found in the images, from its shaft.
+
+    Its frame then has +z along the shaft, from the handle towards the tip, and its origin on the shaft's axis,
+    `working_length_mm` behind the tip as the silhouette shows it."""
+
+    shaft_diameter_mm: float
+    working_length_mm: float
+
+
+@dataclass(frozen=True)
 class Instrument:
     """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
     or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
     `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
-    they stand half way between these until they are found."""
+    they stand half way between these until they are found. `from_video`: its poses were found in the images."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
     unrecorded: tuple[str, ...] = ()
+    from_video: FromVideo | None = None
 
     def halfway(self, joint: str) -> float:
         """The middle of a joint's limits; 0 where none are stated."""

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from neeco.capture.documents import Node, RaisingReport, printable
+from neeco.capture.fromvideofile import parse_from_video, parse_uncertainty
 from neeco.capture.kinematicsfile import parse_kinematics
 from neeco.capture.model import Frame, Instrument, InstrumentState, State, swap_camera_axes
 from neeco.errors import NeecoError
@@ -90,13 +91,14 @@ def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
         joints = {joint: child.number() for joint, child in (nodes or {}).items()}
         known = {joint: value for joint, value in joints.items() if value is not None}
         trust = _trust(item)
+        uncertainty = parse_uncertainty(item.child("uncertainty"), known) if item.has("uncertainty") else None
         if name in states:
             item.child("name").error(f"{printable(name)} comes twice here", "keep one state per instrument")
             good = False
         if name is None or pose is None or nodes is None or len(known) < len(joints):
             good = False
             continue
-        states[name] = InstrumentState(torch.from_numpy(pose), known, trust)
+        states[name] = InstrumentState(torch.from_numpy(pose), known, trust, uncertainty)
     return states if good else None
 
 
@@ -124,7 +126,8 @@ def declared_instruments(document: Node) -> tuple[Instrument, ...]:
         if name in instruments:
             item.child("name").error(f"{printable(name)} is declared twice", "give every instrument its own name")
         tree = parse_kinematics(item.child("kinematics")) if item.has("kinematics") else None
-        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded))
+        seen = parse_from_video(item.child("from_video")) if item.has("from_video") else None
+        instruments[name] = Instrument(name, joints, tree, tuple(unrecorded), seen)
     return tuple(instruments.values())
 
 

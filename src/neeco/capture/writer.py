@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neeco.capture.fromvideofile import from_video_to_json, uncertainty_to_json
 from neeco.capture.images import has_alpha, write_image
 from neeco.capture.model import Capture, Frame, Instrument, swap_camera_axes
 from neeco.capture.points import write_ply
@@ -95,6 +96,12 @@ def fingerprint(capture: Capture) -> str:
             "state": state_to_json(frame.state),
             "background": frame.background,
         }
+        sure = {
+            name: uncertainty_to_json(state.uncertainty)
+            for name, state in frame.state.instruments.items()
+            if state.uncertainty is not None
+        }
+        description |= {"uncertainty": sure} if sure else {}  # captures without keep their older fingerprint
         digest.update(json.dumps(description).encode())
         for path in (frame.image_path, frame.mask_path):
             digest.update(b"-" if path is None else hashlib.sha256(read_bytes(path, "an image")).digest())
@@ -103,6 +110,8 @@ def fingerprint(capture: Capture) -> str:
     for item in capture.instruments:
         if item.kinematics is not None:  # captures without keep the fingerprint that older versions noted
             digest.update(json.dumps([item.kinematics.to_json(), item.unrecorded]).encode())
+        if item.from_video is not None:
+            digest.update(json.dumps(from_video_to_json(item.from_video)).encode())
     if capture.lens is not None:
         digest.update(json.dumps(capture.lens.to_json()).encode())
     if capture.still:
@@ -120,8 +129,12 @@ def _instrument_to_json(instrument: Instrument) -> dict[str, Any]:
     }
     for joint in instrument.unrecorded:
         joints[joint]["recorded"] = False
-    written = {"name": instrument.name, "joints": joints}
-    return written if instrument.kinematics is None else written | {"kinematics": instrument.kinematics.to_json()}
+    written: dict[str, Any] = {"name": instrument.name, "joints": joints}
+    if instrument.kinematics is not None:
+        written["kinematics"] = instrument.kinematics.to_json()
+    if instrument.from_video is not None:
+        written["from_video"] = from_video_to_json(instrument.from_video)
+    return written
 
 
 def _names(capture: Capture) -> list[str]:
@@ -154,6 +167,7 @@ def _write_frame(
             },
         }
         | ({} if state.trust is None else {"trust": _number(state.trust)})
+        | ({} if state.uncertainty is None else {"uncertainty": uncertainty_to_json(state.uncertainty)})
         for instrument, state in frame.state.instruments.items()
     ]
     entry: dict[str, Any] = {
