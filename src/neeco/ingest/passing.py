@@ -21,6 +21,8 @@ SMOOTH_PX = 1.5  # over which neighbours vote
 ODDS = 1.0  # logarithm of the odds from which a pixel shows an instrument
 ROUNDS = 4  # each with the colours of what the one before found
 SMALLEST = 0.004  # of the image: what passes is larger
+LIKELY, NEAR_PX = 0.5, 1.0  # the same for outlines, once it is known what passes
+OF_IT_MOVES = 0.3  # share of a piece that was found to move
 
 
 def passing_masks(
@@ -51,4 +53,9 @@ def passing_masks(
             for found, may in zip(colors, suspect, strict=True)
         ])  # fmt: skip
         inside, outside = masks, ~masks
-    return masks
+    # what stood still for a while, and thin ends: of the same colours and in one piece with what moves
+    odds = color_odds(colors, inside & shown, outside & shown)
+    return np.stack([
+        whole_pieces((odds.smoothed(found, NEAR_PX) > LIKELY) & shown, SMALLEST, mask, OF_IT_MOVES)
+        for found, mask in zip(colors, masks, strict=True)
+    ])  # fmt: skip
