@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.capture.model import Frame, Instrument, InstrumentState, State
+from neeco.capture.model import Frame, Instrument, InstrumentState, State, Uncertainty
 from neeco.raster.types import Camera
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
@@ -61,6 +61,26 @@ def test_corrections_of_another_shape_are_not_taken_up() -> None:
     refinement.restore(kept)
     with pytest.raises(ValueError, match=r"latency: \[2\], not \[1\]"):
         refinement.restore(kept | {"latency": torch.zeros(2)})
+
+
+def test_states_that_say_how_sure_they_are_are_corrected_accordingly() -> None:
+    plain = sliding_frames()
+    turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)  # its x is the camera's depth
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = turn.T
+    sure = Uncertainty((0.1, 0.2, 3.0), (0.25, 1.0, 20.0))
+    unsure = replace(plain[0], state=State({"rod": InstrumentState(pose, uncertainty=sure)}))
+    config = RefineConfig(frame_poses=True, start=0)
+    refinement = Refinement(config, (unsure, *plain[1:]), (Instrument("rod"),), CPU)
+    usual = Refinement(config, plain, (Instrument("rod"),), CPU)
+    expected = [*torch.tensor([0.25, 1.0, 20.0]).deg2rad().tolist(), 3.0, 0.2, 0.1]
+    assert refinement.prior_sigma[0, 0].tolist() == pytest.approx(expected, rel=1e-4)
+    assert torch.equal(refinement.prior_sigma[1:], usual.prior_sigma[1:])
+    assert refinement.rates["poses"][0, 0, 2] == pytest.approx(10 * config.rotation_rate)
+    for corrected in (refinement, usual):
+        corrected.poses += 0.1
+    penalties = [item.apply(0, unsure.state, CAMERA, 1)[2] for item in (refinement, usual)]
+    assert float(penalties[0].detach()) < 0.5 * float(penalties[1].detach())
 
 
 JAWS = KinematicTree((Link("shaft"), Link("jaw", "shaft", REVOLUTE, value={"jaw": 1.0})))

@@ -22,6 +22,8 @@ from neeco.training.config import RefineConfig
 
 LEARNED = ("poses", "joints", "cameras", "latency")
 MM_PER_RAD = 20.0  # what a joint that slides is taken to move as one that turns does
+FASTER = 10.0  # times the usual rates, at most, where a pose is less sure than usual
+SUREST = 1e-4  # rad, mm: a standard deviation of 0 would hold a pose for ever
 SMOOTH_S = 1.0  # s between instants that tell something of each other
 STATE = (*LEARNED, "frame_steps")  # tensors of a checkpoint beside the moments
 
@@ -68,14 +70,17 @@ class Refinement:
         first = tuple(frames[shown[0]] for shown in self.posed)
         self.velocities = _velocities(first, names).to(device)  # [P, I, 6] per s, body frame
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
+        usual = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
+        self.camera_sigma = usual.to(device)
+        self.prior_sigma = _pose_priors(first, names, usual).to(device)  # [P, I, 6]
         self.rates = {
-            "poses": rates.to(device),
+            "poses": (rates * (self.prior_sigma.cpu() / usual).clamp(1, FASTER)).to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
         }
-        self.joint_sigma = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
-        self.prior_sigma = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3, device=device)
+        usual = per_rad * torch.where(self.unrecorded, config.prior_unrecorded, config.prior_joint)
+        self.joint_sigma = self._joint_priors(frames, usual, sliding)  # [instants, R]
         self.moments = {
             f"{order}.{name}": torch.zeros_like(getattr(self, name))
             for order in ("first", "second")
@@ -95,7 +100,7 @@ class Refinement:
             if self.config.frame_poses:
                 leaf = self._leaves["poses"] = self.poses[row].clone().requires_grad_()
                 offset = offset + leaf
-                penalty = self._prior(leaf, self.prior_sigma)
+                penalty = self._prior(leaf, self.prior_sigma[row])
             if self.config.latency:
                 leaf = self._leaves["latency"] = self.latency.clone().requires_grad_()
                 offset = offset + self.velocities[row] * leaf
@@ -106,7 +111,7 @@ class Refinement:
             if self.config.frame_joints and self.readings:
                 leaf = self._leaves["joints"] = self.joints[instant].clone().requires_grad_()
                 expected = torch.where(self.unrecorded, self.joints[self.beside[instant]].mean(0), 0.0)
-                joint_penalty = self._prior(leaf - expected, self.joint_sigma)
+                joint_penalty = self._prior(leaf - expected, self.joint_sigma[instant])
                 penalty = joint_penalty if penalty is None else penalty + joint_penalty
                 for (name, reading), change in zip(self.readings, leaf, strict=True):
                     corrected_reading: Any = moved[name].joints[reading] + change
@@ -116,9 +121,21 @@ class Refinement:
             leaf = self._leaves["cameras"] = self.cameras[index].clone().requires_grad_()
             corrected = camera.world_from_camera.to(leaf) @ rigid_from_vector(leaf)
             camera = replace(camera, world_from_camera=corrected)
-            camera_penalty = self._prior(leaf, self.prior_sigma)
+            camera_penalty = self._prior(leaf, self.camera_sigma)
             penalty = camera_penalty if penalty is None else penalty + camera_penalty
         return state, camera, penalty
+
+    def _joint_priors(self, frames: tuple[Frame, ...], usual: Tensor, sliding: set[tuple[str, str]]) -> Tensor:
+        """[instants, R] standard deviations of readings, rad or mm: as states say, else as `usual` [R]."""
+        priors = usual.repeat(len(self.beside), 1)
+        for frame, instant in zip(frames, self.instants, strict=True):
+            for column, (name, reading) in enumerate(self.readings):
+                sure = frame.state.instruments[name].uncertainty
+                if sure is not None and reading in sure.joints_deg:
+                    deviation = sure.joints_deg[reading]
+                    own = deviation if (name, reading) in sliding else math.radians(deviation)
+                    priors[instant, column] = max(own, SUREST)
+        return priors
 
     def _prior(self, correction: Tensor, sigma: Tensor) -> Tensor:
         """Penalty [] on a correction [..., 6] or [R] of such standard deviations."""
@@ -144,7 +161,8 @@ class Refinement:
             row, steps = rows[name]
             first, second = self.moments[f"first.{name}"][row], self.moments[f"second.{name}"][row]
             update = adam_update(leaf.grad, first, second, steps, (0.9, 0.99), 1e-12)
-            getattr(self, name)[row] -= decay * self.rates[name] * update
+            rate = self.rates[name][row] if name == "poses" else self.rates[name]
+            getattr(self, name)[row] -= decay * rate * update
         self._leaves = {}
 
     @torch.no_grad()
@@ -209,6 +227,23 @@ def _instants(frames: tuple[Frame, ...], instruments: tuple[str, ...]) -> tuple[
     near = [[k for k in (i - 1, i + 1) if 0 <= k < len(times) and over[k] == over[i]
              and abs(times[k] - t) < SMOOTH_S] or [i] for i, t in enumerate(times)]  # fmt: skip
     return shown, near
+
+
+def _pose_priors(frames: Sequence[Frame], instruments: tuple[str, ...], usual: Tensor) -> Tensor:
+    """[F, I, 6] standard deviations of corrections (rad, mm, in the instrument's own frame): as states say of
+    themselves, else as `usual` [6]."""
+    priors = usual.repeat(len(frames), len(instruments), 1)
+    for row, frame in enumerate(frames):
+        for k, name in enumerate(instruments):
+            state = frame.state.instruments[name]
+            if (sure := state.uncertainty) is None:
+                continue
+            camera = frame.camera.world_from_camera.detach().cpu().double()
+            turn = state.pose[:3, :3].detach().cpu().double().T @ camera[:3, :3]  # instrument_from_camera
+            shifts = (turn.square() @ torch.tensor(sure.translation_mm, dtype=torch.float64).square()).sqrt()
+            turns = torch.tensor(sure.rotation_deg, dtype=torch.float64).deg2rad()
+            priors[row, k] = torch.cat([turns, shifts]).clamp(min=SUREST).float()
+    return priors
 
 
 def _scope(frame: Frame) -> bytes:
