@@ -38,6 +38,9 @@ class Ingest:
     """CSV log of the instrument's tracker."""
     laparoscope: Path | None = None
     """CSV log of the laparoscope's tracker; it puts the cameras into the tracker's frame, in mm."""
+    shaft_diameter: float | None = None
+    """Shaft's diameter, mm, of a rigid instrument that nothing tracked: it is found in the video (instead of
+    --instrument)."""
     joint: Annotated[tuple[tuple[str, Path, Path], ...], tyro.conf.UseAppendAction] = ()
     """Joint sensor: NAME LOG.csv CALIBRATION.csv (counts and angles). May be given several times."""
     intrinsics: tuple[float, float, float, float] | None = None
@@ -161,6 +164,7 @@ def recordings_of(args: Ingest) -> list[Recording]:
         args.sync,
         args.frames,
         args.fps,
+        args.shaft_diameter,
     )
     return [recording]
 

@@ -9,6 +9,7 @@ from neeco.ingest.episodes import Episodes
 from neeco.ingest.motion import ResidualFlow
 from neeco.ingest.recording import IngestSettings
 from neeco.ingest.registration import GIVEN, Registration, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.video_instruments import seen_in_video
 
 
 def register(
@@ -19,6 +20,8 @@ def register(
     world_from_camera [M, 4, 4] in SfM's frame; times [M] s on the joint timeline, frames [M] their numbers. Every
     episode's clock is found from its own motion first, then all of them are registered together.
     """
+    if data.scope is None and seen_in_video(data) is not None:
+        return None  # what tells the scale is said with the instrument
     if data.scope is None:
         data.note(
             "the laparoscope was not tracked: "

@@ -230,6 +230,14 @@ class Episodes:
         """As `SynchronizedRecording.instrument_poses`, at times [N] of the joint timeline."""
         return self._posed(lambda part, own: part.instrument_poses(name, own), times)
 
+    def place(self, name: str, times: np.ndarray, poses: np.ndarray) -> None:
+        """Take an instrument to be where it was found in the video: poses [N, 4, 4] at times [N] of the joint
+        timeline."""
+        for part in self.parts:
+            part.found[name] = np.zeros(0), np.zeros((0, 4, 4))
+        for part, rows, own in self._each(times):
+            part.found[name] = own, poses[rows]
+
     def _posed(
         self, of: Callable[[SynchronizedRecording, np.ndarray], tuple[np.ndarray, np.ndarray]], times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -353,7 +361,8 @@ def _of_episode(recording: Recording, episode: int) -> Recording:
             name: replace(log, stream=stream_of(log.path, log.stream, f"joints: {name}"))
             for name, log in item.joints.items()
         }
-        instruments.append(replace(item, poses=poses, joints=joints))
+        roll = item.roll and replace(item.roll, stream=stream_of(item.roll.path, item.roll.stream, "roll"))
+        instruments.append(replace(item, poses=poses, joints=joints, roll=roll))
     scope, partner = recording.laparoscope, recording.stereo
     stream = stream_of(recording.video, recording.stream, "video")
     changed = replace(
@@ -393,8 +402,10 @@ def file_name(text: str) -> str:
 def _unlike(mine: InstrumentLogs, theirs: InstrumentLogs, worlds: bool) -> str | None:
     """In what an instrument differs from that of another recording; None: in nothing that a capture states once, or
     `worlds`, each once."""
-    if (mine.poses is None) != (theirs.poses is None):
+    if (mine.poses is None) != (theirs.poses is None) or mine.from_video != theirs.from_video:
         return "poses are"
+    if (mine.roll is None) != (theirs.roll is None):
+        return "roll is"
     limits = [{name: source.limits for name, source in item.joints.items()} for item in (mine, theirs)]
     if limits[0].keys() != limits[1].keys():
         return f"joints ({', '.join(limits[0]) or 'none'}) are"

@@ -13,7 +13,16 @@ import torch
 
 from neeco.capture.images import open_image, write_image, write_labels
 from neeco.capture.lens import Border, Lens
-from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State, evenly_spaced
+from neeco.capture.model import (
+    REFERENCE_PIXELS,
+    Capture,
+    Frame,
+    InstrumentState,
+    PointCloud,
+    State,
+    Uncertainty,
+    evenly_spaced,
+)
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
@@ -22,17 +31,27 @@ from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.episodes import Episodes, separate
 from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
-from neeco.ingest.frame_selection import LEFT_OUT, assign_splits, choose_frames, frame_features
+from neeco.ingest.frame_selection import LEFT_OUT, choose_frames, frame_features
+from neeco.ingest.from_video import FoundShaft
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.passing import passing_masks
-from neeco.ingest.recording import MIN_FRAMES, STILL, Recording, Splits
+from neeco.ingest.recording import MIN_FRAMES, STILL, Recording
 from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
+from neeco.ingest.splits import split_frames
 from neeco.ingest.still import LOOKED_AT, find_background, moving_masks, reduced, stands_still
 from neeco.ingest.still_scene import RightCamera, look_behind, read_right_camera, seen_by, still_cameras
 from neeco.ingest.synchronized import States
+from neeco.ingest.video_instruments import (
+    NOT_SEEN,
+    find_in_video,
+    instruments_of,
+    on_masks,
+    seen_in_video,
+    uncertainties,
+)
 
 
 def ingest(
@@ -88,6 +107,9 @@ class WorldIngest:
         self.bases: dict[str, BaseRegistration] = {}  # by instrument, of those found
         self.dropped: dict[int, str] = {}  # video frame -> why
         self.moving: dict[int, np.ndarray] = {}  # video frame -> [h, w] what moves in it
+        self.in_video = seen_in_video(self.data)
+        self.shaft: FoundShaft | None = None
+        self.scale = 1.0  # of cameras that nothing registers, beside a plausible one
         self.selected = self._choose()  # [K] video frames
         self.names = [f"{frame:06d}.png" for frame in self.selected]
         self._write_images()
@@ -120,8 +142,20 @@ class WorldIngest:
         self._find_instrument_clocks(sfm, self.pinhole)
         self._place_bases_seen_from(sfm, self.pinhole, registration)
         on_instruments, shapes = self._find_instruments(sfm, self.pinhole, registration)
+        masks = np.zeros((0, 1, 1), dtype=bool)
+        if self.in_video is not None:
+            self.progress("finding what moves", 0, 0)
+            masks = self._passing(sfm, self.pinhole)(np.arange(len(sfm.indices)))
+            on_instruments |= on_masks(masks, sfm, self.size)
+        before = sfm.indices
         sfm = self.motion.adjust(sfm, on_instruments, self.progress)
         registration = self._register(sfm)  # first: it may find clocks
+        if self.in_video is not None:
+            cameras, points = self._placed(sfm, registration)
+            tissue = None
+            if registration is None:
+                tissue = float(np.median(np.linalg.norm(points[:, None] - cameras[None, ::10, :3, 3], axis=-1)))
+            self._find_in_video(sfm, cameras, masks[np.isin(before, sfm.indices)], tissue)
         return Placed(sfm, self.pinhole, registration, shapes, *self.data.states_at(self._times(sfm)))
 
     def _is_still(self) -> bool:
@@ -170,8 +204,13 @@ class WorldIngest:
         cameras = still_cameras(len(self.names))
         self._find_instrument_clocks(cameras, pinhole)
         self._place_bases(cameras, pinhole)
-        tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in data.world_from_base}
         visible = self._field_of_view()
+        if self.in_video is not None:
+            self.progress("finding what moves", 0, 0)
+            masks = moving_masks(self._load, len(self.names), cameras.indices, visible)
+            self._find_in_video(cameras, cameras.world_from_camera, masks, None)
+        names = [*data.world_from_base, *([self.in_video.name] if self.in_video else [])]
+        tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in names}
         found = look_behind(self._load, len(self.names), pinhole, visible, tracked, self.settings, right, self.progress)
         for note in found.notes:
             data.note(note)
@@ -218,11 +257,25 @@ class WorldIngest:
         if registration is None:
             require_no_base(self.data)
             return
-        flow, rows = self._residual_flow(sfm, pinhole), sfm.indices
-        self._find_bases(
-            sfm, registration.cameras(sfm.world_from_camera), pinhole,
-            lambda some: passing_masks(self._loader(rows), flow, some, self.settings.moving_px, self._field_of_view()),
+        cameras = registration.cameras(sfm.world_from_camera)
+        self._find_bases(sfm, cameras, pinhole, self._passing(sfm, pinhole))
+
+    def _passing(self, sfm: SfmResult, pinhole: Lens) -> Callable[[np.ndarray], np.ndarray]:
+        """What gives the masks of what passes before the tissue, bool [R, h, w], in some rows of `sfm`."""
+        flow, load = self._residual_flow(sfm, pinhole), self._loader(sfm.indices)
+        return lambda some: passing_masks(load, flow, some, self.settings.moving_px, self._field_of_view())
+
+    def _find_in_video(self, sfm: SfmResult, cameras: np.ndarray, masks: np.ndarray, tissue: float | None) -> None:
+        """Find the instrument that nothing tracked before `cameras` [M, 4, 4], in the rows of `sfm`."""
+        assert self.in_video is not None
+        assert self.pinhole is not None
+        self.progress("finding the shaft", 0, 0)
+        small = Lens.of(self.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
+        self.shaft = find_in_video(
+            self.data, self.in_video, self._loader(sfm.indices), masks, cameras, self._times(sfm),
+            self._episodes()[sfm.indices], small, tissue,
         )  # fmt: skip
+        self.scale = self.shaft.axes.scale
 
     def _find_bases(
         self,
@@ -393,8 +446,10 @@ class WorldIngest:
         frames, times = self.selected[sfm.indices], self._times(sfm)
         cameras, points = self._placed(sfm, registration)
         for frame in frames[~usable]:
-            self.dropped[int(frame)] = "no instrument state at its time (gap in a log)"
-        splits, rule = self._split(frames, states, usable, everywhere)
+            unseen = self.shaft is not None and not self.shaft.known[np.flatnonzero(frames == frame)[0]]
+            self.dropped[int(frame)] = NOT_SEEN if unseen else "no instrument state at its time (gap in a log)"
+        sure = uncertainties(self.in_video, self.shaft) if self.in_video and self.shaft else None
+        splits, rule = split_frames(data, frames, states, usable, everywhere)
         chosen = np.flatnonzero(usable & (splits != LEFT_OUT))
         for frame in frames[usable & (splits == LEFT_OUT)]:
             self.dropped[int(frame)] = "beside an unseen frame"
@@ -402,7 +457,7 @@ class WorldIngest:
             Frame(
                 self._named_image(int(frames[i])),
                 placed.pinhole.camera(cameras[i]),
-                _state(states, i, float(times[i])),
+                _state(states, i, float(times[i]), None if sure is None else sure[i]),
                 splits[i],
                 self.visible / f"{frames[i]:06d}.png.png" if self.visible else None,
             )
@@ -415,11 +470,7 @@ class WorldIngest:
             reliable = np.ones(len(sfm.points), dtype=bool)
             data.note("no tissue point is seen by several frames and fits well: all of them are kept")
         cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
-        instruments = tuple(
-            Instrument(item.name, {name: source.limits for name, source in item.joints.items()}, item.kinematics)
-            for item in self.recording.instruments
-            if item.poses is not None
-        )
+        instruments = instruments_of(self.recording, self.shaft)
         registered = registration is not None or set(data.poses) <= set(data.world_from_base)
         assert self.lens is not None
         lens = replace(self.lens, size=self.size, border=self.border)
@@ -452,6 +503,7 @@ class WorldIngest:
             registered,
             self.bases,
             data.ranges,
+            () if self.in_video is None else (self.in_video.name,),
             dict(zip(data.ranges, data.starts.tolist(), strict=False)),
         )
         return capture, result
@@ -474,55 +526,18 @@ class WorldIngest:
         if registration is not None:
             return registration.cameras(sfm.world_from_camera), registration.points(sfm.points)
         distances = np.linalg.norm(sfm.points[:, None] - sfm.world_from_camera[None, ::10, :3, 3], axis=-1)
-        scale = self.settings.scene_distance_mm / float(np.median(distances))
+        scale = self.scale * self.settings.scene_distance_mm / float(np.median(distances))
         cameras = sfm.world_from_camera.copy()
         cameras[:, :3, 3] *= scale
         return cameras, sfm.points * scale
 
-    def _split(
-        self,
-        frames: np.ndarray,
-        states: States,
-        usable: np.ndarray,
-        everywhere: dict[str, dict[str, np.ndarray]] | None,
-    ) -> tuple[np.ndarray, str]:
-        """Splits [M] by the first tracked instrument (LEFT_OUT without a state), and the rule in words."""
-        poses, joints = next(iter(states.values()), (np.tile(np.eye(4), (len(frames), 1, 1)), {}))
-        where, rule = self.recording.path, self.recording.splits
-        known = next(iter((everywhere or {}).values()), {})
-        by = rule.unseen_by if rule else None
-        if by is not None and by not in joints:  # another instrument's
-            owner = next((values for _, values in states.values() if by in values), None)
-            if owner is None:
-                raise NeecoError(
-                    f"{where}: splits.unseen_by: {by!r} belongs to an instrument without poses; name another"
-                )
-            joints = owner
-            known = next((values for values in (everywhere or {}).values() if by in values), {})
-        rule = rule or (Splits() if states else Splits(unseen_fraction=0.0))
-        readings = {joint: values[usable] for joint, values in joints.items()}
-        assigned, words = assign_splits(frames[usable], poses[usable], readings, rule, self.data.ranges, known)
-        if "train" not in assigned:
-            raise NeecoError(f"{where}: splits: leave no frame to train on ({words}); change them")
-        for name in rule.test_episodes + rule.unseen_episodes:
-            first, last = self.data.ranges[name]
-            if not ((frames[usable] >= first) & (frames[usable] <= last)).any():
-                self.data.note(f"splits: no frame of the episode {name} is in the capture")
-        for kind, ranges in (("test", rule.test), ("unseen", rule.unseen)):
-            if ranges and kind not in assigned:
-                self.data.note(
-                    f"splits.{kind}: no frame of the capture lies in the ranges given (the video has "
-                    f"{len(self.data.times)} frames)"
-                )
-        splits = np.full(len(frames), LEFT_OUT, dtype=object)
-        splits[usable] = assigned
-        return splits, words
 
-
-def _state(states: States, row: int, time: float) -> State:
+def _state(states: States, row: int, time: float, sure: Uncertainty | None) -> State:
     instruments = {
         name: InstrumentState(
-            torch.from_numpy(poses[row].copy()), {joint: float(values[row]) for joint, values in joints.items()}
+            torch.from_numpy(poses[row].copy()),
+            {joint: float(values[row]) for joint, values in joints.items()},
+            uncertainty=sure,
         )
         for name, (poses, joints) in states.items()
     }

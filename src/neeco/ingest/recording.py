@@ -22,15 +22,33 @@ MIN_FRAMES = 10  # that cameras can be found from
 
 
 @dataclass(frozen=True)
+class ShaftInVideo:
+    """What is known of an instrument whose poses are to be found in the video: its shaft's diameter, the length from
+    the shaft's end to the tip (None: measured), and whether it passes a fixed trocar (None: it is found out)."""
+
+    shaft_diameter_mm: float
+    working_length_mm: float | None = None
+    fixed_trocar: bool | None = None
+
+
+@dataclass(frozen=True)
 class InstrumentLogs:
     """One instrument: where its poses are (None: it was not tracked), its joints' readings, by joint, its links, and
-    what is said of the base that its poses are in."""
+    what is said of the base that its poses are in; or what tells its poses from the video alone, and its roll where
+    that was logged."""
 
     name: str
     poses: PoseColumns | None = None
     joints: Mapping[str, JointColumns] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
     base: StatedBase | None = None
+    from_video: ShaftInVideo | None = None
+    roll: JointColumns | None = None
+
+    @property
+    def placed(self) -> bool:
+        """Whether its poses become known."""
+        return self.poses is not None or self.from_video is not None
 
 
 @dataclass(frozen=True)
@@ -151,5 +169,5 @@ def clocks_of(instruments: Sequence[InstrumentLogs], laparoscope: PoseColumns | 
     """Names of the clocks of all these logs, each once."""
     logs: list[PoseColumns | JointColumns | None] = [laparoscope]
     for instrument in instruments:
-        logs += [instrument.poses, *instrument.joints.values()]
+        logs += [instrument.poses, instrument.roll, *instrument.joints.values()]
     return tuple(dict.fromkeys(log.clock for log in logs if log))

@@ -27,6 +27,7 @@ from neeco.ingest.recording import (
     IngestSettings,
     InstrumentLogs,
     Recording,
+    ShaftInVideo,
     Splits,
     StereoPartner,
     clocks_of,
@@ -34,6 +35,7 @@ from neeco.ingest.recording import (
 from neeco.ingest.sections import LARGEST, RecordingLoader, Section, close_match
 
 BASE_KEY, WORLD_KEY = "camera_from_base", "world_from_base"  # to a still camera; to the laparoscope's tracker
+THICKEST_MM = 40.0  # of shafts
 MOST_EPISODES = 500  # of one capture
 _SPLIT_EPISODES = ("test_episodes", "unseen_episodes")
 _OFFSET_SUFFIX = "_minus_video_s"  # of clocks' names in sync files
@@ -86,9 +88,11 @@ def recording_from_flags(
     sync: Path | None = None,
     frames: int | None = None,
     fps: float | None = None,
+    shaft_diameter: float | None = None,
 ) -> Recording:
     """The same from the command line: columns are recognised from the headers. `video`: a file or a folder of images;
-    joints: (name, log, calibration or None). Raises NeecoError naming the option."""
+    joints: (name, log, calibration or None); shaft_diameter: mm, of an instrument that was not tracked. Raises
+    NeecoError naming the option."""
     given = [("--video", video), ("--instrument", instrument), ("--laparoscope", laparoscope), ("--sync", sync)]
     given += [(f"--joint {joint}", file) for joint, *files in joints for file in files]
     for option, file in given:
@@ -98,8 +102,14 @@ def recording_from_flags(
     twice = next((joint for joint in names if names.count(joint) > 1), None)
     if twice is not None:
         raise NeecoError(f"--joint {twice}: given twice; give each joint once")
-    if joints and instrument is None:
-        raise NeecoError(f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to")
+    if joints and instrument is None and shaft_diameter is None:
+        raise NeecoError(
+            f"--joint {names[0]}: needs --instrument, the log of the instrument it belongs to, or --shaft-diameter"
+        )
+    if shaft_diameter is not None and instrument is not None:
+        raise NeecoError("--shaft-diameter: finds an instrument that was not tracked, and --instrument says it was")
+    if shaft_diameter is not None and not 0 < shaft_diameter < THICKEST_MM:
+        raise NeecoError(f"--shaft-diameter: {shaft_diameter:g} is no shaft's; give it in mm, as in 5")
 
     def clock(log: Path, otherwise: str) -> str:
         return VIDEO_CLOCK if Path(log) == Path(video) else otherwise
@@ -109,7 +119,9 @@ def recording_from_flags(
         for joint, log, table in joints
     }
     poses = None if instrument is None else PoseColumns(Path(instrument), clock(instrument, TRACKER_CLOCK))
-    instruments = () if poses is None else (InstrumentLogs("instrument", poses, logs),)
+    shaft = None if shaft_diameter is None else ShaftInVideo(shaft_diameter)
+    known = poses is not None or shaft is not None
+    instruments = (InstrumentLogs("instrument", poses, logs, from_video=shaft),) if known else ()
     scope = None if laparoscope is None else PoseColumns(Path(laparoscope), clock(laparoscope, TRACKER_CLOCK))
     values: Path | tuple[float, ...] | None = None
     if isinstance(intrinsics, str | Path):
@@ -188,10 +200,8 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
         return ()
     if not isinstance(value, list):
         raise top.error("instruments", "must be a list; begin each instrument with `- name:`")
-    sections = [
-        Section(top.file, f"instruments[{i}]", item, ("name", "poses", "joints", "kinematics", BASE_KEY, WORLD_KEY))
-        for i, item in enumerate(value)
-    ]
+    keys = ("name", "poses", "joints", "kinematics", BASE_KEY, WORLD_KEY, "from_video", "roll")
+    sections = [Section(top.file, f"instruments[{i}]", item, keys) for i, item in enumerate(value)]
     names = [section.text("name", required=True) for section in sections]
     joint_names = [joint for section in sections for joint in _joints_of(section)]
     found = []
@@ -206,8 +216,31 @@ def _instruments(top: Section, video: Path | None) -> tuple[InstrumentLogs, ...]
             joints[joint] = _joint_columns(section, f"joints.{joint}", item, clock, columns, video)
         own = section.node.has(BASE_KEY) or section.node.has(WORLD_KEY)
         base = _base(section if own else top, columns)
-        found.append(InstrumentLogs(name, columns, joints, _kinematics(section, tuple(joints)), base))
+        shaft, roll = _shaft_in_video(section), section.value.get("roll")
+        if roll is not None and shaft is None:
+            raise section.error("roll", "belongs to an instrument from_video; logged poses hold the roll already")
+        turned = None if roll is None else _joint_columns(section, "roll", roll, "roll", columns, video)
+        tree = _kinematics(section, tuple(joints))
+        found.append(InstrumentLogs(name, columns, joints, tree, base, shaft, turned))
+    if len(found) > 1 and any(item.from_video for item in found):
+        raise top.error("instruments", "one that is found in the video must be the only one; film one at a time")
     return tuple(found)
+
+
+def _shaft_in_video(instrument: Section) -> ShaftInVideo | None:
+    """What tells an instrument's poses from the video."""
+    if instrument.value.get("from_video") is None:
+        return None
+    section = instrument.section("from_video", tuple(vars(ShaftInVideo(1.0))))
+    diameter = section.number("shaft_diameter_mm", above=0.0, below=THICKEST_MM)
+    if diameter is None:
+        raise section.error("shaft_diameter_mm", "missing; measure the shaft with a ruler, in mm")
+    if instrument.value.get("poses") is not None:
+        raise section.error("shaft_diameter_mm", "poses are logged; leave out one of poses and from_video")
+    trocar = section.value.get("fixed_trocar")
+    if trocar is not None and not isinstance(trocar, bool):
+        raise section.error("fixed_trocar", f"expected true or false, found {printable(trocar)}")
+    return ShaftInVideo(diameter, section.number("working_length_mm", above=0.0), trocar)
 
 
 def _check_one_clock(
@@ -217,7 +250,7 @@ def _check_one_clock(
     known = None if video is None else format_of(video)
     logs: list[PoseColumns | JointColumns | None] = [scope]
     for instrument in instruments:
-        logs += [instrument.poses, *instrument.joints.values()]
+        logs += [instrument.poses, instrument.roll, *instrument.joints.values()]
     for log in logs:
         if known is None or video is None or log is None or log.path != video or log.clock != VIDEO_CLOCK:
             continue

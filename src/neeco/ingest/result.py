@@ -43,6 +43,7 @@ class IngestResult:
     registered: bool = True  # instrument poses are in the cameras' world
     bases: dict[str, BaseRegistration] = field(default_factory=dict)  # found from what moves, by instrument
     episodes: dict[str, tuple[int, int]] = field(default_factory=dict)  # frames (first, last) of several recordings
+    in_video: tuple[str, ...] = ()  # instruments that nothing tracked, found in the images
     # s of the capture's time at which each of several recordings has its own 0
     episode_starts: dict[str, float] = field(default_factory=dict)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.from_video import with_roll
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
 from neeco.ingest.recording import Recording
@@ -13,6 +14,7 @@ from neeco.ingest.registration import GIVEN, LONGEST, ClockOffset
 from neeco.ingest.sfm import StageProgress
 
 SLOWEST, FASTEST = 0.01, 10_000.0  # frames a second
+SAME_INSTANT = 1e-6  # s
 SMALLEST = 32  # px: smaller frames have nothing to find cameras by
 LIMIT_SLACK = 0.03  # rad beyond a joint's limits that noise and calibration make
 
@@ -33,19 +35,23 @@ class SynchronizedRecording:
             item.name: {joint: read_reading_log(source) for joint, source in item.joints.items()}
             for item in recording.instruments
         }
+        self.rolls = {item.name: read_reading_log(item.roll) for item in recording.instruments if item.roll is not None}
+        # by instrument, of those found in the video: times [N] s and poses [N, 4, 4] of the frames that show them
+        self.found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.placed = tuple(item.name for item in recording.instruments if item.placed)
         self.scope = read_pose_log(recording.laparoscope) if recording.laparoscope else None
         self._check_bases()
         progress("reading video", 0, 0)
         self.video = recording.open()
         self.times = self.video.times  # [V] s, every frame
         logs: list[PoseLog | ReadingLog] = [*self.poses.values(), *([self.scope] if self.scope else [])]
-        logs += [log for joints in self.joints.values() for log in joints.values()]
+        logs += [log for joints in self.joints.values() for log in joints.values()] + [*self.rolls.values()]
         found = [*recording.notes, *(note for log in logs for note in log.notes), *self.video.notes]
         self.notes = list(dict.fromkeys(found))  # two joints may be of one stream
         for item in recording.instruments:
-            if item.poses is None:
+            if not item.placed:
                 self.note(f"instrument {item.name!r} was not tracked: it is left out of the capture's states")
-        if not self.poses:
+        if not self.placed:
             self.note("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
         self._check_video()
         self.clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
@@ -67,8 +73,23 @@ class SynchronizedRecording:
     def instrument_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses [N, 4, 4] of an instrument at video times, in the world's frame as far as that is known (else in its
         tracker's), and where known."""
+        if name in self.found:
+            return self._found_poses(name, times)
         poses, known = self.logged_poses(self.poses[name], times)
         return (self.world_from_base[name] @ poses if name in self.world_from_base else poses), known
+
+    def _found_poses(self, name: str, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`instrument_poses` of one found in the video, with its roll where that is logged."""
+        held, poses = self.found[name]
+        if not len(held):
+            return np.full((len(times), 4, 4), np.nan), np.zeros(len(times), dtype=bool)
+        row = np.abs(times[:, None] - held).argmin(1)
+        known = np.abs(times - held[row]) < SAME_INSTANT
+        found = np.where(known[:, None, None], poses[row], np.nan)
+        if name in self.rolls:
+            roll, logged = readings_at(self.rolls[name], times + self._offset(self.rolls[name]))
+            found, known = with_roll(found, np.nan_to_num(roll)), known & logged
+        return found, known
 
     def states_at(self, times: np.ndarray) -> tuple[States, np.ndarray]:
         """Every tracked instrument's states at video times [N], and where all of them are known."""
@@ -78,7 +99,7 @@ class SynchronizedRecording:
             item.name: {joint: source.limits for joint, source in item.joints.items()}
             for item in self.recording.instruments
         }
-        for name in self.poses:
+        for name in [*self.poses, *self.found]:
             poses, valid = self.instrument_poses(name, times)
             usable &= valid
             readings = {}
@@ -104,7 +125,7 @@ class SynchronizedRecording:
                 columns.append(np.where(valid[:, None], poses[:, :3, 3], 0.0))
                 columns.append(np.where(valid[:, None], poses[:, :3, :3].reshape(-1, 9)[:, :3], 0.0))
                 self._check_overlap(log, valid)
-        for reading in (reading for name in self.poses for reading in self.joints[name].values()):
+        for reading in (reading for name in self.placed for reading in self.joints[name].values()):
             if reading.clock in self.clocks:
                 values, valid = readings_at(reading, self.times + self.clocks[reading.clock].seconds)
                 usable &= valid
@@ -144,7 +165,7 @@ class SynchronizedRecording:
         Trackers' clocks, and those of joints on one of them, are found later, from motion.
         """
         found_later = {log.clock for log in [*self.poses.values(), *([self.scope] if self.scope else [])]}
-        for name in self.poses:
+        for name in self.placed:
             for joint, reading in self.joints[name].items():
                 if reading.clock not in self.clocks and reading.clock not in found_later:
                     cost = ": at 1 rad/s, 20 ms off are 1.1 deg"

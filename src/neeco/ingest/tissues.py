@@ -75,6 +75,11 @@ def by_tissue(recordings: Sequence[Recording]) -> dict[str | None, list[Recordin
     named = [replace(item, episode=name) for item, name in zip(recordings, episode_names(recordings), strict=True)]
     worlds: dict[str | None, list[Recording]] = {}
     for item in named:
+        if any(instrument.from_video for instrument in item.instruments):
+            raise NeecoError(
+                f"{item.path}: from_video: over each tissue an instrument found in the video has a frame of its own; "
+                "ingest one tissue at a time"
+            )
         if item.tissue is None:
             others = ", ".join(dict.fromkeys(other.tissue for other in named if other.tissue))
             raise NeecoError(f"{item.path}: tissue: is missing, where other recordings name theirs: {others}; name it")

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from neeco.capture.fromvideofile import UNKNOWN_DEG
 from neeco.capture.model import Capture
 from neeco.ingest.result import IngestResult
 
@@ -51,6 +52,8 @@ def assess_ingest(result: IngestResult, capture: Capture) -> Assessment:
         for name, clock in result.clocks.items()
         if not np.isfinite(clock.sd)
     ]
+    if result.in_video and not _rolls_known(capture):
+        doubts.append("The instrument's roll is not known: log it, or pose frames by hand, before training.")
     if not capture.instruments:
         severe.append("No instrument was tracked: only methods without states, such as 3dgs, can be trained.")
         return Assessment("bad", "Cameras only: there is no instrument to pose.", (*severe, *doubts))
@@ -64,6 +67,12 @@ def assess_ingest(result: IngestResult, capture: Capture) -> Assessment:
         return Assessment("careful", "Usable, with care: " + _lower(doubts[0]), tuple(doubts))
     fit = "nothing measured speaks against it" if result.registration is None else "cameras and instrument fit together"
     return Assessment("good", f"Ready to train: {fit}.", ())
+
+
+def _rolls_known(capture: Capture) -> bool:
+    """Whether every state's roll is sure to less than UNKNOWN_DEG."""
+    sure = [state.uncertainty for frame in capture.frames for state in frame.state.instruments.values()]
+    return all(item is None or item.rotation_deg[2] < UNKNOWN_DEG for item in sure)
 
 
 def _lower(sentence: str) -> str:
