@@ -24,6 +24,7 @@ class ShaftWorld:
     frames: int = FRAMES
     reach: float = 1.0  # by which the cameras move farther
     even: bool = False  # the head has the shaft's colour
+    wrist: float = 0.0  # mm between shaft and head, of the shaft's colour and thinner
     images: np.ndarray = field(init=False)
     masks: np.ndarray = field(init=False)
 
@@ -63,7 +64,8 @@ class ShaftWorld:
         rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones(x.shape)], -1)
         end, axis = self.line(frame)
         depth, light, part = np.full(x.shape, np.inf), np.zeros((*x.shape, 3)), np.zeros(x.shape, bool)
-        parts = ((RADIUS, -300.0, 0.0, SHAFT), (0.7 * RADIUS, 0.0, HEAD, SHAFT if self.even else TIP))
+        parts = [(RADIUS, -300.0, 0.0, SHAFT), (0.85 * RADIUS, 0.0, self.wrist, SHAFT)]
+        parts += [(0.7 * RADIUS, self.wrist, self.wrist + HEAD, SHAFT if self.even else TIP)]
         for radius, low, high, color in parts:
             across = rays - (rays @ axis)[..., None] * axis
             offset = end - (end @ axis) * axis

@@ -116,6 +116,15 @@ def test_where_colours_do_not_tell_the_end_the_tip_does():
     assert np.median(along) < 1
 
 
+def test_a_thinner_part_of_the_shafts_colour_is_not_taken_for_shaft():
+    world = ShaftWorld(wrist=9.0)
+    found = find_shaft(world.images, world.masks, world.scene(), trocar=True)
+    angles, _, _ = errors(world, found.axes)
+    assert np.median(angles) < 1.5
+    ends, directions = truth(world)
+    assert abs(np.median(((found.axes.points - ends) * directions).sum(1))) < 5  # at the shaft's end, not the wrist's
+
+
 def test_what_cannot_work_is_refused_with_what_to_film(world):
     scene = world.scene()
     with pytest.raises(NeecoError, match="moves before the tissue in 0 of 24 frames"):

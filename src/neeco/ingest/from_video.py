@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from neeco.capture.fromvideofile import UNKNOWN_DEG
 from neeco.capture.model import Uncertainty, evenly_spaced
 from neeco.errors import NeecoError
-from neeco.ingest.shaft_axis import Axes, Edges, Scene, across_axes, solve_axes, unit
+from neeco.ingest.shaft_axis import Axes, Edges, Scene, across_axes, edge_distances, solve_axes, unit
 from neeco.ingest.shaft_edges import BLURS, outline_edges, shaded_edges, with_shafts
 from neeco.ingest.shaft_end import axis_coordinates, shaft_ends, tips_along
 from neeco.ingest.silhouettes import shaft_lines
@@ -28,7 +28,10 @@ WINDOW, SUDDEN = 5, 0.35  # frames to both sides; difference from their directio
 HEADS = (0.4, 1.6)  # of the median length of the head, between which an end is believed
 CLOSED = 0.8  # quantile of the heads' lengths that is taken for that of closed jaws
 
-ROUNDS = 3
+ROUNDS, MOST_ROUNDS = 3, 7
+STRAIGHT_PX = 0.15  # by which the median of the edges may leave a straight line anywhere
+BIN, BINS = 0.5, 16  # radii of shaft that are one place of its edges, and how many places are looked at
+FILLED = 0.3  # places on edges for each frame, that tell something of one
 SAMPLE = 40  # frames by which the lens's blur is told
 MISSED_MM = 3.0  # root mean square by which axes miss a trocar that is fixed
 END_PX, TIP_MM = 1.5, 3.0  # by which the shaft's end is off, told by its colour or by the tip
@@ -95,17 +98,23 @@ def find_shaft(
         axes = _plausible(axes, tissue)
         notes.append(UNKNOWN_SCALE)
     diameters, blur = np.zeros(len(images)), BLURS[0]
-    for turn in range(ROUNDS):
+    offset = 0.0  # mm by which the shaft ends before the change of colour
+    for turn in range(MOST_ROUNDS):
         if turn == 0:
             sample = evenly_spaced(len(images), SAMPLE)
             few = replace(axes, points=axes.points[sample], directions=axes.directions[sample])
             blur = min(BLURS, key=lambda px: shaded_edges(images[sample], few, scene.radius, scene.intrinsics, px)[2])
         edges, diameters, _ = shaded_edges(images, axes, scene.radius, scene.intrinsics, blur)
-        axes = solve_axes(scene, axes, edges, covariance=turn in (0, ROUNDS - 1))
+        axes = solve_axes(scene, axes, edges, covariance=turn == 0)
         if turn == 0 and axes.scale_sd is not None and axes.scale_sd > SURE_SCALE:
             scene, axes = replace(scene, scaled=True), _plausible(axes, tissue)
             notes.append(UNKNOWN_SCALE)
-        axes, ends, heads = _at_end(axes, images, masks, scene, working_length)
+        narrower = _narrower_part(scene, axes, edges) if turn > 0 else 0.0
+        offset += narrower
+        axes, ends, heads = _at_end(axes, images, masks, scene, working_length, offset)
+        if turn >= ROUNDS - 1 and not narrower:
+            break
+    axes = solve_axes(scene, axes, edges, covariance=True)
     share = float((diameters >= TWO_DIAMETERS).mean())
     if share < ENOUGH:
         raise NeecoError(
@@ -226,10 +235,11 @@ def _bridged(scene: Scene, axes: Axes, edges: Edges, found: np.ndarray) -> tuple
 
 
 def _at_end(
-    axes: Axes, images: np.ndarray, masks: np.ndarray, scene: Scene, working_length: float | None
+    axes: Axes, images: np.ndarray, masks: np.ndarray, scene: Scene, working_length: float | None, offset: float = 0.0
 ) -> tuple[Axes, np.ndarray, np.ndarray | None]:
     """The axes with their points where the shaft ends; which frames show that [F]; and the heads' lengths [F] mm, NaN
-    where they are not seen (None: the end is not told by colour, but behind the tip)."""
+    where they are not seen (None: the end is not told by colour, but behind the tip). offset: mm that
+    the shaft ends before its colour does."""
     fx, fy, cx, cy = scene.intrinsics
     near, ahead = axes.points, axes.points + scene.radius * axes.directions
     first, second = (np.array([fx, fy]) * place[:, :2] / place[:, 2:] + [cx, cy] for place in (near, ahead))
@@ -239,16 +249,37 @@ def _at_end(
     tips = tips_along(masks, axes, scene.intrinsics)
     heads = None
     if np.isfinite(shift).any():
-        heads = tips - shift
+        heads = tips - shift + offset
         usual = np.nanmedian(heads) if np.isfinite(heads).any() else np.nan
         shift[(heads < HEADS[0] * usual) | (heads > HEADS[1] * usual)] = np.nan
     else:
         shift = tips - (working_length or _default(scene))
+    shift = shift - offset
     known = np.isfinite(shift)
     if known.any():
         shift = np.interp(scene.times, scene.times[known], shift[known])
         axes = replace(axes, points=axes.points + shift[:, None] * axes.directions)
     return axes, known, heads
+
+
+def _narrower_part(scene: Scene, axes: Axes, edges: Edges) -> float:
+    """mm before the points of the axes in which their edges leave those behind: a part of the shaft's colour that is
+    not as thick. 0: edges are straight."""
+    missed = edge_distances(axes, edges, scene.radius, scene.intrinsics) - axes.inset
+    places, values = [], []
+    for frame in range(len(axes.points)):
+        for side in range(2):
+            there = np.isfinite(edges.deviations[frame, side])
+            behind = -axis_coordinates(axes, frame, edges.pixels[frame, side, there], scene.intrinsics)
+            places.append(behind / (BIN * scene.radius))
+            values.append(missed[frame, side, there])
+    place, value = np.concatenate(places).astype(int), np.concatenate(values)
+    numbers = [number for number in range(BINS) if (place == number).sum() >= FILLED * len(axes.points)]
+    medians = np.array([np.median(value[place == number]) for number in numbers])
+    if len(medians) < 4 or np.abs(medians).max() < STRAIGHT_PX:
+        return 0.0
+    step = int((medians[:-1] - medians[1:])[:-1].argmax())  # from inside the contour to outside, going back
+    return float(numbers[step + 1] * BIN * scene.radius)
 
 
 def _along_deviation(scene: Scene, axes: Axes, ends: np.ndarray, by_color: bool) -> np.ndarray:
