@@ -1,0 +1,118 @@
+"""`hand_posed.yaml` beside a capture: rolls and joints that people set by hand, frame by frame.
+
+    - {frame: '000123', instrument: maryland, roll_deg: 152.0, joints_deg: {jaw_angle: 31.0}, when: 2026-03-01 14:05}
+
+roll_deg: angle about the shaft from the direction towards the camera to the hinge's axis (the instrument's x axis);
+joints_deg: as they were drawn. `when` and `who` are optional. Several answers for one frame are all kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neeco.errors import NeecoError
+from neeco.files import parse_yaml, read_text, write_text
+
+FILE = "hand_posed.yaml"
+HEADER = """\
+# Frames posed by hand (`neeco view CAPTURE --annotate`), one answer a line; lines may be added, mended and removed.
+# roll_deg: about the shaft, from the direction towards the camera to the hinge's axis. joints_deg: as they stand.
+"""
+KEYS = ("frame", "instrument", "roll_deg", "joints_deg")
+OPTIONAL = ("when", "who")
+REMEDY = "mend or remove that line"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What somebody said of one instrument in one frame. frame: its image's name without the suffix."""
+
+    frame: str
+    instrument: str
+    roll_deg: float
+    joints_deg: dict[str, float] = field(default_factory=dict)
+    when: str | None = None
+    who: str | None = None
+
+
+def read_answers(capture: Path) -> list[Answer]:
+    """The answers beside a capture, in the file's order; none where there is no file. Raises NeecoError."""
+    path = capture / FILE
+    if not path.exists():
+        return []
+    entries = parse_yaml(path, read_text(path, "YAML"), REMEDY)
+    if entries is None:
+        return []
+    if not isinstance(entries, list):
+        raise NeecoError(f"{path}: is not a list of answers; {REMEDY}")
+    return [_answer(entry, f"{path}: answer {index + 1}") for index, entry in enumerate(entries)]
+
+
+def write_answers(capture: Path, answers: Iterable[Answer]) -> None:
+    """Write the file anew, whole or not at all. Raises NeecoError."""
+    write_text(capture / FILE, HEADER + "".join(f"- {_line(answer)}\n" for answer in answers))
+
+
+def answers_for(
+    answers: Sequence[Answer], instrument: str, frames: Sequence[str], joints: Iterable[str], place: Path
+) -> list[tuple[int, Answer]]:
+    """Those of one instrument, each with the index of its frame. Raises NeecoError for a frame that the capture at
+    `place` has not, and for joints other than the instrument's."""
+    index = {name: number for number, name in enumerate(frames)}
+    wanted = set(joints)
+    found = []
+    for answer in answers:
+        if answer.instrument != instrument:
+            continue
+        if answer.frame not in index:
+            raise NeecoError(f"{place / FILE}: frame {answer.frame}: the capture has no such frame; {REMEDY}")
+        if set(answer.joints_deg) != wanted:
+            expected = ", ".join(sorted(wanted)) or "none"
+            raise NeecoError(f"{place / FILE}: frame {answer.frame}: joints_deg: expected {expected}; {REMEDY}")
+        found.append((index[answer.frame], answer))
+    return found
+
+
+def _line(answer: Answer) -> str:
+    value: dict[str, Any] = {
+        "frame": answer.frame,
+        "instrument": answer.instrument,
+        "roll_deg": round(answer.roll_deg, 1),
+        "joints_deg": {name: round(angle, 1) for name, angle in answer.joints_deg.items()},
+    }
+    value |= {key: getattr(answer, key) for key in OPTIONAL if getattr(answer, key) is not None}
+    return str(
+        yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True)
+    ).strip()
+
+
+def _answer(entry: Any, place: str) -> Answer:
+    if not isinstance(entry, dict):
+        raise NeecoError(f"{place}: is no answer; expected {', '.join(KEYS)}; {REMEDY}")
+    unknown = sorted(str(key) for key in set(entry) - {*KEYS, *OPTIONAL})
+    missing = [key for key in KEYS if key not in entry and key != "joints_deg"]
+    if unknown or missing:
+        what = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]} is missing"
+        raise NeecoError(f"{place}: {what}; expected {', '.join((*KEYS, *OPTIONAL))}")
+    joints = entry.get("joints_deg") or {}
+    if not isinstance(joints, dict):
+        raise NeecoError(f"{place}: joints_deg: is not name: degrees; {REMEDY}")
+    return Answer(
+        str(entry["frame"]),
+        str(entry["instrument"]),
+        _degrees(entry["roll_deg"], f"{place}: roll_deg"),
+        {str(name): _degrees(value, f"{place}: joints_deg: {name}") for name, value in joints.items()},
+        *(None if entry.get(key) is None else str(entry[key]) for key in OPTIONAL),
+    )
+
+
+def _degrees(value: Any, place: str) -> float:
+    if type(value) not in (int, float) or not abs(value) <= 720:
+        raise NeecoError(f"{place}: {value!r} is no angle in degrees; {REMEDY}")
+    return float(value)

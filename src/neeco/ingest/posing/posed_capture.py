@@ -1,0 +1,220 @@
+"""A capture whose roll and joints are solved from its video's measurements and hand-posed frames: what to ask next, how
+sure it all is, and its states written anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neeco.capture.model import Capture, Instrument
+from neeco.capture.reader import read_capture
+from neeco.errors import NeecoError
+from neeco.files import own_folder, read_json, write_json
+from neeco.ingest.posing.along_shaft import Shafts
+from neeco.ingest.posing.chain import HAND_DEG, Solved, chain_breaks, solve_joint, solve_rolls
+from neeco.ingest.posing.hand_posed import Answer, answers_for, read_answers
+from neeco.ingest.posing.measurements import Measurements, read_measurements
+
+TEN = 10  # frames that are suggested in all
+FRAME_S = 0.04  # from frame to frame, where the recording does not say
+NEAR_BREAK = 3  # frames
+EXTREME = 0.05  # share of the frames in which jaws are called widest or narrowest
+DOUBTED_DEG, DOUBTED_SHARE = 12.0, 3.0  # an answer is doubted from so many degrees on, and so many deviations
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A frame that would help if it were posed by hand, and why, in a few words."""
+
+    frame: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """An answer that others contradict. degrees: by how much; against: "an earlier answer" or "its neighbours"."""
+
+    frame: int
+    what: str  # roll, or a joint's name
+    degrees: float
+    against: str
+
+    def __str__(self) -> str:
+        return f"{self.what} differs by {abs(self.degrees):.0f}° from {self.against}"
+
+
+@dataclass(frozen=True, eq=False)
+class Posing:
+    """What is known of one instrument in all frames, given answers (frame's index, answer)."""
+
+    instrument: Instrument
+    shafts: Shafts
+    measured: Measurements
+    answers: Sequence[tuple[int, Answer]]
+    rolls: Solved
+    joints: dict[str, Solved]
+
+    @property
+    def breaks(self) -> list[int]:
+        """Frames before which texture alone does not carry the roll on."""
+        return chain_breaks(self.measured.pairs, self.rolls)
+
+    def suggestions(self, count: int = TEN) -> list[Suggestion]:
+        """The frames whose answers would help most, each as if those before it were answered already."""
+        solved = [self.rolls, *self.joints.values()]
+        usable = self.measured.seen.copy()
+        usable[[frame for frame, _ in self.answers]] = False
+        chosen: list[Suggestion] = []
+        breaks = np.array(self.breaks)
+        for _ in range(min(count, int(usable.sum()))):
+            doubt = np.asarray(sum(np.diag(some.covariance) for some in solved))
+            if not self.answers and not chosen:  # all are alike; open jaws show their hinge best
+                doubt = self.measured.shapes.widths
+            frame = int(np.argmax(np.where(usable, doubt, -np.inf)))
+            chosen.append(Suggestion(frame, self._reason(frame, [some.deviations[frame] for some in solved], breaks)))
+            usable[frame] = False
+            solved = [some.with_answer(frame) for some in solved]
+        return chosen
+
+    def _reason(self, frame: int, deviations: Sequence[float], breaks: np.ndarray) -> str:
+        widths = self.measured.shapes.widths
+        if self.joints and widths[frame] >= np.quantile(widths, 1 - EXTREME):
+            return "jaws at their widest"
+        if len(breaks) and np.abs(breaks - frame).min() <= NEAR_BREAK:
+            return "the chain of rolls breaks here"
+        if self.joints and widths[frame] <= np.quantile(widths, EXTREME):
+            return "jaws at their narrowest"
+        names = ["roll", *self.joints]
+        least = int(np.argmax(deviations))
+        return f"least sure: {names[least]} ± {min(math.degrees(deviations[least]), 180):.0f}°"
+
+    def doubts(self) -> list[Doubt]:
+        """Answers that differ from an earlier one of the same frame, or from what all others say of their frame."""
+        found = []
+        for position, (frame, answer) in enumerate(self.answers):
+            earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
+            for what, solved in {"roll": self.rolls, **self.joints}.items():
+                said = _angle(answer, what)
+                if earlier is not None and abs(apart := _turn(said - _angle(earlier, what))) > DOUBTED_DEG:
+                    found.append(Doubt(frame, what, apart, "an earlier answer"))
+                if len(self.answers) < 3:
+                    continue
+                # leaving one answer out of a Gaussian posterior
+                left = 1 - float(solved.deviations[frame]) ** 2 / math.radians(HAND_DEG) ** 2
+                apart = _turn(said - math.degrees(solved.values[frame])) / max(left, 0.1)
+                if abs(apart) > DOUBTED_DEG and abs(apart) > DOUBTED_SHARE * HAND_DEG / math.sqrt(max(left, 0.1)):
+                    found.append(Doubt(frame, what, apart, "what its neighbours say"))
+        return found
+
+    def sureness(self) -> dict[str, tuple[float, float]]:
+        """Of roll and each joint: the standard deviations, degrees, that half and 95 % of the frames stay below; 180
+        where nothing is known."""
+        found = {}
+        for name, solved in {"roll": self.rolls, **self.joints}.items():
+            deviations = np.minimum(np.degrees(solved.deviations), 180.0)
+            if name == "roll" and not self.answers:
+                deviations = np.full(len(deviations), 180.0)
+            found[name] = (float(np.median(deviations)), float(np.quantile(deviations, 0.95)))
+        return found
+
+
+class PosedCapture:
+    """A capture with instruments found in its video, its answers and what follows from them."""
+
+    def __init__(self, root: Path) -> None:
+        """Raises NeecoError for a capture without such instruments, or whose measurements or answers cannot be read."""
+        self.root = root
+        self.capture: Capture = read_capture(root)
+        found = [item for item in self.capture.instruments if item.from_video is not None]
+        if not found:
+            raise NeecoError(
+                f"{root}: no instrument was found in the video: all poses are known; "
+                "give a capture made by `neeco ingest --shaft-diameter`"
+            )
+        self.measured = read_measurements(self.capture)
+        self.instruments = {item.name: item for item in found if item.name in self.measured}
+        self.frames = [frame.name for frame in self.capture.frames]
+        times = np.array([frame.state.time for frame in self.capture.frames], float)
+        self.times = times if self.capture.timed else np.arange(len(times)) * FRAME_S
+        self.shafts = {name: Shafts.of(self.capture, item) for name, item in self.instruments.items()}
+
+    def solve(self, answers: Sequence[Answer] | None = None) -> dict[str, Posing]:
+        """By instrument, what follows from the answers; those in the file where none are given. Raises NeecoError."""
+        answers = read_answers(self.root) if answers is None else answers
+        for answer in answers:
+            if answer.instrument not in self.instruments:
+                known = ", ".join(self.instruments)
+                raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {known}")
+        found = {}
+        for name, instrument in self.instruments.items():
+            joints = [joint for joint in instrument.joints if not instrument.slides(joint)]
+            own = answers_for(answers, name, self.frames, joints, self.root)
+            measured, shafts = self.measured[name], self.shafts[name]
+            rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, _by_frame(own, "roll"))
+            solved = {
+                joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(own, joint), instrument.joints[joint])
+                for joint in joints
+            }
+            found[name] = Posing(instrument, shafts, measured, own, rolls, solved)
+        return found
+
+    def write_states(self, posings: dict[str, Posing]) -> None:
+        """Write the solved rolls and joints, and how sure they are, into transforms.json, whole or not at all. Raises
+        NeecoError."""
+        path = self.root / "transforms.json"
+        with own_folder(self.root, path):
+            document = read_json(path)
+            for item in document.get("instruments", []):
+                if item["name"] in posings:  # known from now on
+                    for joint in posings[item["name"]].joints:
+                        item["joints"][joint].pop("recorded", None)
+            for index, frame in enumerate(document["frames"]):
+                for item in frame["instruments"]:
+                    if item["name"] in posings:
+                        self._write_state(item, posings[item["name"]], index)
+            write_json(path, document)
+
+    def _write_state(self, item: dict[str, Any], posing: Posing, frame: int) -> None:
+        shafts = posing.shafts
+        rotation = shafts.world_from_camera[frame]
+        z = rotation @ shafts.directions[frame]
+        x = rotation @ shafts.x_axes(posing.rolls.values)[frame]
+        x -= (x @ z) * z
+        x /= np.linalg.norm(x)
+        pose = np.array(item["pose"], float)
+        pose[:3, :3] = np.stack([x, np.cross(z, x), z], -1)
+        item["pose"] = pose.tolist()
+        item["joints"] = item.get("joints", {}) | {
+            name: float(solved.values[frame]) for name, solved in posing.joints.items()
+        }
+        known = item.get("uncertainty", {})
+        tilts = known.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
+        roll = min(math.degrees(posing.rolls.deviations[frame]), 180.0) if posing.answers else 180.0
+        item["uncertainty"] = {
+            "translation_mm": known.get("translation_mm", [0.0, 0.0, 0.0]),
+            "rotation_deg": [*tilts, roll],
+            "joints_deg": {
+                name: min(math.degrees(solved.deviations[frame]), 180.0) for name, solved in posing.joints.items()
+            },
+        }
+
+
+def _by_frame(answers: Sequence[tuple[int, Answer]], what: str) -> dict[int, list[float]]:
+    found: dict[int, list[float]] = {}
+    for frame, answer in answers:
+        found.setdefault(frame, []).append(math.radians(_angle(answer, what)))
+    return found
+
+
+def _angle(answer: Answer, what: str) -> float:
+    return answer.roll_deg if what == "roll" else answer.joints_deg[what]
+
+
+def _turn(degrees: float) -> float:
+    """The same angle between -180 and 180."""
+    return (degrees + 180) % 360 - 180
