@@ -4,14 +4,14 @@
     python benchmarks/hand_posed.py TRUE --shaft-from-truth --output CAPTURE [--masks FILE.npz]
 
 CAPTURE was made by `neeco ingest --shaft-diameter`; TRUE is the rendered capture of the same frames (default: CAPTURE
-itself), with truth/transforms.json. "Posed by hand" is the truth with a normal, seeded error of 3 degrees on frames that
-the program asks for one after another; nothing else of the truth is read, except for the scores. Prints the errors of
-roll and joints without any answer and with each number of them, and writes hand_posed.yaml and the states that follow
-into CAPTURE.
+itself), with truth/transforms.json. "Posed by hand" is the truth with a normal, seeded error of 3 degrees on frames
+that the program asks for one after another; nothing else of the truth is read, except for the scores. Prints the
+errors of roll and joints without any answer and with each number of them, and writes hand_posed.yaml and the states
+that follow into CAPTURE.
 
---shaft-from-truth is a control, of roll and joints alone: it makes CAPTURE from TRUE with the true shaft, off by 1 degree
-of tilt, .2 mm across, 1 mm in depth and .6 mm along (smooth over some frames), and with masks from a file (key `mask`,
-bits packed; key `shape`) or, without one, the true ones.
+--shaft-from-truth is a control, of roll and joints alone: it makes CAPTURE from TRUE with the true shaft, off by 1
+degree of tilt, .2 mm across, 1 mm in depth and .6 mm along (smooth over some frames), and with masks from a file (key
+`mask`, bits packed; key `shape`) or, without one, the true ones.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from neeco.capture import Capture, Instrument, InstrumentState, State, read_capt
 from neeco.capture.model import FromVideo, Uncertainty, swap_camera_axes
 from neeco.files import read_json
 from neeco.ingest.posing.hand_posed import Answer, write_answers
-from neeco.ingest.posing.measurements import measure, write_measurements
-from neeco.ingest.posing.posed_capture import PosedCapture, Posing
+from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
 
 HAND_DEG = 3.0
 SMOOTH_FRAMES = 3.0  # of the shaft's errors in the control
@@ -149,7 +148,7 @@ def main(words: list[str] | None = None) -> None:
         true = read_capture(true_root)
         made = capture_with_shaft(true, truth, arguments.output, arguments.seed)
         name = made.instruments[0].name
-        write_measurements(made, measure(made, {name: masks_of(made, true_root, arguments.masks)}))
+        prepare(arguments.output, {name: masks_of(made, true_root, arguments.masks)})
         root = arguments.output
     posed = PosedCapture(root)
     name, instrument = next(iter(posed.instruments.items()))

@@ -1,7 +1,8 @@
-"""`neeco view`: look at a run and steer it, in a browser or as one file."""
+"""`neeco view`: look at a run and steer it, in a browser or as one file; pose frames of a capture by hand."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,16 +17,19 @@ from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 @dataclass(frozen=True)
 class Arguments:
     """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
-    that is still trained, too. With --export, write one file that does so without a server."""
+    that is still trained, too. With --export, write one file that does so without a server. With --annotate, set the roll
+    and the joints of an instrument found in a video by hand, in the frames that help most."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
-    """Run folders that `neeco train` wrote or is writing: one, or two to compare."""
+    """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
     """Address to listen on. Any but this machine's own loopback needs the token in the address that is printed."""
     no_browser: bool = False
     """Open no web browser; only print the address."""
+    annotate: bool = False
+    """Pose frames of the capture given by hand; answers go to hand_posed.yaml in it, and its states are solved anew."""
     export: Path | None = None
     """Write this HTML file instead, of the one run given."""
     size: tyro.conf.OmitArgPrefixes[SizeSettings] = RECORDED_SIZE
@@ -42,6 +46,8 @@ def run(arguments: Arguments) -> int:
 
     if not arguments.runs:
         raise NeecoError("view: no run given; give one, or two to compare")
+    if arguments.annotate:
+        return _annotate(arguments)
     if arguments.export is not None:
         if arguments.size != RECORDED_SIZE:
             raise NeecoError("--size, --scale: an exported page draws as large as its window is; leave them out")
@@ -53,18 +59,33 @@ def run(arguments: Arguments) -> int:
     with ViewerServer(
         arguments.runs, arguments.host, arguments.port, device, arguments.size, arguments.tissue
     ) as viewer:
-        try:
-            if len(shown := viewer.runs.loaded[0].tissues) > 1:
-                print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
-            print(f"{viewer.address}  (Ctrl-C ends)", flush=True)
-            if not arguments.no_browser:
-                import webbrowser
+        if len(shown := viewer.runs.loaded[0].tissues) > 1:
+            print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
+        return _serve(viewer.address, viewer.wait, arguments.no_browser)
 
-                webbrowser.open(viewer.address)
-            viewer.wait()
-        except KeyboardInterrupt:
-            print()
+
+def _serve(address: str, wait: Callable[[], None], no_browser: bool) -> int:
+    try:
+        print(f"{address}  (Ctrl-C ends)", flush=True)
+        if not no_browser:
+            import webbrowser
+
+            webbrowser.open(address)
+        wait()
+    except KeyboardInterrupt:
+        print()
     return 0
+
+
+def _annotate(arguments: Arguments) -> int:
+    from neeco.viewer.posing_server import PosingServer
+
+    if len(arguments.runs) != 1:
+        raise NeecoError(f"--annotate: {len(arguments.runs)} folders given; give one capture")
+    if arguments.export is not None:
+        raise NeecoError("--annotate, --export: give one of the two")
+    with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:
+        return _serve(server.address, server.wait, arguments.no_browser)
 
 
 def _export(arguments: Arguments, output: Path) -> int:

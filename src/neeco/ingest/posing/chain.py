@@ -57,7 +57,7 @@ def solve_rolls(
     pairs: RollPairs, carried: np.ndarray, times: np.ndarray, posed: Mapping[int, Sequence[float]]
 ) -> Solved:
     """Rolls of all frames [F] at `times` [F] s, with hand-posed ones (frame -> answers, rad). carried [F - 1]: the
-    change of an instrument that turns as little as it can. Without hand-posed frames the first one's roll is called 0."""
+    change of an instrument that turns as little as it can. Without hand-posed frames the first roll is called 0."""
     view = np.concatenate([[0.0], np.cumsum(carried)])
     frames, angles = _answers(posed)
     if not len(frames):

@@ -4,7 +4,7 @@ sure it all is, and its states written anew."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,10 @@ from neeco.capture.model import Capture, Instrument
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
-from neeco.ingest.posing.along_shaft import Shafts
+from neeco.ingest.posing.along_shaft import Load, Shafts
 from neeco.ingest.posing.chain import HAND_DEG, Solved, chain_breaks, solve_joint, solve_rolls
 from neeco.ingest.posing.hand_posed import Answer, answers_for, read_answers
-from neeco.ingest.posing.measurements import Measurements, read_measurements
+from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 
 TEN = 10  # frames that are suggested in all
 FRAME_S = 0.04  # from frame to frame, where the recording does not say
@@ -121,6 +121,15 @@ class Posing:
                 deviations = np.full(len(deviations), 180.0)
             found[name] = (float(np.median(deviations)), float(np.quantile(deviations, 0.95)))
         return found
+
+
+def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
+    """Measure what the images of a new capture say of roll and joints, keep it there and write the states that follow
+    without any hand-posed frame. load_mask: as `measure` takes it. Raises NeecoError."""
+    capture = read_capture(root)
+    write_measurements(capture, measure(capture, load_mask))
+    posed = PosedCapture(root)
+    posed.write_states(posed.solve())
 
 
 class PosedCapture:

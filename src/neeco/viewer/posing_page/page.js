@@ -1,0 +1,317 @@
+"use strict";
+const $ = id => document.getElementById(id);
+const STRIP = [-12, -6, -3, -1, 0, 1, 3, 6, 12];  // frames about the asked one
+const STEP = 2, LEAP = 10;  // degrees of a key
+const HINGE = 0.36, SHARE = 50;  // of the working length; percent: where lines begin
+const PIN = "#35b6ff", JAW = "#ff9a1f";
+
+let overview, frame, pose, shown, picture = null, hidden = false, busy = false, skipped = new Set(), timer = null;
+const lines = { hinge: null, share: SHARE };
+
+async function ask(path, body) {
+  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
+  let answer, value;
+  try {
+    answer = await fetch(path, options);
+    value = await answer.json();
+  } catch (error) {
+    throw new Error("neeco does not answer: is it still running?");
+  }
+  if (!answer.ok) throw new Error(value.error || answer.statusText);
+  return value;
+}
+
+const query = (index, more = "") => `?instrument=${encodeURIComponent(overview.instrument)}&index=${index}${more}`;
+
+function fail(error) {
+  $("failed").textContent = error.message;
+  $("failed").hidden = false;
+}
+
+function image(index) {
+  return new Promise((done, failed) => {
+    const loaded = new Image();
+    loaded.onload = () => done(loaded);
+    loaded.onerror = () => failed(new Error("the picture could not be loaded"));
+    loaded.src = "picture" + query(index);
+  });
+}
+
+async function go(index, reason) {
+  stop();
+  frame = await ask("frame" + query(index));
+  pose = { roll: frame.roll.value, joints: {} };
+  for (const [name, known] of Object.entries(frame.joints)) pose.joints[name] = known.value;
+  picture = await image(index);
+  shown = index;
+  $("why").textContent = `frame ${frame.name}` + (reason ? `: ${reason}` : "");
+  $("failed").hidden = true;
+  sliders();
+  strip();
+  draw();
+}
+
+function next() {
+  const open = overview.suggested.filter(item => !skipped.has(item.frame));
+  if (!open.length) skipped.clear();
+  const item = open[0] || overview.suggested[0];
+  return item ? go(item.frame, item.reason) : Promise.resolve();
+}
+
+// a point of the instrument, mm along the shaft, across and towards the camera -> the picture's pixels
+function place(along, across, towards) {
+  const nearer = frame.origin_towards / (frame.origin_towards + towards);
+  const a = nearer * (frame.origin_along + along) - frame.origin_along, b = nearer * across;
+  const [left, right, top] = overview.window, scale = $("canvas").width / (right - left);
+  return [(a - left) * scale, (b - top) * scale];
+}
+
+// of the instrument's frame: x along the pin, y across it, z along the shaft
+function point(x, y, z) {
+  const roll = pose.roll * Math.PI / 180, c = Math.cos(roll), s = Math.sin(roll);
+  return place(z, s * x + c * y, c * x - s * y);
+}
+
+function stroke(context, points, color, width, dash = []) {
+  for (const [style, wide] of [["rgba(0,0,0,.65)", width + 2.5], [color, width]]) {
+    context.strokeStyle = style;
+    context.lineWidth = wide * devicePixelRatio;
+    context.setLineDash(dash.map(length => length * devicePixelRatio));
+    context.beginPath();
+    points.forEach(([x, y], i) => i ? context.lineTo(x, y) : context.moveTo(x, y));
+    context.stroke();
+  }
+}
+
+function draw() {
+  const canvas = $("canvas"), box = $("stage").getBoundingClientRect();
+  const ratio = picture.naturalHeight / picture.naturalWidth;
+  const width = Math.max(200, Math.min(box.width, box.height / ratio));
+  canvas.style.width = `${width}px`;
+  canvas.style.height = `${width * ratio}px`;
+  canvas.width = Math.round(width * devicePixelRatio);
+  canvas.height = Math.round(width * ratio * devicePixelRatio);
+  const context = canvas.getContext("2d");
+  context.imageSmoothingQuality = "high";
+  context.drawImage(picture, 0, 0, canvas.width, canvas.height);
+  if (hidden || shown !== frame.index) return;
+  context.lineCap = "round";
+  const hinge = lines.hinge, radius = overview.radius, reach = overview.length - hinge;
+  // the pin, sticking out of the wrist; the wrist's face at its marked end, dashed where it is turned away
+  const facing = Math.cos(pose.roll * Math.PI / 180) > 0;
+  stroke(context, [point(radius, 0, 0), point(radius, 0, hinge)], PIN, 1.5, facing ? [] : [3, 6]);
+  stroke(context, [point(-1.7 * radius, 0, hinge), point(1.7 * radius, 0, hinge)], PIN, 3);
+  const [x, y] = point(1.7 * radius, 0, hinge);
+  context.setLineDash([]);
+  context.beginPath();
+  context.arc(x, y, 6 * devicePixelRatio, 0, 2 * Math.PI);
+  context.lineWidth = 2.5 * devicePixelRatio;
+  context.strokeStyle = facing ? "rgba(0,0,0,.65)" : PIN;
+  context.fillStyle = facing ? PIN : "rgba(0,0,0,.65)";
+  context.fill();
+  context.stroke();
+  const joint = Object.keys(pose.joints)[0];
+  if (joint === undefined) return;
+  const opening = pose.joints[joint] * Math.PI / 180, share = lines.share / 100;
+  for (const angle of [-opening * share, opening * (1 - share)])
+    stroke(context, [point(0, 0, hinge), point(0, reach * Math.sin(angle), hinge + reach * Math.cos(angle))], JAW, 3);
+}
+
+function slider(label, kind, low, high, value, change, sure) {
+  const row = document.createElement("label"), said = document.createElement("output"), input = document.createElement("input");
+  row.append(label, said, input);
+  Object.assign(input, { type: "range", min: low, max: high, step: 1, value, className: kind });
+  const show = () => said.textContent = `${Math.round(input.value)}°` + (sure ? `  (expected ± ${Math.round(sure)}°)` : "");
+  input.oninput = () => { change(Number(input.value)); show(); draw(); };
+  show();
+  return row;
+}
+
+function sliders() {
+  const rows = [slider("roll", "pin", -180, 180, pose.roll, value => pose.roll = value, overview.done ? frame.roll.deviation : 0)];
+  for (const [name, [low, high]] of Object.entries(overview.joints)) {
+    const sure = overview.done ? frame.joints[name].deviation : 0;
+    rows.push(slider(name, "jaw", low, high, pose.joints[name], value => pose.joints[name] = value, sure));
+  }
+  $("sliders").replaceChildren(...rows);
+}
+
+function turn(what, degrees) {
+  if (shown !== frame.index) return show(frame.index);
+  if (what === "roll") pose.roll = (pose.roll + degrees + 540) % 360 - 180;
+  else {
+    const name = Object.keys(pose.joints)[0];
+    if (name === undefined) return;
+    const [low, high] = overview.joints[name];
+    pose.joints[name] = Math.min(high, Math.max(low, pose.joints[name] + degrees));
+  }
+  sliders();
+  draw();
+}
+
+function strip() {
+  const indices = STRIP.map(step => frame.index + step).filter(index => index >= 0 && index < overview.frames);
+  $("strip").replaceChildren(...indices.map(index => {
+    const figure = document.createElement("figure"), small = document.createElement("img"), caption = document.createElement("figcaption");
+    small.src = "picture" + query(index, "&small=1");
+    small.alt = `frame ${index}`;
+    const apart = index - frame.index;
+    caption.textContent = apart ? (apart > 0 ? `+${apart}` : `${apart}`) : "this frame";
+    figure.dataset.index = index;
+    figure.append(small, caption);
+    figure.onclick = () => show(index);
+    return figure;
+  }));
+  mark();
+}
+
+function mark() {
+  for (const figure of $("strip").children)
+    figure.toggleAttribute("aria-current", Number(figure.dataset.index) === shown);
+}
+
+// another frame in the large picture, to look at
+async function show(index) {
+  stop();
+  picture = await image(index);
+  shown = index;
+  mark();
+  draw();
+}
+
+function stop() {
+  clearInterval(timer);
+  timer = null;
+}
+
+async function play() {
+  if (timer) return show(frame.index);
+  const first = Math.max(0, frame.index - 12), last = Math.min(overview.frames - 1, frame.index + 12);
+  const film = await Promise.all(Array.from({ length: last - first + 1 }, (_, k) => image(first + k)));
+  let at = 0;
+  timer = setInterval(() => {
+    if (at >= film.length) return show(frame.index).catch(fail);
+    picture = film[at];
+    shown = first + at++;
+    mark();
+    draw();
+  }, 80);
+}
+
+function report() {
+  $("which").textContent = `${overview.capture}, ${overview.instrument}`;
+  $("bar").style.width = `${Math.min(100, 100 * overview.done / overview.of)}%`;
+  $("count").textContent = overview.done >= overview.of ? `${overview.done} frames posed: enough; more still help` : `${overview.done} of ${overview.of} suggested frames posed`;
+  const rows = [];
+  for (const [name, [half, most]] of Object.entries(overview.sure)) {
+    const term = document.createElement("dt"), text = document.createElement("dd");
+    term.textContent = name;
+    text.textContent = half >= 179 ? "not known yet" : `± ${Math.round(half)}°, at worst ± ${Math.round(most)}°`;
+    rows.push(term, text);
+  }
+  $("sure").replaceChildren(...rows);
+  const context = $("doubt").getContext("2d"), { width, height } = $("doubt");
+  context.clearRect(0, 0, width, height);
+  const style = getComputedStyle(document.documentElement), most = 40;
+  overview.deviations.forEach((value, index) => {
+    const tall = overview.done ? Math.min(1, value / most) * height : height, wide = width / overview.frames;
+    context.fillStyle = style.getPropertyValue("--line");
+    context.fillRect(index * wide, height - tall, wide + 0.5, tall);
+  });
+  context.fillStyle = style.getPropertyValue("--accent");
+  for (const item of overview.answered) context.fillRect(item.frame / overview.frames * width - 1.5, 0, 3, height);
+  $("answers").replaceChildren(...overview.answered.map(item => {
+    const row = document.createElement("li");
+    const joints = Object.entries(item.joints).map(([name, value]) => `, ${name} ${Math.round(value)}°`).join("");
+    row.textContent = `${item.name}: roll ${Math.round(item.roll)}°${joints}` + item.doubts.map(doubt => `; ${doubt}`).join("");
+    row.className = item.doubts.length ? "doubted" : "";
+    row.onclick = () => go(item.frame, "posed before").catch(fail);
+    return row;
+  }));
+  $("undo").disabled = !overview.answered.length;
+}
+
+async function act(work) {
+  if (busy) return;
+  busy = true;
+  $("save").disabled = true;
+  try { await work(); } catch (error) { fail(error); }
+  busy = false;
+  $("save").disabled = false;
+}
+
+const save = () => act(async () => {
+  say("saving");
+  const name = frame.name;
+  overview = await ask("save", { instrument: overview.instrument, frame: frame.index, roll: pose.roll, joints: pose.joints });
+  skipped.clear();
+  report();
+  say(overview.said.length ? `${name} is saved, but its ${overview.said.join("; ")}. Undo to look again.` : `${name} is saved.`, overview.said.length);
+  await next();
+});
+
+const skip = () => act(async () => {
+  skipped.add(frame.index);
+  say("skipped");
+  await next();
+});
+
+const undo = () => act(async () => {
+  overview = await ask("undo", { instrument: overview.instrument });
+  report();
+  if (overview.frame === null) return;
+  say("the last answer is gone");
+  await go(overview.frame, "again");
+});
+
+function hide() {
+  hidden = !hidden;
+  $("hide").setAttribute("aria-pressed", hidden);
+  draw();
+}
+
+function say(text, doubted) {
+  $("said").textContent = text;
+  $("said").className = doubted ? "doubted" : "";
+}
+
+function keep() {
+  lines.hinge = Number($("hinge").value);
+  lines.share = Number($("share").value);
+  $("hinge-value").textContent = lines.hinge.toFixed(1);
+  $("share-value").textContent = lines.share;
+  localStorage.setItem(`neeco ${overview.capture} ${overview.instrument}`, JSON.stringify(lines));
+  if (frame) draw();
+}
+
+async function start() {
+  overview = await ask("overview");
+  const kept = JSON.parse(localStorage.getItem(`neeco ${overview.capture} ${overview.instrument}`) || "{}");
+  Object.assign($("hinge"), { max: overview.length, value: kept.hinge ?? HINGE * overview.length });
+  $("share").value = kept.share ?? SHARE;
+  keep();
+  report();
+  await next();
+}
+
+$("save").onclick = save;
+$("skip").onclick = skip;
+$("undo").onclick = undo;
+$("hide").onclick = hide;
+$("hinge").oninput = $("share").oninput = keep;
+$("canvas").addEventListener("wheel", event => { event.preventDefault(); turn("roll", event.deltaY > 0 ? STEP : -STEP); }, { passive: false });
+addEventListener("resize", () => picture && draw());
+addEventListener("keydown", event => {
+  if (!frame || event.ctrlKey || event.metaKey || event.altKey) return;
+  const step = event.shiftKey ? LEAP : STEP;
+  const keys = {
+    ArrowLeft: () => turn("roll", -step), ArrowRight: () => turn("roll", step),
+    ArrowUp: () => turn("joint", step), ArrowDown: () => turn("joint", -step),
+    Enter: save, s: skip, u: undo, h: hide, p: () => play().catch(fail),
+  };
+  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if (!keys[key] || (key === "Enter" && event.target.tagName === "SUMMARY")) return;
+  event.preventDefault();
+  keys[key]();
+});
+start().catch(fail);

@@ -1,0 +1,171 @@
+"""`neeco view CAPTURE --annotate`: a small web server with the page on which a person poses frames by hand.
+
+Every request passes the same access control as the viewer of runs; the page loads nothing from elsewhere.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import threading
+import time
+from functools import cache
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from neeco.errors import NeecoError
+from neeco.files import require_like
+from neeco.viewer.access import AccessControl, free_port, is_loopback, url_of
+from neeco.viewer.posing_session import PosingSession
+
+HOST, PORT = "127.0.0.1", 8080
+TOKEN_BYTES = 24
+MAX_BODY = 2**16  # bytes of a request's
+WAIT_S = 20.0  # for the rest of a request
+POLL_S = 0.5  # between two looks for Ctrl-C
+ANSWER = {"instrument": str, "frame": int, "roll": float, "joints": {str: float}}
+
+log = logging.getLogger(__name__)
+
+
+class PosingServer:
+    """A running server; `address` is what to open. Use as a context manager, or call `stop`."""
+
+    def __init__(self, capture: Path, host: str = HOST, port: int = PORT) -> None:
+        """port: or the next that is free. Raises NeecoError."""
+        self.session = PosingSession(capture)
+        port = free_port(host, port)
+        self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
+        access = AccessControl(self.token, f"neeco_{port}")
+        handler = type("Handler", (_Handler,), {"session": self.session, "access": access})
+        self._server = ThreadingHTTPServer((host, port), handler)
+        self.address = url_of(host, port, self.token)
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> PosingServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End the server."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Until Ctrl-C."""
+        while True:  # in short waits: a signal that comes just before one begins is heard after it
+            time.sleep(POLL_S)
+
+
+@cache
+def page() -> bytes:
+    """The page, one file of HTML."""
+    folder = files("neeco.viewer") / "posing_page"
+    html, style, script = (folder.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
+    return html.replace("{{ style }}", style).replace("{{ script }}", script).encode()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers one browser's requests."""
+
+    session: PosingSession
+    access: AccessControl
+    timeout = WAIT_S
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "neeco", ""
+
+    def do_GET(self) -> None:
+        if not self._allowed():
+            return
+        address = urlsplit(self.path)
+        given = {name: values[-1] for name, values in parse_qs(address.query).items()}
+        session = self.session
+        instrument = given.get("instrument", session.instruments[0])
+        if address.path == "/":
+            self._send(page(), "text/html; charset=utf-8")
+        elif address.path == "/overview":
+            self._answer(lambda: session.overview(instrument))
+        elif address.path == "/frame":
+            self._answer(lambda: session.frame(instrument, _whole(given.get("index"))))
+        elif address.path == "/picture":
+            try:
+                pixels = session.picture(instrument, _whole(given.get("index")), "small" in given)
+            except NeecoError as error:
+                self._send(str(error).encode(), "text/plain; charset=utf-8", HTTPStatus.NOT_FOUND)
+            else:
+                self._send(pixels, "image/jpeg")
+        else:
+            self._send(b"neeco view: no such page\n", "text/plain", HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > MAX_BODY:
+            self.close_connection = True  # what follows would be taken for the next request
+            self._send(b"neeco view: not understood\n", "text/plain", HTTPStatus.BAD_REQUEST)
+            return
+        body = self.rfile.read(int(length))
+        # a form on another site cannot send JSON without asking first
+        if not self._allowed(self.headers.get("Content-Type") == "application/json"):
+            return
+        try:
+            value = json.loads(body)
+        except (ValueError, RecursionError):
+            value = None
+        path = urlsplit(self.path).path
+        if path == "/save":
+            self._answer(lambda: self._save(value))
+        elif path == "/undo":
+            self._answer(lambda: self._undo(value))
+        else:
+            self._send(b"neeco view: no such page\n", "text/plain", HTTPStatus.NOT_FOUND)
+
+    def _save(self, value: Any) -> dict[str, Any]:
+        given = require_like(value, ANSWER, "answer", "send it anew")
+        return self.session.save(given["instrument"], given["frame"], given["roll"], given["joints"])
+
+    def _undo(self, value: Any) -> dict[str, Any]:
+        return self.session.undo(require_like(value, {"instrument": str}, "undo", "send it anew")["instrument"])
+
+    def _allowed(self, plain: bool = True) -> bool:
+        headers = {name.lower(): self.headers.get_all(name, []) for name in self.headers.keys()}  # noqa: SIM118
+        reason = self.access.refusal(self.path, headers) if plain else "expected application/json"
+        if reason is not None:
+            self.close_connection = True
+            self._send(f"neeco view: refused: {reason}\n".encode(), "text/plain", HTTPStatus.FORBIDDEN)
+        return reason is None
+
+    def _answer(self, ask: Any) -> None:
+        """Send what `ask` gives as JSON, or what is wrong."""
+        try:
+            value, status = ask(), HTTPStatus.OK
+        except NeecoError as error:
+            value, status = {"error": str(error)}, HTTPStatus.BAD_REQUEST
+        self._send(json.dumps(value, allow_nan=False).encode(), "application/json", status)
+
+    def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        if status == HTTPStatus.OK:
+            html = body if kind.startswith("text/html") else b""
+            for name, value in self.access.page_headers(self.path, html, self.headers["Host"]).items():
+                self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        log.debug(format, *args)
+
+
+def _whole(text: str | None) -> int:
+    """A number of a frame; -1, which none has, where it is no number."""
+    return int(text) if text is not None and text.isdecimal() and len(text) < 10 else -1

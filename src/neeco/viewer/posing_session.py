@@ -1,0 +1,175 @@
+"""What the page of `neeco view CAPTURE --annotate` shows and saves: asked frames, pictures along the shaft, answers."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from neeco.capture.images import open_image
+from neeco.errors import NeecoError
+from neeco.ingest.posing.along_shaft import crop
+from neeco.ingest.posing.hand_posed import Answer, read_answers, write_answers
+from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing
+
+ALONG, ACROSS = (
+    (-0.6, 1.4),
+    0.65,
+)  # of the working length, that a picture shows: before and beyond the origin, beside it
+PICTURE_PX, THUMB_PX = 1000, 160  # wide
+QUALITY = 90
+JOINT_RANGE_DEG = (0.0, 120.0)  # of a slider, where the capture states no limits
+
+
+class PosingSession:
+    """One capture that is posed by hand, by one or more browsers. Any thread may call it."""
+
+    def __init__(self, root: Path) -> None:
+        """Raises NeecoError for a capture that cannot be posed, or whose answers cannot be read."""
+        self.posed = PosedCapture(root)
+        self._lock = threading.Lock()
+        self._answers = read_answers(root)
+        self._posings = self.posed.solve(self._answers)
+
+    @property
+    def instruments(self) -> list[str]:
+        """Their names."""
+        return list(self._posings)
+
+    def overview(self, instrument: str) -> dict[str, Any]:
+        """What is asked, answered and known of an instrument, as the page takes it. Raises NeecoError."""
+        with self._lock:
+            return self._overview(instrument)
+
+    def frame(self, instrument: str, index: int) -> dict[str, Any]:
+        """What is known in one frame, and what its lines are drawn with. Raises NeecoError."""
+        with self._lock:
+            posing = self._posing(instrument, index)
+            origin = posing.shafts.origins[index]
+            towards, _ = posing.shafts.view_axes
+            return {
+                "index": index,
+                "name": self.posed.frames[index],
+                "roll": _known(posing.rolls.values[index], posing.rolls.deviations[index], wrap=True),
+                "joints": {
+                    name: _known(solved.values[index], solved.deviations[index])
+                    for name, solved in posing.joints.items()
+                },
+                # a point a mm along the shaft, b across, c towards the camera is seen at (a, b) of another depth
+                "origin_towards": float(towards[index] @ origin),
+                "origin_along": float(posing.shafts.directions[index] @ origin),
+            }
+
+    def picture(self, instrument: str, index: int, small: bool) -> bytes:
+        """A frame along the shaft, which points to the right, as JPEG. Raises NeecoError."""
+        posing = self._posing(instrument, index)
+        left, right, top, bottom = self._window(posing)
+        width = THUMB_PX if small else PICTURE_PX
+        height = round(width * (bottom - top) / (right - left))
+        scale = (right - left) / width
+        along = left + (np.arange(width) + 0.5) * scale
+        across = top + (np.arange(height) + 0.5) * scale
+        image = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
+        pixels = crop(posing.shafts, index, image, along, across).transpose(1, 0, 2)
+        done, encoded = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        if not done:
+            raise NeecoError(f"{self.posed.frames[index]}: the picture could not be encoded")
+        return encoded.tobytes()
+
+    def save(self, instrument: str, index: int, roll_deg: float, joints_deg: dict[str, float]) -> dict[str, Any]:
+        """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
+        NeecoError."""
+        with self._lock:
+            posing = self._posing(instrument, index)
+            if set(joints_deg) != set(posing.joints):
+                raise NeecoError(f"joints: expected {', '.join(posing.joints) or 'none'}")
+            if not all(math.isfinite(value) and abs(value) <= 360 for value in (roll_deg, *joints_deg.values())):
+                raise NeecoError("roll and joints: expected degrees between -360 and 360")
+            now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
+            answer = Answer(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
+            self._keep([*read_answers(self.posed.root), answer])
+            doubts = [doubt for doubt in self._posings[instrument].doubts() if doubt.frame == index]
+            return self._overview(instrument) | {"said": [str(doubt) for doubt in doubts]}
+
+    def undo(self, instrument: str) -> dict[str, Any]:
+        """Take the last answer for an instrument out again; the overview, and under `frame` what it was of. Raises
+        NeecoError."""
+        with self._lock:
+            answers = read_answers(self.posed.root)
+            own = [position for position, answer in enumerate(answers) if answer.instrument == instrument]
+            if not own:
+                return self._overview(instrument) | {"frame": None}
+            gone = answers.pop(own[-1])
+            self._keep(answers)
+            return self._overview(instrument) | {"frame": self.posed.frames.index(gone.frame)}
+
+    def _keep(self, answers: list[Answer]) -> None:
+        posings = self.posed.solve(answers)  # raises before anything is written
+        write_answers(self.posed.root, answers)
+        self.posed.write_states(posings)
+        self._answers, self._posings = answers, posings
+
+    def _posing(self, instrument: str, index: int = 0) -> Posing:
+        if instrument not in self._posings:
+            raise NeecoError(f"no instrument {instrument!r}; known: {', '.join(self._posings)}")
+        if not 0 <= index < len(self.posed.frames):
+            raise NeecoError(f"no frame {index}; there are {len(self.posed.frames)}")
+        return self._posings[instrument]
+
+    def _window(self, posing: Posing) -> tuple[float, float, float, float]:
+        """Left, right (mm along the shaft), top and bottom (across) of a picture."""
+        length = posing.shafts.working_length_mm
+        return ALONG[0] * length, ALONG[1] * length, -ACROSS * length, ACROSS * length
+
+    def _overview(self, instrument: str) -> dict[str, Any]:
+        posing = self._posing(instrument)
+        answered = {frame for frame, _ in posing.answers}
+        doubts: dict[int, list[str]] = {}
+        for doubt in posing.doubts():
+            doubts.setdefault(doubt.frame, []).append(str(doubt))
+        return {
+            "capture": self.posed.root.resolve().name,
+            "instrument": instrument,
+            "instruments": self.instruments,
+            "frames": len(self.posed.frames),
+            "suggested": [
+                {"frame": item.frame, "name": self.posed.frames[item.frame], "reason": item.reason}
+                for item in posing.suggestions(max(1, TEN - len(answered)))
+            ],
+            "of": max(TEN, len(answered)),
+            "answered": [
+                {
+                    "frame": frame,
+                    "name": answer.frame,
+                    "roll": answer.roll_deg,
+                    "joints": answer.joints_deg,
+                    "doubts": doubts.get(frame, []),
+                }
+                for frame, answer in posing.answers
+            ],
+            "done": len(answered),
+            "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.sureness().items()},
+            "breaks": len(posing.breaks),
+            "deviations": [round(min(math.degrees(value), 180.0), 1) for value in posing.rolls.deviations],
+            "window": self._window(posing),
+            "length": posing.shafts.working_length_mm,
+            "radius": posing.shafts.diameter_mm / 2,
+            "joints": {
+                name: [math.degrees(value) for value in limits]
+                if (limits := posing.instrument.joints[name]) is not None
+                else list(JOINT_RANGE_DEG)
+                for name in posing.joints
+            },
+        }
+
+
+def _known(value: float, deviation: float, wrap: bool = False) -> dict[str, float]:
+    degrees = math.degrees(float(value))
+    if wrap:
+        degrees = (degrees + 180) % 360 - 180
+    return {"value": degrees, "deviation": min(math.degrees(float(deviation)), 180.0)}
