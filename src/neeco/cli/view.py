@@ -17,8 +17,8 @@ from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
 @dataclass(frozen=True)
 class Arguments:
     """Show a run in a web browser: any state, any view, what is made up and what is wrong. Two runs side by side; one
-    that is still trained, too. With --export, write one file that does so without a server. With --annotate, set the roll
-    and the joints of an instrument found in a video by hand, in the frames that help most."""
+    that is still trained, too. With --export, write one file that does so without a server. With --annotate, set roll
+    and joints of an instrument found in a video by hand, in the frames that help most."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
     """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture."""

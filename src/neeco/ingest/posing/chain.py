@@ -61,10 +61,17 @@ def solve_rolls(
     view = np.concatenate([[0.0], np.cumsum(carried)])
     frames, angles = _answers(posed)
     if not len(frames):
-        frames, angles = np.array([0]), np.array([0.0])
-    # answers less than half a turn apart from one to the next, as far as the view tells
+        return _chained(pairs, view, times, np.array([0]), np.array([0.0]))
+    # which of the turns an answer means: the nearest to what textures alone say, all answers together
+    alone = _chained(pairs, view, times, np.array([0]), np.array([0.0])).values
+    beside = np.exp(1j * (angles - alone[frames])).mean()
+    expected = alone[frames] + np.angle(beside)
+    return _chained(pairs, view, times, frames, expected + _wrapped(angles - expected))
+
+
+def _chained(pairs: RollPairs, view: np.ndarray, times: np.ndarray, frames: np.ndarray, angles: np.ndarray) -> Solved:
+    """Rolls of all frames, given those of some [A], which are not taken modulo a turn."""
     angles = angles - view[frames]
-    angles = angles[0] + np.concatenate([[0.0], np.cumsum(_wrapped(np.diff(angles)))])
     center = angles.mean()
     covariance = ROLL_SWING**2 * _alike(times, SMOOTH_S) + ANYWHERE**2
     precision = np.linalg.inv(covariance + JITTER * np.eye(len(times)))

@@ -106,8 +106,8 @@ class Posing:
                     continue
                 # leaving one answer out of a Gaussian posterior
                 left = 1 - float(solved.deviations[frame]) ** 2 / math.radians(HAND_DEG) ** 2
-                apart = _turn(said - math.degrees(solved.values[frame])) / max(left, 0.1)
-                if abs(apart) > DOUBTED_DEG and abs(apart) > DOUBTED_SHARE * HAND_DEG / math.sqrt(max(left, 0.1)):
+                apart = _turn(said - math.degrees(solved.values[frame])) / max(left, 0.02)
+                if abs(apart) > DOUBTED_DEG and abs(apart) > DOUBTED_SHARE * HAND_DEG / math.sqrt(max(left, 0.02)):
                     found.append(Doubt(frame, what, apart, "what its neighbours say"))
         return found
 
