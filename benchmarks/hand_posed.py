@@ -1,38 +1,42 @@
 """How well roll and joints of an instrument found in a video are known once ten frames were posed by hand.
 
-    python benchmarks/hand_posed.py CAPTURE [--truth TRUE] [--answers 10] [--seed 1]
-    python benchmarks/hand_posed.py TRUE --shaft-from-truth --output CAPTURE [--masks FILE.npz]
+    python benchmarks/hand_posed.py TRUE --output CAPTURE [--diameter MM] [--working-length MM] [--seed 1]
+    python benchmarks/hand_posed.py TRUE --output CAPTURE --shaft-from-truth
 
-CAPTURE was made by `neeco ingest --shaft-diameter`; TRUE is the rendered capture of the same frames (default: CAPTURE
-itself), with truth/transforms.json. "Posed by hand" is the truth with a normal, seeded error of 3 degrees on frames
-that the program asks for one after another; nothing else of the truth is read, except for the scores. Prints the
-errors of roll and joints without any answer and with each number of them, and writes hand_posed.yaml and the states
-that follow into CAPTURE.
+TRUE is a rendered capture with truth/transforms.json. Its cameras, points and images alone become CAPTURE, in which the
+shaft is found as `neeco ingest --shaft-diameter` finds it. "Posed by hand" is the truth with a normal, seeded error of
+3 degrees on frames that the program asks for one after another; nothing else of the truth is read, except for the
+scores. Prints the errors of roll and joint without any answer and with each number of them, and writes hand_posed.yaml
+and the states that follow into CAPTURE, which can be trained.
 
---shaft-from-truth is a control, of roll and joints alone: it makes CAPTURE from TRUE with the true shaft, off by 1
-degree of tilt, .2 mm across, 1 mm in depth and .6 mm along (smooth over some frames), and with masks from a file (key
-`mask`, bits packed; key `shape`) or, without one, the true ones.
+--shaft-from-truth is a control, of roll and joint alone: the true shaft, off by 1 degree of tilt, .2 mm across, 1 mm in
+depth and .6 mm along, smooth over some frames.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import process_time
 
-import cv2
 import numpy as np
 import torch
+from from_video import masks_of
 from scipy.ndimage import gaussian_filter1d
 
 from neeco.capture import Capture, Instrument, InstrumentState, State, read_capture, write_capture
-from neeco.capture.model import FromVideo, Uncertainty, swap_camera_axes
+from neeco.capture.lens import Lens
+from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
 from neeco.files import read_json
+from neeco.ingest.from_video import find_shaft
 from neeco.ingest.posing.hand_posed import Answer, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
+from neeco.ingest.shaft_axis import Scene
+from neeco.ingest.still import reduced
 
 HAND_DEG = 3.0
+LIMITS = (0.0, 1.6)  # rad, of the joint
 SMOOTH_FRAMES = 3.0  # of the shaft's errors in the control
 TILT_DEG, ACROSS_MM, DEPTH_MM, ALONG_MM = 1.0, 0.2, 1.0, 0.6
 SHAFTS = {"maryland": (6.0, 26.0), "scissors": (4.8, 20.5)}  # diameter and working length, mm, as those READMEs say
@@ -45,6 +49,16 @@ class Truth:
     camera_from_instrument: np.ndarray
     joint: np.ndarray
     shaft_mm: tuple[float, float]  # diameter, working length
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """Poses [F, 4, 4] that have no roll, in which frames [F] they are known, and how well."""
+
+    camera_from_instrument: np.ndarray
+    known: np.ndarray
+    uncertainties: tuple[Uncertainty, ...]
+    seen: FromVideo
 
 
 def read_truth(root: Path) -> Truth:
@@ -68,12 +82,24 @@ def read_truth(root: Path) -> Truth:
     return Truth(np.linalg.inv(camera) @ pose @ sensor_from_instrument, opening, shaft)
 
 
-def capture_with_shaft(true: Capture, truth: Truth, output: Path, seed: int) -> Capture:
-    """A capture as one found in the video is, its shaft the true one with errors, its roll of no meaning."""
+def shaft_from_video(true: Capture, masks: np.ndarray, shaft: tuple[float, float | None]) -> Shaft:
+    """As `neeco ingest` finds it, from a diameter and, if given, a working length; masks of the images reduced."""
+    images = np.stack([reduced(frame.load_image_bytes().numpy()) for frame in true.frames])
+    cameras = np.stack([frame.camera.world_from_camera.double().numpy() for frame in true.frames])
+    times = np.array([frame.state.time for frame in true.frames])
+    intrinsics = Lens.of(true.frames[0].camera.within(REFERENCE_PIXELS)).intrinsics
+    scene = Scene(cameras, times, np.zeros(len(times)), shaft[0] / 2, intrinsics, True, True)
+    found = find_shaft(images, masks, scene, shaft[1])
+    seen = FromVideo(shaft[0], found.working_length)
+    return Shaft(np.linalg.inv(cameras) @ found.poses, found.known, found.uncertainties, seen)
+
+
+def shaft_from_truth(truth: Truth, seed: int) -> Shaft:
+    """The true one with errors; its roll has no meaning."""
     random = np.random.default_rng(seed)
 
     def error(deviation: float) -> np.ndarray:
-        smooth = gaussian_filter1d(random.normal(size=len(true.frames)), SMOOTH_FRAMES, mode="wrap")
+        smooth = gaussian_filter1d(random.normal(size=len(truth.joint)), SMOOTH_FRAMES, mode="wrap")
         return np.asarray(deviation * smooth / smooth.std())[:, None]
 
     origin, z = truth.camera_from_instrument[:, :3, 3].copy(), truth.camera_from_instrument[:, :3, 2]
@@ -86,29 +112,24 @@ def capture_with_shaft(true: Capture, truth: Truth, output: Path, seed: int) -> 
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     x = np.cross(np.cross(z, towards), z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    name = true.instruments[0].name
-    joint = next(iter(true.instruments[0].joints), "jaw_angle")
-    uncertainty = Uncertainty((ACROSS_MM, ACROSS_MM, DEPTH_MM), (TILT_DEG, TILT_DEG, 180.0), {joint: 60.0})
+    pose = np.tile(np.eye(4), (len(z), 1, 1))
+    pose[:, :3, :3], pose[:, :3, 3] = np.stack([x, np.cross(z, x), z], -1), origin
+    uncertainty = Uncertainty((ACROSS_MM, ACROSS_MM, DEPTH_MM), (TILT_DEG, TILT_DEG, 180.0))
+    return Shaft(pose, np.ones(len(z), bool), (uncertainty,) * len(z), FromVideo(*truth.shaft_mm))
+
+
+def capture_of(true: Capture, shaft: Shaft, output: Path) -> Capture:
+    """A capture of the frames in which the shaft is known, as `neeco ingest` writes one."""
+    name, joint = true.instruments[0].name, next(iter(true.instruments[0].joints), "jaw_angle")
     frames = []
-    for index, frame in enumerate(true.frames):
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([x[index], np.cross(z[index], x[index]), z[index]], -1)
-        pose[:3, 3] = origin[index]
-        camera = frame.camera.world_from_camera.double()
-        state = InstrumentState(camera @ torch.from_numpy(pose), {joint: 0.0}, None, uncertainty)
+    for index in np.flatnonzero(shaft.known):
+        frame = true.frames[index]
+        pose = frame.camera.world_from_camera.double() @ torch.from_numpy(shaft.camera_from_instrument[index])
+        state = InstrumentState(pose, {joint: 0.0}, None, shaft.uncertainties[index])
         frames.append(replace(frame, state=State({name: state}, frame.state.time)))
-    instrument = Instrument(name, {joint: (0.0, 1.6)}, from_video=FromVideo(*truth.shaft_mm))
+    instrument = Instrument(name, {joint: LIMITS}, from_video=shaft.seen)
     write_capture(replace(true, frames=tuple(frames), instruments=(instrument,)), output)
     return read_capture(output)
-
-
-def masks_of(capture: Capture, true: Path, file: Path | None) -> Callable[[int], np.ndarray]:
-    if file is not None:
-        packed = np.load(file)
-        shape = tuple(packed["shape"])
-        masks = np.unpackbits(packed["mask"])[: np.prod(shape)].reshape(shape).astype(bool)
-        return lambda frame: np.asarray(masks[frame])
-    return lambda frame: cv2.imread(str(true / "truth" / "masks" / f"{capture.frames[frame].name}.png"), 0) > 0
 
 
 def scores(posing: Posing, truth: Truth, free: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -132,26 +153,31 @@ def row(label: str, posing: Posing, truth: Truth, free: bool = False) -> str:
 
 def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("--truth", type=Path)
+    parser.add_argument("true", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--diameter", type=float, help="of the shaft, mm; as the rendered capture states it")
+    parser.add_argument(
+        "--working-length", type=float, help="from the shaft's end to the tip, mm; measured if not given"
+    )
     parser.add_argument("--answers", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--shaft-from-truth", action="store_true")
-    parser.add_argument("--output", type=Path)
-    parser.add_argument("--masks", type=Path)
     arguments = parser.parse_args(words)
-    root, true_root = arguments.capture, arguments.truth or arguments.capture
-    truth = read_truth(true_root)
+    true, truth = read_capture(arguments.true), read_truth(arguments.true)
+    masks, _ = masks_of(true, np.stack([reduced(frame.load_image_bytes().numpy()) for frame in true.frames]))
     if arguments.shaft_from_truth:
-        if arguments.output is None:
-            parser.error("--shaft-from-truth: give --output")
-        true = read_capture(true_root)
-        made = capture_with_shaft(true, truth, arguments.output, arguments.seed)
-        name = made.instruments[0].name
-        prepare(arguments.output, {name: masks_of(made, true_root, arguments.masks)})
-        root = arguments.output
+        shaft = shaft_from_truth(truth, arguments.seed)
+    else:
+        shaft = shaft_from_video(true, masks, (arguments.diameter or truth.shaft_mm[0], arguments.working_length))
+    root = arguments.output
+    name = capture_of(true, shaft, root).instruments[0].name
+    rows = np.flatnonzero(shaft.known)
+    start = process_time()
+    prepare(root, {name: lambda frame: masks[rows[frame]]})
+    print(f"{len(rows)} of {len(masks)} frames; measured in {process_time() - start:.0f} processor seconds")
+    truth = replace(truth, camera_from_instrument=truth.camera_from_instrument[rows], joint=truth.joint[rows])
     posed = PosedCapture(root)
-    name, instrument = next(iter(posed.instruments.items()))
+    instrument = posed.instruments[name]
     random = np.random.default_rng(arguments.seed)
     answers: list[Answer] = []
     print(f"{root.name}, {name}: errors, degrees (rms, median, 95 %, and the median standard deviation that is stated)")

@@ -91,6 +91,8 @@ function draw() {
   canvas.style.height = `${width * ratio}px`;
   canvas.width = Math.round(width * devicePixelRatio);
   canvas.height = Math.round(width * ratio * devicePixelRatio);
+  $("why").style.left = `${(box.width - width) / 2 + 8}px`;
+  $("why").style.top = `${(box.height - width * ratio) / 2 + 8}px`;
   const context = canvas.getContext("2d");
   context.imageSmoothingQuality = "high";
   context.drawImage(picture, 0, 0, canvas.width, canvas.height);
@@ -300,7 +302,7 @@ $("undo").onclick = undo;
 $("hide").onclick = hide;
 $("hinge").oninput = $("share").oninput = keep;
 $("canvas").addEventListener("wheel", event => { event.preventDefault(); turn("roll", event.deltaY > 0 ? STEP : -STEP); }, { passive: false });
-addEventListener("resize", () => picture && draw());
+new ResizeObserver(() => frame && picture && draw()).observe($("stage"));
 addEventListener("keydown", event => {
   if (!frame || event.ctrlKey || event.metaKey || event.altKey) return;
   const step = event.shiftKey ? LEAP : STEP;
