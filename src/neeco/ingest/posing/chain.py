@@ -16,7 +16,7 @@ from neeco.ingest.posing.roll_pairs import RollPairs
 from neeco.ingest.posing.silhouette_shapes import Shapes
 
 SMOOTH_S = 0.72  # over which a hand's motion stays alike
-ROLL_SWING = 0.5  # rad, standard deviation of the roll's changes over longer times
+ROLL_SWING = 0.7  # rad, standard deviation of the roll's changes over longer times
 JOINT_SWING = 0.2  # the same of a joint, beyond what silhouettes tell
 ANYWHERE = 1.4  # rad, standard deviation of the mean of either
 HAND_DEG = 3.5  # standard deviation of a hand-posed angle
@@ -24,6 +24,11 @@ TEXTURE_DEG = 4.0  # of the roll that a texture shows in one frame: an axis .2 m
 EXACT_DEG, VAGUE_DEG = 3.0, 8.0  # of a pair of correlation 1, and what is added towards 0
 TRUSTED_SCORE, SCORE_WIDTH = 0.5, 0.08  # correlation at which a hypothesis is as likely right as wrong, and its scale
 PAIR_WEIGHT = 0.01  # what shading is left shifts all pairs of the same two moments, some hundred, by the same angle
+SHOWN, SHOWN_PRIOR, ENOUGH = (
+    (0.4, 1.2),
+    0.02,
+    3,
+)  # share of a turn that textures show; weight of 1; answers that tell it
 ROUNDS, VAGUE_AT_FIRST = 8, 4.0  # of expectation maximisation; by how much the first ones widen what pairs say
 AGREEING_DEG, WEAK = 6.0, 12  # a pair that fits; fewer of them across a gap between two frames leave it open
 READING_SWING, SHAPE_SWING = 0.7, 0.35  # rad, what the silhouette's width and its whole shape tell of a joint
@@ -80,16 +85,18 @@ def _chained(pairs: RollPairs, view: np.ndarray, times: np.ndarray, frames: np.n
     np.add.at(pull, frames, (angles - center) * np.radians(HAND_DEG) ** -2)
     rolls = np.linalg.solve(precision, pull)
     own = np.eye(len(times)) * np.radians(TEXTURE_DEG) ** -2
-    shown, known = rolls, precision
+    shown, known, share = rolls, precision, 1.0
     for sharpness in np.linspace(0.0, 1.6, ROUNDS).clip(max=1.0):
         widened = VAGUE_AT_FIRST + (1 - VAGUE_AT_FIRST) * sharpness
-        weights, turns = _likely(pairs, shown, view, widened)
+        weights, turns = _likely(pairs, shown, view, share, widened)
         between, toward = _differences(pairs, weights, turns, len(times))
         # what textures show is the roll and an error of each frame's own, which is solved for, too
         inner = np.linalg.solve(between + own, np.column_stack([own, toward]))
         known = precision + own - own @ inner[:, :-1]
         rolls = np.linalg.solve(known, pull + own @ inner[:, -1])
         shown = inner[:, :-1] @ rolls + inner[:, -1]
+        if len(frames) >= ENOUGH:
+            share = _share_shown(pairs, rolls + view, weights, turns, view, share)
     return Solved(rolls + center + view, np.linalg.inv(known))
 
 
@@ -161,9 +168,23 @@ def _within(values: np.ndarray, limits: tuple[float, float] | None) -> np.ndarra
     return values if limits is None else values.clip(*limits)
 
 
-def _likely(pairs: RollPairs, rolls: np.ndarray, view: np.ndarray, widened: float) -> tuple[np.ndarray, np.ndarray]:
+def _share_shown(
+    pairs: RollPairs, rolls: np.ndarray, weights: np.ndarray, turns: np.ndarray, view: np.ndarray, share: float
+) -> float:
+    """How much of a turn textures show: shading that stays with the view holds them back, in all pairs alike. weights
+    and turns [P] of the pairs by the `share` so far."""
+    turned = rolls[pairs.second] - rolls[pairs.first]
+    measured = (turns + view[pairs.second] - view[pairs.first]) * share
+    together = (weights * turned**2).sum()
+    prior = SHOWN_PRIOR * together + 1e-12
+    return float(np.clip(((weights * measured * turned).sum() + prior) / (together + prior), *SHOWN))
+
+
+def _likely(
+    pairs: RollPairs, rolls: np.ndarray, view: np.ndarray, share: float, widened: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Weight [P] of each pair, 1/rad^2, and the turn [P] that it then stands for, given rolls less the view's part."""
-    measured = pairs.turns - (view[pairs.second] - view[pairs.first])[:, None]
+    measured = pairs.turns / share - (view[pairs.second] - view[pairs.first])[:, None]
     apart = (rolls[pairs.second] - rolls[pairs.first])[:, None] - measured
     turns = measured + 2 * np.pi * np.round(apart / (2 * np.pi))
     apart = _wrapped(apart)

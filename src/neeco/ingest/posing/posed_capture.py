@@ -25,6 +25,7 @@ FRAME_S = 0.04  # from frame to frame, where the recording does not say
 NEAR_BREAK = 3  # frames
 EXTREME = 0.05  # share of the frames in which jaws are called widest or narrowest
 DOUBTED_DEG, DOUBTED_SHARE = 12.0, 3.0  # an answer is doubted from so many degrees on, and so many deviations
+FEW = 3  # answers from which on they contradict each other
 
 
 @dataclass(frozen=True)
@@ -94,21 +95,23 @@ class Posing:
         return f"least sure: {names[least]} ± {min(math.degrees(deviations[least]), 180):.0f}°"
 
     def doubts(self) -> list[Doubt]:
-        """Answers that differ from an earlier one of the same frame, or from what all others say of their frame."""
+        """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
+        most from what all others say of its frame, as a wrong one makes others look wrong, too."""
         found = []
-        for position, (frame, answer) in enumerate(self.answers):
-            earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-            for what, solved in {"roll": self.rolls, **self.joints}.items():
+        for what, solved in {"roll": self.rolls, **self.joints}.items():
+            worst, least = None, DOUBTED_SHARE
+            for position, (frame, answer) in enumerate(self.answers):
                 said = _angle(answer, what)
+                earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
                 if earlier is not None and abs(apart := _turn(said - _angle(earlier, what))) > DOUBTED_DEG:
                     found.append(Doubt(frame, what, apart, "an earlier answer"))
-                if len(self.answers) < 3:
-                    continue
                 # leaving one answer out of a Gaussian posterior
-                left = 1 - float(solved.deviations[frame]) ** 2 / math.radians(HAND_DEG) ** 2
-                apart = _turn(said - math.degrees(solved.values[frame])) / max(left, 0.02)
-                if abs(apart) > DOUBTED_DEG and abs(apart) > DOUBTED_SHARE * HAND_DEG / math.sqrt(max(left, 0.02)):
-                    found.append(Doubt(frame, what, apart, "what its neighbours say"))
+                left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_DEG)) ** 2, 0.02)
+                apart = _turn(said - math.degrees(solved.values[frame])) / left
+                far = abs(apart) * math.sqrt(left) / HAND_DEG
+                if len(self.answers) >= FEW and abs(apart) > DOUBTED_DEG and far > least:
+                    worst, least = Doubt(frame, what, _turn(apart), "what its neighbours say"), far
+            found += [] if worst is None else [worst]
         return found
 
     def sureness(self) -> dict[str, tuple[float, float]]:
