@@ -1,13 +1,13 @@
 """How well roll and joints of an instrument found in a video are known once ten frames were posed by hand.
 
-    python benchmarks/hand_posed.py TRUE --output CAPTURE [--diameter MM] [--working-length MM] [--seed 1]
+    python benchmarks/hand_posed.py TRUE --output CAPTURE [--diameter MM] [--working-length MM] [--seeds 1]
     python benchmarks/hand_posed.py TRUE --output CAPTURE --shaft-from-truth
 
 TRUE is a rendered capture with truth/transforms.json. Its cameras, points and images alone become CAPTURE, in which the
 shaft is found as `neeco ingest --shaft-diameter` finds it. "Posed by hand" is the truth with a normal, seeded error of
 3 degrees on frames that the program asks for one after another; nothing else of the truth is read, except for the
-scores. Prints the errors of roll and joint without any answer and with each number of them, and writes hand_posed.yaml
-and the states that follow into CAPTURE, which can be trained.
+scores. Prints the errors of roll and joint without any answer and with each number of them (of further seeds with all),
+and writes hand_posed.yaml and the states that follow into CAPTURE, which can be trained.
 
 --shaft-from-truth is a control, of roll and joint alone: the true shaft, off by 1 degree of tilt, .2 mm across, 1 mm in
 depth and .6 mm along, smooth over some frames.
@@ -30,7 +30,7 @@ from neeco.capture.lens import Lens
 from neeco.capture.model import REFERENCE_PIXELS, FromVideo, Uncertainty, swap_camera_axes
 from neeco.files import read_json
 from neeco.ingest.from_video import find_shaft
-from neeco.ingest.posing.hand_posed import Answer, write_answers
+from neeco.ingest.posing.hand_posed import HandPose, write_answers
 from neeco.ingest.posing.posed_capture import PosedCapture, Posing, prepare
 from neeco.ingest.shaft_axis import Scene
 from neeco.ingest.still import reduced
@@ -77,7 +77,8 @@ def read_truth(root: Path) -> Truth:
     sensor_from_instrument[:3, :3] = np.stack([x, np.cross(z, x), z], -1)
     sensor_from_instrument[:3, 3] = np.array(hinge["shaft_origin"]) + hinge["wrist_starts_mm"] * z
     length = hinge["hinge_along_shaft_mm"] + max(hinge["jaw_lengths_mm"].values())
-    opening = joint - hinge["joint"]["jaw_angle"]["zero"]
+    reading = hinge["joint"][next(iter(hinge["joint"]))]
+    opening = reading["sign"] * (joint - reading["zero"])
     shaft = (2 * hinge["shaft_radius_mm"], length)
     return Truth(np.linalg.inv(camera) @ pose @ sensor_from_instrument, opening, shaft)
 
@@ -161,6 +162,7 @@ def main(words: list[str] | None = None) -> None:
     )
     parser.add_argument("--answers", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seeds", type=int, default=1, help="so many draws of the hand's errors; the first is written")
     parser.add_argument("--shaft-from-truth", action="store_true")
     arguments = parser.parse_args(words)
     true, truth = read_capture(arguments.true), read_truth(arguments.true)
@@ -177,28 +179,33 @@ def main(words: list[str] | None = None) -> None:
     print(f"{len(rows)} of {len(masks)} frames; measured in {process_time() - start:.0f} processor seconds")
     truth = replace(truth, camera_from_instrument=truth.camera_from_instrument[rows], joint=truth.joint[rows])
     posed = PosedCapture(root)
-    instrument = posed.instruments[name]
-    random = np.random.default_rng(arguments.seed)
-    answers: list[Answer] = []
     print(f"{root.name}, {name}: errors, degrees (rms, median, 95 %, and the median standard deviation that is stated)")
     print(f"{'answers':>9} | {'roll':^27} | {'joint':^27}")
-    while True:
-        posing = posed.solve(answers)[name]
-        label = str(len(answers)) if answers else "automatic"
-        print(row(label, posing, truth, free=not answers))
-        if len(answers) >= arguments.answers:
-            break
-        frame = posing.suggestions(1)[0].frame
-        roll = np.degrees(posing.shafts.rolls(truth.camera_from_instrument[:, :3, 0])[frame])
-        joint = next(iter(instrument.joints))
-        opening = np.degrees(truth.joint[frame]) + HAND_DEG * random.normal()
-        drawn = {joint: max(0.0, float(opening))}
-        answers.append(Answer(posed.frames[frame], name, float(roll + HAND_DEG * random.normal()), drawn))
+    print(row("automatic", posed.solve([])[name], truth, free=True))
+    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+        answers = answer_by_truth(posed, name, truth, arguments.answers, seed)
+        for count in range(1 if seed == arguments.seed else len(answers), len(answers) + 1):
+            print(row(str(count), posed.solve(answers[:count])[name], truth))
+        if seed == arguments.seed:
+            write_answers(root, answers)
+            posed.write_states(posed.solve(answers))
+            print(f"{'':>9} | asked for: {', '.join(answer.frame for answer in answers)}")
     breaks = posed.solve([])[name].breaks
     print(f"the chain of rolls breaks before frames {', '.join(posed.frames[frame] for frame in breaks) or 'none'}")
-    print(f"asked for: {', '.join(answer.frame for answer in answers)}")
-    write_answers(root, answers)
-    posed.write_states(posed.solve(answers))
+
+
+def answer_by_truth(posed: PosedCapture, name: str, truth: Truth, count: int, seed: int) -> list[HandPose]:
+    """Answers to what the program asks for, one after another, off by HAND_DEG."""
+    random = np.random.default_rng(seed)
+    joint = next(iter(posed.instruments[name].joints))
+    rolls = np.degrees(posed.shafts[name].rolls(truth.camera_from_instrument[:, :3, 0]))
+    answers: list[HandPose] = []
+    for _ in range(count):
+        frame = posed.solve(answers)[name].suggestions(1)[0].frame
+        opening = max(0.0, float(np.degrees(truth.joint[frame]) + HAND_DEG * random.normal()))
+        roll = float(rolls[frame] + HAND_DEG * random.normal())
+        answers.append(HandPose(posed.frames[frame], name, roll, {joint: opening}))
+    return answers
 
 
 if __name__ == "__main__":

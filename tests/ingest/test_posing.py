@@ -15,7 +15,7 @@ from posing_world import JOINT, NAME, PosingWorld, posing_world
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import Shafts, crop
-from neeco.ingest.posing.hand_posed import Answer, read_answers, write_answers
+from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.measurements import FILE, measure, read_measurements, write_measurements
 from neeco.ingest.posing.posed_capture import PosedCapture, prepare
 from neeco.ingest.posing.roll_pairs import roll_pairs, unrolled_textures
@@ -40,10 +40,10 @@ def shafts(world: PosingWorld) -> Shafts:
     return Shafts.of(world.capture, world.capture.instruments[0])
 
 
-def answers(world: PosingWorld, frames: list[int], error_deg: float = 0.0) -> list[Answer]:
+def answers(world: PosingWorld, frames: list[int], error_deg: float = 0.0) -> list[HandPose]:
     random = np.random.default_rng(5)
     return [
-        Answer(
+        HandPose(
             world.capture.frames[frame].name,
             NAME,
             math.degrees(world.rolls[frame]) + error_deg * random.normal(),
@@ -110,7 +110,7 @@ def test_texture_tells_how_far_it_rolled(world: PosingWorld) -> None:
 
 def test_a_few_hand_posed_frames_tell_all(world: PosingWorld) -> None:
     posed = PosedCapture(world.root)
-    given: list[Answer] = []
+    given: list[HandPose] = []
     for _ in range(5):
         asked = posed.solve(given)[NAME].suggestions(1)[0].frame
         given.append(*answers(world, [asked], HAND_DEG))
@@ -169,7 +169,7 @@ def test_without_answers_the_roll_is_said_to_be_unknown(world: PosingWorld) -> N
 
 
 def test_answers_are_read_back_line_by_line(world: PosingWorld, copied: Path) -> None:
-    given = [Answer("000003", NAME, -12.5, {JOINT: 31.0}, "2026-03-01 14:05", "Ada"), *answers(world, [5])]
+    given = [HandPose("000003", NAME, -12.5, {JOINT: 31.0}, "2026-03-01 14:05", "Ada"), *answers(world, [5])]
     write_answers(copied, given)
     back = read_answers(copied)
     assert back[0] == given[0]

@@ -14,7 +14,7 @@ import numpy as np
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import crop
-from neeco.ingest.posing.hand_posed import Answer, read_answers, write_answers
+from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing
 
 ALONG, ACROSS = (
@@ -91,7 +91,7 @@ class PosingSession:
             if not all(math.isfinite(value) and abs(value) <= 360 for value in (roll_deg, *joints_deg.values())):
                 raise NeecoError("roll and joints: expected degrees between -360 and 360")
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
-            answer = Answer(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
+            answer = HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
             self._keep([*read_answers(self.posed.root), answer])
             doubts = [doubt for doubt in self._posings[instrument].doubts() if doubt.frame == index]
             return self._overview(instrument) | {"said": [str(doubt) for doubt in doubts]}
@@ -108,7 +108,7 @@ class PosingSession:
             self._keep(answers)
             return self._overview(instrument) | {"frame": self.posed.frames.index(gone.frame)}
 
-    def _keep(self, answers: list[Answer]) -> None:
+    def _keep(self, answers: list[HandPose]) -> None:
         posings = self.posed.solve(answers)  # raises before anything is written
         write_answers(self.posed.root, answers)
         self.posed.write_states(posings)

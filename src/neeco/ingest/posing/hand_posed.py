@@ -30,7 +30,7 @@ REMEDY = "mend or remove that line"
 
 
 @dataclass(frozen=True)
-class Answer:
+class HandPose:
     """What somebody said of one instrument in one frame. frame: its image's name without the suffix."""
 
     frame: str
@@ -41,7 +41,7 @@ class Answer:
     who: str | None = None
 
 
-def read_answers(capture: Path) -> list[Answer]:
+def read_answers(capture: Path) -> list[HandPose]:
     """The answers beside a capture, in the file's order; none where there is no file. Raises NeecoError."""
     path = capture / FILE
     if not path.exists():
@@ -54,14 +54,14 @@ def read_answers(capture: Path) -> list[Answer]:
     return [_answer(entry, f"{path}: answer {index + 1}") for index, entry in enumerate(entries)]
 
 
-def write_answers(capture: Path, answers: Iterable[Answer]) -> None:
+def write_answers(capture: Path, answers: Iterable[HandPose]) -> None:
     """Write the file anew, whole or not at all. Raises NeecoError."""
     write_text(capture / FILE, HEADER + "".join(f"- {_line(answer)}\n" for answer in answers))
 
 
 def answers_for(
-    answers: Sequence[Answer], instrument: str, frames: Sequence[str], joints: Iterable[str], place: Path
-) -> list[tuple[int, Answer]]:
+    answers: Sequence[HandPose], instrument: str, frames: Sequence[str], joints: Iterable[str], place: Path
+) -> list[tuple[int, HandPose]]:
     """Those of one instrument, each with the index of its frame. Raises NeecoError for a frame that the capture at
     `place` has not, and for joints other than the instrument's."""
     index = {name: number for number, name in enumerate(frames)}
@@ -79,7 +79,7 @@ def answers_for(
     return found
 
 
-def _line(answer: Answer) -> str:
+def _line(answer: HandPose) -> str:
     value: dict[str, Any] = {
         "frame": answer.frame,
         "instrument": answer.instrument,
@@ -92,7 +92,7 @@ def _line(answer: Answer) -> str:
     ).strip()
 
 
-def _answer(entry: Any, place: str) -> Answer:
+def _answer(entry: Any, place: str) -> HandPose:
     if not isinstance(entry, dict):
         raise NeecoError(f"{place}: is no answer; expected {', '.join(KEYS)}; {REMEDY}")
     unknown = sorted(str(key) for key in set(entry) - {*KEYS, *OPTIONAL})
@@ -103,7 +103,7 @@ def _answer(entry: Any, place: str) -> Answer:
     joints = entry.get("joints_deg") or {}
     if not isinstance(joints, dict):
         raise NeecoError(f"{place}: joints_deg: is not name: degrees; {REMEDY}")
-    return Answer(
+    return HandPose(
         str(entry["frame"]),
         str(entry["instrument"]),
         _degrees(entry["roll_deg"], f"{place}: roll_deg"),

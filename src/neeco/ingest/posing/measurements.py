@@ -55,7 +55,7 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
     """Write them into the capture's folder, whole or not at all. Raises NeecoError."""
     tensors: dict[str, np.ndarray] = {}
     for number, found in enumerate(measured.values()):
-        kept = {
+        stored = {
             "first": found.pairs.first.astype(np.int32),
             "second": found.pairs.second.astype(np.int32),
             "turns": found.pairs.turns.astype(np.float32),
@@ -64,7 +64,7 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
             "shapes": found.shapes.shapes.astype(np.float32),
             "seen": found.seen,
         }
-        tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in kept.items()}
+        tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in stored.items()}
     notes = {"format": FORMAT, "frames": _frames(capture), "instruments": json.dumps(list(measured))}
     write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
 

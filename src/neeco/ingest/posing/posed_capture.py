@@ -17,7 +17,7 @@ from neeco.errors import NeecoError
 from neeco.files import own_folder, read_json, write_json
 from neeco.ingest.posing.along_shaft import Load, Shafts
 from neeco.ingest.posing.chain import HAND_DEG, Solved, chain_breaks, solve_joint, solve_rolls
-from neeco.ingest.posing.hand_posed import Answer, answers_for, read_answers
+from neeco.ingest.posing.hand_posed import HandPose, answers_for, read_answers
 from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 
 TEN = 10  # frames that are suggested in all
@@ -56,7 +56,7 @@ class Posing:
     instrument: Instrument
     shafts: Shafts
     measured: Measurements
-    answers: Sequence[tuple[int, Answer]]
+    answers: Sequence[tuple[int, HandPose]]
     rolls: Solved
     joints: dict[str, Solved]
 
@@ -155,7 +155,7 @@ class PosedCapture:
         self.times = times if self.capture.timed else np.arange(len(times)) * FRAME_S
         self.shafts = {name: Shafts.of(self.capture, item) for name, item in self.instruments.items()}
 
-    def solve(self, answers: Sequence[Answer] | None = None) -> dict[str, Posing]:
+    def solve(self, answers: Sequence[HandPose] | None = None) -> dict[str, Posing]:
         """By instrument, what follows from the answers; those in the file where none are given. Raises NeecoError."""
         answers = read_answers(self.root) if answers is None else answers
         for answer in answers:
@@ -216,14 +216,14 @@ class PosedCapture:
         }
 
 
-def _by_frame(answers: Sequence[tuple[int, Answer]], what: str) -> dict[int, list[float]]:
+def _by_frame(answers: Sequence[tuple[int, HandPose]], what: str) -> dict[int, list[float]]:
     found: dict[int, list[float]] = {}
     for frame, answer in answers:
         found.setdefault(frame, []).append(math.radians(_angle(answer, what)))
     return found
 
 
-def _angle(answer: Answer, what: str) -> float:
+def _angle(answer: HandPose, what: str) -> float:
     return answer.roll_deg if what == "roll" else answer.joints_deg[what]
 
 

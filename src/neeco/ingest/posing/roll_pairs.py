@@ -97,7 +97,7 @@ def _normalised(textures: np.ndarray) -> np.ndarray:
 
 def roll_pairs(textures: np.ndarray, seen: np.ndarray) -> RollPairs:
     """Pairs near in time, and for every frame those long after it that look most alike; only frames that are `seen`."""
-    kept = [
+    blocks = [
         RollPairs(*(np.zeros((0, *shape), kind) for shape, kind in ((((), int),) * 2 + (((HYPOTHESES,), float),) * 2)))
     ]
     for start in range(0, len(textures), BLOCK):
@@ -106,9 +106,9 @@ def roll_pairs(textures: np.ndarray, seen: np.ndarray) -> RollPairs:
         first, second = _chosen(scores.max(-1), seen[start:])
         turns, found = _peaks(scores[first, second])
         good = found[:, 0] >= LEAST_SCORE
-        kept.append(RollPairs(first[good] + start, second[good] + start, turns[good], found[good]))
+        blocks.append(RollPairs(first[good] + start, second[good] + start, turns[good], found[good]))
     return RollPairs(
-        *(np.concatenate([getattr(some, name) for some in kept]) for name in ("first", "second", "turns", "scores"))
+        *(np.concatenate([getattr(block, name) for block in blocks]) for name in ("first", "second", "turns", "scores"))
     )
 
 
