@@ -36,7 +36,6 @@ from neeco.ingest.shaft_axis import Scene
 from neeco.ingest.still import reduced
 
 HAND_DEG = 3.0
-LIMITS = (0.0, 1.6)  # rad, of the joint
 SMOOTH_FRAMES = 3.0  # of the shaft's errors in the control
 TILT_DEG, ACROSS_MM, DEPTH_MM, ALONG_MM = 1.0, 0.2, 1.0, 0.6
 SHAFTS = {"maryland": (6.0, 26.0), "scissors": (4.8, 20.5)}  # diameter and working length, mm, as those READMEs say
@@ -121,14 +120,14 @@ def shaft_from_truth(truth: Truth, seed: int) -> Shaft:
 
 def capture_of(true: Capture, shaft: Shaft, output: Path) -> Capture:
     """A capture of the frames in which the shaft is known, as `neeco ingest` writes one."""
-    name, joint = true.instruments[0].name, next(iter(true.instruments[0].joints), "jaw_angle")
+    name = true.instruments[0].name
     frames = []
     for index in np.flatnonzero(shaft.known):
         frame = true.frames[index]
         pose = frame.camera.world_from_camera.double() @ torch.from_numpy(shaft.camera_from_instrument[index])
-        state = InstrumentState(pose, {joint: 0.0}, None, shaft.uncertainties[index])
+        state = InstrumentState(pose, {}, None, shaft.uncertainties[index])
         frames.append(replace(frame, state=State({name: state}, frame.state.time)))
-    instrument = Instrument(name, {joint: LIMITS}, from_video=shaft.seen)
+    instrument = Instrument(name, from_video=shaft.seen)
     write_capture(replace(true, frames=tuple(frames), instruments=(instrument,)), output)
     return read_capture(output)
 

@@ -54,11 +54,11 @@ def posing_world(root: Path, count: int = 40) -> PosingWorld:
         masks.append(mask)
         pose = np.eye(4)  # of no meaning about the shaft
         pose[:3, :3], pose[:3, 3] = np.stack([across, np.cross(direction, across), direction], -1), origin
-        unsure = Uncertainty((0.2, 0.2, 1.0), (1.0, 1.0, 180.0), {JOINT: 60.0})
-        state = State({NAME: InstrumentState(pose, {JOINT: 0.0}, None, unsure)}, float(times[frame]))
+        unsure = Uncertainty((0.2, 0.2, 1.0), (1.0, 1.0, 180.0))
+        state = State({NAME: InstrumentState(pose, {}, None, unsure)}, float(times[frame]))
         camera = Camera(torch.eye(4), FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
         frames.append(Frame(Path(f"{frame:06d}.png"), camera, state, "train"))
-    instrument = Instrument(NAME, {JOINT: (0.0, 1.4)}, from_video=FromVideo(2 * RADIUS, LENGTH))
+    instrument = Instrument(NAME, from_video=FromVideo(2 * RADIUS, LENGTH))
     points = PointCloud(np.array([[0.0, 0.0, 140.0]], np.float32), np.array([[0.5, 0.5, 0.5]], np.float32))
     write_capture(Capture(root, tuple(frames), (instrument,), points), root, images=images)
     return PosingWorld(root, read_capture(root), rolls, jaws, np.stack(masks))

@@ -36,6 +36,7 @@ from neeco.ingest.from_video import FoundShaft
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.passing import passing_masks
+from neeco.ingest.posing.posed_capture import prepare
 from neeco.ingest.recording import MIN_FRAMES, STILL, Recording
 from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
@@ -73,6 +74,7 @@ def ingest(
         one = WorldIngest(recordings, folder, progress)
         capture, result = one.finish(output, one.place())
         write_capture(capture, folder / "capture")
+        one.measure_roll(folder / "capture")
         complete(result, folder / "capture")
         return result
 
@@ -109,6 +111,8 @@ class WorldIngest:
         self.moving: dict[int, np.ndarray] = {}  # video frame -> [h, w] what moves in it
         self.in_video = seen_in_video(self.data)
         self.shaft: FoundShaft | None = None
+        self.masks = np.zeros((0, 1, 1), dtype=bool)  # [M, h, w] of the rows in which it was looked for
+        self.shown = self.masks  # the same of the capture's frames
         self.scale = 1.0  # of cameras that nothing registers, beside a plausible one
         self.selected = self._choose()  # [K] video frames
         self.names = [f"{frame:06d}.png" for frame in self.selected]
@@ -270,6 +274,7 @@ class WorldIngest:
         assert self.in_video is not None
         assert self.pinhole is not None
         self.progress("finding the shaft", 0, 0)
+        self.masks = masks
         small = Lens.of(self.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
         self.shaft = find_in_video(
             self.data, self.in_video, self._loader(sfm.indices), masks, cameras, self._times(sfm),
@@ -477,6 +482,8 @@ class WorldIngest:
         capture = Capture(
             self.folder, capture_frames, instruments, cloud, registered, lens=lens, still=tissue is not None
         )
+        if len(capture_frames) == len(chosen):  # of a second camera no masks are known
+            self.shown = self.masks[chosen] if self.in_video is not None else self.masks
         position = {row: index for index, row in enumerate(chosen.tolist())}
         registered_rows = [position.get(int(row), -1) for row in registration.used] if registration else []
         result = IngestResult(
@@ -507,6 +514,14 @@ class WorldIngest:
             dict(zip(data.ranges, data.starts.tolist(), strict=False)),
         )
         return capture, result
+
+    def measure_roll(self, capture: Path) -> None:
+        """Measure in the written capture what its images say of the roll and the joints of an instrument that nothing
+        tracked, for `neeco view --annotate`; nothing where the roll was logged."""
+        if self.in_video is None or self.in_video.roll is not None or not len(self.shown):
+            return
+        self.progress("measuring roll and joints", 0, 0)
+        prepare(capture, {self.in_video.name: lambda frame: self.shown[frame]})
 
     def _named_image(self, frame: int) -> Path:
         """The image of a frame, under the name that it has in the capture."""

@@ -20,6 +20,7 @@ from neeco.ingest.posing.chain import HAND_DEG, Solved, chain_breaks, solve_join
 from neeco.ingest.posing.hand_posed import HandPose, answers_for, read_answers
 from neeco.ingest.posing.measurements import Measurements, measure, read_measurements, write_measurements
 
+JAW_LIMITS = (0.0, 2.1)  # rad, of jaws of which nothing is known
 TEN = 10  # frames that are suggested in all
 FRAME_S = 0.04  # from frame to frame, where the recording does not say
 NEAR_BREAK = 3  # frames
@@ -127,10 +128,19 @@ class Posing:
 
 
 def prepare(root: Path, load_mask: Mapping[str, Load]) -> None:
-    """Measure what the images of a new capture say of roll and joints, keep it there and write the states that follow
-    without any hand-posed frame. load_mask: as `measure` takes it. Raises NeecoError."""
+    """Measure what the images of a new capture say of roll and joints, keep it there, declare joints that nothing
+    logged, and write the states that follow without any hand-posed frame. load_mask: as `measure` takes it. Raises
+    NeecoError."""
     capture = read_capture(root)
-    write_measurements(capture, measure(capture, load_mask))
+    measured = measure(capture, load_mask)
+    path = root / "transforms.json"
+    document = read_json(path)
+    for item in [*document["instruments"], *(item for frame in document["frames"] for item in frame["instruments"])]:
+        if item["name"] in measured and (new := measured[item["name"]].joints):
+            in_frame = "pose" in item
+            item["joints"] = {joint: 0.0 if in_frame else {"limits": list(JAW_LIMITS)} for joint in new}
+    write_json(path, document)
+    write_measurements(capture, measured)
     posed = PosedCapture(root)
     posed.write_states(posed.solve())
 
@@ -164,9 +174,9 @@ class PosedCapture:
                 raise NeecoError(f"{self.root}: hand_posed.yaml: no instrument {answer.instrument!r}; known: {known}")
         found = {}
         for name, instrument in self.instruments.items():
-            joints = [joint for joint in instrument.joints if not instrument.slides(joint)]
-            own = answers_for(answers, name, self.frames, joints, self.root)
             measured, shafts = self.measured[name], self.shafts[name]
+            joints = [joint for joint in measured.joints if joint in instrument.joints]
+            own = answers_for(answers, name, self.frames, joints, self.root)
             rolls = solve_rolls(measured.pairs, shafts.carried(), self.times, _by_frame(own, "roll"))
             solved = {
                 joint: solve_joint(measured.shapes, rolls, self.times, _by_frame(own, joint), instrument.joints[joint])
@@ -181,10 +191,6 @@ class PosedCapture:
         path = self.root / "transforms.json"
         with own_folder(self.root, path):
             document = read_json(path)
-            for item in document.get("instruments", []):
-                if item["name"] in posings:  # known from now on
-                    for joint in posings[item["name"]].joints:
-                        item["joints"][joint].pop("recorded", None)
             for index, frame in enumerate(document["frames"]):
                 for item in frame["instruments"]:
                     if item["name"] in posings:
@@ -210,9 +216,8 @@ class PosedCapture:
         item["uncertainty"] = {
             "translation_mm": known.get("translation_mm", [0.0, 0.0, 0.0]),
             "rotation_deg": [*tilts, roll],
-            "joints_deg": {
-                name: min(math.degrees(solved.deviations[frame]), 180.0) for name, solved in posing.joints.items()
-            },
+            "joints_deg": known.get("joints_deg", {})
+            | {name: min(math.degrees(solved.deviations[frame]), 180.0) for name, solved in posing.joints.items()},
         }
 
 
