@@ -17,6 +17,8 @@ from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.ingest.from_video import find_shaft, with_roll
 from neeco.ingest.pipeline import ingest
+from neeco.ingest.posing.hand_posed import HandPose
+from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.recordingfile import read_recording, recording_from_flags
 from neeco.ingest.shaft_axis import axis_between, contour_normals, image_lines, unit
 from neeco.report.ingest_assessment import assess_ingest
@@ -191,6 +193,18 @@ def test_a_video_and_a_ruler_become_a_capture(recorded, tmp_path):
     first = replace(capture.frames[0], state=State({"grasper": unknown}))
     unsure = replace(capture, frames=(first, *capture.frames[1:]))
     assert any("roll is not known" in doubt for doubt in assess_ingest(result, unsure).doubts)
+
+
+def test_without_a_logged_roll_it_can_be_posed_by_hand(recorded, tmp_path):
+    _, write = recorded
+    result = ingest(read_recording(write()), tmp_path / "capture", lambda what, done, total: None)
+    assert not errors_only(check_capture(result.capture))
+    posed = PosedCapture(result.capture)
+    first = posed.solve()["grasper"].suggestions(1)[0].frame
+    answer = HandPose(posed.frames[first], "grasper", 40.0, dict.fromkeys(posed.measured["grasper"].joints, 20.0))
+    solved = posed.solve([answer])["grasper"]
+    assert np.degrees(solved.rolls.values[first]) == pytest.approx(40.0, abs=1)
+    assert 0 < np.degrees(solved.rolls.deviations).max() < 120
 
 
 @pytest.mark.parametrize(

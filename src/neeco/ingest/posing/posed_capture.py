@@ -102,13 +102,13 @@ class Posing:
         for what, solved in {"roll": self.rolls, **self.joints}.items():
             worst, least = None, DOUBTED_SHARE
             for position, (frame, answer) in enumerate(self.answers):
-                said = _angle(answer, what)
+                angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := _turn(said - _angle(earlier, what))) > DOUBTED_DEG:
+                if earlier is not None and abs(apart := _turn(angle - _angle(earlier, what))) > DOUBTED_DEG:
                     found.append(Doubt(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_DEG)) ** 2, 0.02)
-                apart = _turn(said - math.degrees(solved.values[frame])) / left
+                apart = _turn(angle - math.degrees(solved.values[frame])) / left
                 far = abs(apart) * math.sqrt(left) / HAND_DEG
                 if len(self.answers) >= FEW and abs(apart) > DOUBTED_DEG and far > least:
                     worst, least = Doubt(frame, what, _turn(apart), "what its neighbours say"), far
