@@ -9,11 +9,13 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
 from PIL import Image
 from posing_world import JOINT, NAME, PosingWorld, posing_world
+from viewer_world import grasper_scene, write_run
 
 from neeco.capture.reader import read_capture
 from neeco.cli import main
@@ -97,6 +99,32 @@ def test_a_frame_is_shown_along_the_shaft(server: PosingServer) -> None:
     assert rod[rod.shape[0] // 2 - 20 : rod.shape[0] // 2 + 20].std() > 5 * rod[:20].std()
     small = Image.open(io.BytesIO(ask(server, f"/picture?instrument={NAME}&index=5&small=1")[2]))
     assert small.width < pixels.shape[1] / 4
+
+
+def test_a_run_shows_its_scene_as_a_ghost_that_follows_the_sliders(made: PosingWorld, tmp_path: Path) -> None:
+    capture = Path(shutil.copytree(made.root, tmp_path / "capture"))
+    run = write_run(grasper_scene(NAME, JOINT), tmp_path / "run", capture)
+
+    def ghost(jaw: float) -> np.ndarray:
+        state = quote(json.dumps({"roll": 0.0, "joints": {JOINT: jaw}}))
+        status, headers, body = ask(started, f"/ghost?instrument={NAME}&index=5&state={state}")
+        assert (status, headers["Content-Type"]) == (200, "image/png")
+        return np.asarray(Image.open(io.BytesIO(body)))[..., 3] > 0
+
+    with PosingServer(run, port=18320) as started:
+        assert json.loads(ask(started, "/overview")[2])["ghost"]
+        closed, opened = ghost(0.0), ghost(60.0)
+        height, width = closed.shape
+        shaft = closed[:, : width // 5]
+        assert 0 < shaft.mean() < 0.5
+        assert shaft[height // 2 - 3 : height // 2 + 3].mean() > 0.9
+        beyond = slice(width // 2, None)
+        assert np.flatnonzero(opened[:, beyond].any(1)).size > 1.5 * np.flatnonzero(closed[:, beyond].any(1)).size
+        assert ask(started, f"/ghost?instrument={NAME}&index=5&state=1")[0] == 404
+        assert (
+            ask(started, f"/ghost?instrument={NAME}&index=5&state={quote(json.dumps({'roll': 1, 'joints': {}}))}")[0]
+            == 404
+        )
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,8 @@ class Arguments:
     and joints of an instrument found in a video by hand, in the frames that help most."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [OTHER]"), tyro.conf.Positional]
-    """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture."""
+    """Run folders that `neeco train` wrote or is writing: one, or two to compare. With --annotate: a capture, or a run
+    of one, whose scene then shows as a ghost."""
     port: int = 8080
     """Port to listen on; the next free one where it is taken."""
     host: str = "127.0.0.1"
@@ -81,7 +82,7 @@ def _annotate(arguments: Arguments) -> int:
     from neeco.viewer.posing_server import PosingServer
 
     if len(arguments.runs) != 1:
-        raise NeecoError(f"--annotate: {len(arguments.runs)} folders given; give one capture")
+        raise NeecoError(f"--annotate: {len(arguments.runs)} folders given; give one capture, or a run of one")
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")
     with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:

@@ -10,6 +10,7 @@ import logging
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from functools import cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -28,7 +29,8 @@ TOKEN_BYTES = 24
 MAX_BODY = 2**16  # bytes of a request's
 WAIT_S = 20.0  # for the rest of a request
 POLL_S = 0.5  # between two looks for Ctrl-C
-ANSWER = {"instrument": str, "frame": int, "roll": float, "joints": {str: float}}
+STATE = {"roll": float, "joints": {str: float}}  # degrees
+ANSWER = {"instrument": str, "frame": int, **STATE}
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +38,9 @@ log = logging.getLogger(__name__)
 class PosingServer:
     """A running server; `address` is what to open. Use as a context manager, or call `stop`."""
 
-    def __init__(self, capture: Path, host: str = HOST, port: int = PORT) -> None:
-        """port: or the next that is free. Raises NeecoError."""
-        self.session = PosingSession(capture)
+    def __init__(self, folder: Path, host: str = HOST, port: int = PORT) -> None:
+        """folder: a capture, or a run of one. port: or the next that is free. Raises NeecoError."""
+        self.session = PosingSession(folder)
         port = free_port(host, port)
         self.token = None if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)
         access = AccessControl(self.token, f"neeco_{port}")
@@ -97,12 +99,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif address.path == "/frame":
             self._answer(lambda: session.frame(instrument, _whole(given.get("index"))))
         elif address.path == "/picture":
-            try:
-                pixels = session.picture(instrument, _whole(given.get("index")), "small" in given)
-            except NeecoError as error:
-                self._send(str(error).encode(), "text/plain; charset=utf-8", HTTPStatus.NOT_FOUND)
-            else:
-                self._send(pixels, "image/jpeg")
+            self._show(lambda: session.picture(instrument, _whole(given.get("index")), "small" in given), "image/jpeg")
+        elif address.path == "/ghost":
+            self._show(lambda: self._ghost(instrument, given), "image/png")
         else:
             self._send(b"neeco view: no such page\n", "text/plain", HTTPStatus.NOT_FOUND)
 
@@ -116,10 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
         # a form on another site cannot send JSON without asking first
         if not self._allowed(self.headers.get("Content-Type") == "application/json"):
             return
-        try:
-            value = json.loads(body)
-        except (ValueError, RecursionError):
-            value = None
+        value = _json(body)
         path = urlsplit(self.path).path
         if path == "/save":
             self._answer(lambda: self._save(value))
@@ -127,6 +123,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(lambda: self._undo(value))
         else:
             self._send(b"neeco view: no such page\n", "text/plain", HTTPStatus.NOT_FOUND)
+
+    def _ghost(self, instrument: str, given: dict[str, str]) -> bytes:
+        state = require_like(_json(given.get("state", "")), STATE, "state", "send it anew")
+        return self.session.ghost(instrument, _whole(given.get("index")), state["roll"], state["joints"])
 
     def _save(self, value: Any) -> dict[str, Any]:
         given = require_like(value, ANSWER, "answer", "send it anew")
@@ -143,13 +143,22 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(f"neeco view: refused: {reason}\n".encode(), "text/plain", HTTPStatus.FORBIDDEN)
         return reason is None
 
-    def _answer(self, ask: Any) -> None:
+    def _answer(self, ask: Callable[[], dict[str, Any]]) -> None:
         """Send what `ask` gives as JSON, or what is wrong."""
         try:
             value, status = ask(), HTTPStatus.OK
         except NeecoError as error:
             value, status = {"error": str(error)}, HTTPStatus.BAD_REQUEST
         self._send(json.dumps(value, allow_nan=False).encode(), "application/json", status)
+
+    def _show(self, draw: Callable[[], bytes], kind: str) -> None:
+        """Send the picture that `draw` gives, or what is wrong."""
+        try:
+            pixels = draw()
+        except NeecoError as error:
+            self._send(f"{error}\n".encode(), "text/plain; charset=utf-8", HTTPStatus.NOT_FOUND)
+        else:
+            self._send(pixels, kind)
 
     def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(status)
@@ -164,6 +173,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         log.debug(format, *args)
+
+
+def _json(text: str | bytes) -> Any:
+    """What a JSON text says; None where it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
 
 
 def _whole(text: str | None) -> int:

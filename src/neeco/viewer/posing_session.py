@@ -5,23 +5,29 @@ from __future__ import annotations
 import datetime
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from neeco.capture.images import open_image
+from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing
+from neeco.labels.drawing import draw
+from neeco.training.run import load_run
 
 ALONG, ACROSS = (
     (-0.6, 1.4),
     0.65,
 )  # of the working length, that a picture shows: before and beyond the origin, beside it
-PICTURE_PX, THUMB_PX = 1000, 160  # wide
+PICTURE_PX, THUMB_PX, GHOST_PX = 1000, 160, 500  # wide
+RUN_FILE = "config.yaml"  # tells a run from a capture
 QUALITY = 90
 JOINT_RANGE_DEG = (0.0, 120.0)  # of a slider, where the capture states no limits
 
@@ -30,9 +36,13 @@ class PosingSession:
     """One capture that is posed by hand, by one or more browsers. Any thread may call it."""
 
     def __init__(self, root: Path) -> None:
-        """Raises NeecoError for a capture that cannot be posed, or whose answers cannot be read."""
-        self.posed = PosedCapture(root)
-        self._lock = threading.Lock()
+        """root: a capture, or a run of one, whose scene then appears as a ghost. Raises NeecoError for a capture that
+        cannot be posed, or whose answers cannot be read."""
+        run = load_run(root) if (root / RUN_FILE).exists() else None
+        self.scene = None if run is None else run.scene
+        self.posed = PosedCapture(root if run is None else run.capture().root)
+        root = self.posed.root
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._answers = read_answers(root)
         self._posings = self.posed.solve(self._answers)
 
@@ -65,31 +75,51 @@ class PosingSession:
                 "origin_along": float(posing.shafts.directions[index] @ origin),
             }
 
+    def ghost(self, instrument: str, index: int, roll_deg: float, joints_deg: dict[str, float]) -> bytes:
+        """The run's instruments at such a state, as `picture` shows the frame, as PNG that is clear elsewhere. Raises
+        NeecoError."""
+        posing = self._posing(instrument, index)
+        if self.scene is None or not _possible(posing, roll_deg, joints_deg):
+            raise NeecoError("ghost: no scene is shown, or the state is none")
+        frame = self.posed.capture.frames[index]
+        given = frame.state.instruments[instrument]
+        pose = given.pose.clone()
+        pose[:3, :3] = torch.from_numpy(posing.shafts.rotation(index, math.radians(roll_deg)))
+        joints = {**given.joints, **{name: math.radians(value) for name, value in joints_deg.items()}}
+        state = replace(given, pose=pose, joints=joints)
+        with self._drawing, self.scene.torch_threads():
+            drawn = draw(
+                self.scene, State({**frame.state.instruments, instrument: state}, frame.state.time), frame.camera
+            )
+        if drawn.parts is None:
+            raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
+        color = (drawn.image.numpy() * 255).round().astype(np.uint8)
+        shown = np.dstack([color, (drawn.parts.numpy() > 0).astype(np.uint8) * 255])
+        return _encoded(self._along(posing, index, shown, GHOST_PX), ".png")
+
     def picture(self, instrument: str, index: int, small: bool) -> bytes:
         """A frame along the shaft, which points to the right, as JPEG. Raises NeecoError."""
         posing = self._posing(instrument, index)
+        image = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
+        return _encoded(self._along(posing, index, image, THUMB_PX if small else PICTURE_PX), ".jpg")
+
+    def _along(self, posing: Posing, index: int, image: np.ndarray, width: int) -> np.ndarray:
+        """An image [H, W, C] of a frame along the shaft, `width` px wide."""
         left, right, top, bottom = self._window(posing)
-        width = THUMB_PX if small else PICTURE_PX
         height = round(width * (bottom - top) / (right - left))
         scale = (right - left) / width
         along = left + (np.arange(width) + 0.5) * scale
         across = top + (np.arange(height) + 0.5) * scale
-        image = np.asarray(open_image(self.posed.capture.frames[index].image_path).convert("RGB"))
-        pixels = crop(posing.shafts, index, image, along, across).transpose(1, 0, 2)
-        done, encoded = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        if not done:
-            raise NeecoError(f"{self.posed.frames[index]}: the picture could not be encoded")
-        return encoded.tobytes()
+        return crop(posing.shafts, index, image, along, across).transpose(1, 0, 2)
 
     def save(self, instrument: str, index: int, roll_deg: float, joints_deg: dict[str, float]) -> dict[str, Any]:
         """Add an answer, solve again and write both; the overview, and under `said` what contradicts the answer. Raises
         NeecoError."""
         with self._lock:
             posing = self._posing(instrument, index)
-            if set(joints_deg) != set(posing.joints):
-                raise NeecoError(f"joints: expected {', '.join(posing.joints) or 'none'}")
-            if not all(math.isfinite(value) and abs(value) <= 360 for value in (roll_deg, *joints_deg.values())):
-                raise NeecoError("roll and joints: expected degrees between -360 and 360")
+            if not _possible(posing, roll_deg, joints_deg):
+                names = ", ".join(["roll", *posing.joints])
+                raise NeecoError(f"answer: expected {names} in degrees between -360 and 360")
             now = datetime.datetime.now().strftime("%Y-%m-%d %H:%M")
             answer = HandPose(self.posed.frames[index], instrument, roll_deg, joints_deg, now)
             self._keep([*read_answers(self.posed.root), answer])
@@ -133,6 +163,7 @@ class PosingSession:
         for doubt in posing.doubts():
             doubts.setdefault(doubt.frame, []).append(str(doubt))
         return {
+            "ghost": self.scene is not None,
             "capture": self.posed.root.resolve().name,
             "instrument": instrument,
             "instruments": self.instruments,
@@ -166,6 +197,21 @@ class PosingSession:
                 for name in posing.joints
             },
         }
+
+
+def _possible(posing: Posing, roll_deg: float, joints_deg: dict[str, float]) -> bool:
+    values = (roll_deg, *joints_deg.values())
+    return set(joints_deg) == set(posing.joints) and all(abs(value) <= 360 for value in values)
+
+
+def _encoded(pixels: np.ndarray, kind: str) -> bytes:
+    """Of RGB or RGBA [H, W, C], as a file of that kind."""
+    order = cv2.COLOR_RGB2BGR if pixels.shape[-1] == 3 else cv2.COLOR_RGBA2BGRA
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if kind == ".jpg" else []
+    done, encoded = cv2.imencode(kind, cv2.cvtColor(pixels, order), options)
+    if not done:
+        raise NeecoError(f"a picture of {pixels.shape} could not be encoded")
+    return encoded.tobytes()
 
 
 def _known(value: float, deviation: float, wrap: bool = False) -> dict[str, float]:

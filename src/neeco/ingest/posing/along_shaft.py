@@ -75,6 +75,15 @@ class Shafts:
         towards, across = self.view_axes
         return np.cos(rolls)[:, None] * towards + np.sin(rolls)[:, None] * across
 
+    def rotation(self, frame: int, roll: float) -> np.ndarray:
+        """world_from_instrument [3, 3] of one frame at a roll, rad."""
+        towards, across = (axis[frame] for axis in self.view_axes)
+        z = self.directions[frame] / np.linalg.norm(self.directions[frame])
+        x = np.cos(roll) * towards + np.sin(roll) * across
+        x = x - (x @ z) * z
+        x /= np.linalg.norm(x)
+        return np.asarray(self.world_from_camera[frame] @ np.stack([x, np.cross(z, x), z], -1))
+
     def carried(self) -> np.ndarray:
         """[F - 1] rad by which the roll changes from each frame to the next when the instrument turns about its shaft
         as little as it can (parallel transport in the world): what of a roll's change is the view's alone."""

@@ -198,14 +198,8 @@ class PosedCapture:
             write_json(path, document)
 
     def _write_state(self, item: dict[str, Any], posing: Posing, frame: int) -> None:
-        shafts = posing.shafts
-        rotation = shafts.world_from_camera[frame]
-        z = rotation @ shafts.directions[frame]
-        x = rotation @ shafts.x_axes(posing.rolls.values)[frame]
-        x -= (x @ z) * z
-        x /= np.linalg.norm(x)
         pose = np.array(item["pose"], float)
-        pose[:3, :3] = np.stack([x, np.cross(z, x), z], -1)
+        pose[:3, :3] = posing.shafts.rotation(frame, float(posing.rolls.values[frame]))
         item["pose"] = pose.tolist()
         item["joints"] = item.get("joints", {}) | {
             name: float(solved.values[frame]) for name, solved in posing.joints.items()

@@ -5,7 +5,7 @@ const STEP = 2, LEAP = 10;  // degrees of a key
 const HINGE = 0.36, SHARE = 50;  // of the working length; percent: where lines begin
 const PIN = "#35b6ff", JAW = "#ff9a1f";
 
-let overview, frame, pose, shown, picture = null, hidden = false, busy = false, skipped = new Set(), timer = null;
+let overview, frame, pose, shown, picture = null, hidden = false, ghost = null, ghosted = false, busy = false, skipped = new Set(), timer = null;
 const lines = { hinge: null, share: SHARE };
 
 async function ask(path, body) {
@@ -49,6 +49,26 @@ async function go(index, reason) {
   sliders();
   strip();
   draw();
+  haunt();
+}
+
+// the trained scene at the sliders' state; one drawing at a time, the last one wished for
+let haunting = false, wished = false;
+async function haunt() {
+  wished = true;
+  if (!ghosted || haunting) return;
+  haunting = true;
+  while (wished) {
+    wished = false;
+    const state = encodeURIComponent(JSON.stringify(pose)), loaded = new Image();
+    await new Promise(done => {
+      loaded.onload = loaded.onerror = done;
+      loaded.src = "ghost" + query(frame.index, `&state=${state}`);
+    });
+    ghost = loaded.naturalWidth ? loaded : null;
+    draw();
+  }
+  haunting = false;
 }
 
 function next() {
@@ -96,7 +116,13 @@ function draw() {
   const context = canvas.getContext("2d");
   context.imageSmoothingQuality = "high";
   context.drawImage(picture, 0, 0, canvas.width, canvas.height);
-  if (hidden || shown !== frame.index) return;
+  if (shown !== frame.index) return;
+  if (ghosted && ghost) {
+    context.globalAlpha = 0.6;
+    context.drawImage(ghost, 0, 0, canvas.width, canvas.height);
+    context.globalAlpha = 1;
+  }
+  if (hidden) return;
   context.lineCap = "round";
   const hinge = lines.hinge, radius = overview.radius, reach = overview.length - hinge;
   // the pin, sticking out of the wrist; the wrist's face at its marked end, dashed where it is turned away
@@ -124,7 +150,7 @@ function slider(label, kind, low, high, value, change, sure) {
   row.append(label, said, input);
   Object.assign(input, { type: "range", min: low, max: high, step: 1, value, className: kind });
   const show = () => said.textContent = `${Math.round(input.value)}°` + (sure ? `  (expected ± ${Math.round(sure)}°)` : "");
-  input.oninput = () => { change(Number(input.value)); show(); draw(); };
+  input.oninput = () => { change(Number(input.value)); show(); draw(); haunt(); };
   show();
   return row;
 }
@@ -149,6 +175,7 @@ function turn(what, degrees) {
   }
   sliders();
   draw();
+  haunt();
 }
 
 function strip() {
@@ -272,6 +299,14 @@ function hide() {
   draw();
 }
 
+function toggleGhost() {
+  ghosted = overview.ghost && !ghosted;
+  ghost = null;
+  $("ghost").setAttribute("aria-pressed", ghosted);
+  draw();
+  haunt();
+}
+
 function say(text, doubted) {
   $("said").textContent = text;
   $("said").className = doubted ? "doubted" : "";
@@ -291,6 +326,7 @@ async function start() {
   const kept = JSON.parse(localStorage.getItem(`neeco ${overview.capture} ${overview.instrument}`) || "{}");
   Object.assign($("hinge"), { max: overview.length, value: kept.hinge ?? HINGE * overview.length });
   $("share").value = kept.share ?? SHARE;
+  $("ghost").hidden = !overview.ghost;
   keep();
   report();
   await next();
@@ -300,6 +336,7 @@ $("save").onclick = save;
 $("skip").onclick = skip;
 $("undo").onclick = undo;
 $("hide").onclick = hide;
+$("ghost").onclick = toggleGhost;
 $("hinge").oninput = $("share").oninput = keep;
 $("canvas").addEventListener("wheel", event => { event.preventDefault(); turn("roll", event.deltaY > 0 ? STEP : -STEP); }, { passive: false });
 new ResizeObserver(() => frame && picture && draw()).observe($("stage"));
@@ -309,7 +346,7 @@ addEventListener("keydown", event => {
   const keys = {
     ArrowLeft: () => turn("roll", -step), ArrowRight: () => turn("roll", step),
     ArrowUp: () => turn("joint", step), ArrowDown: () => turn("joint", -step),
-    Enter: save, s: skip, u: undo, h: hide, p: () => play().catch(fail),
+    Enter: save, s: skip, u: undo, h: hide, g: toggleGhost, p: () => play().catch(fail),
   };
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   if (!keys[key] || (key === "Enter" && event.target.tagName === "SUMMARY")) return;
