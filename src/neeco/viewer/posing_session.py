@@ -57,7 +57,7 @@ class PosingSession:
             return self._overview(instrument)
 
     def frame(self, instrument: str, index: int) -> dict[str, Any]:
-        """What is known in one frame, and what its lines are drawn with. Raises NeecoError."""
+        """What is known in one frame, and what its lines are drawing with. Raises NeecoError."""
         with self._lock:
             posing = self._posing(instrument, index)
             origin = posing.shafts.origins[index]
@@ -88,13 +88,13 @@ class PosingSession:
         joints = {**given.joints, **{name: math.radians(value) for name, value in joints_deg.items()}}
         state = replace(given, pose=pose, joints=joints)
         with self._drawing, self.scene.torch_threads():
-            drawn = draw(
+            drawing = draw(
                 self.scene, State({**frame.state.instruments, instrument: state}, frame.state.time), frame.camera
             )
-        if drawn.parts is None:
+        if drawing.parts is None:
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
-        color = (drawn.image.numpy() * 255).round().astype(np.uint8)
-        shown = np.dstack([color, (drawn.parts.numpy() > 0).astype(np.uint8) * 255])
+        color = (drawing.image.numpy() * 255).round().astype(np.uint8)
+        shown = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
         return _encoded(self._along(posing, index, shown, GHOST_PX), ".png")
 
     def picture(self, instrument: str, index: int, small: bool) -> bytes:
