@@ -63,7 +63,7 @@ def find_in_video(
     if item.roll is None:
         data.note(
             f"instrument {item.name!r}: its roll is not known (180 degrees in every state's uncertainty); log it, or "
-            "pose frames by hand"
+            "pose frames by hand (`neeco view CAPTURE --annotate`)"
         )
     return found
 

@@ -75,7 +75,8 @@ function next() {
   const open = overview.suggested.filter(item => !skipped.has(item.frame));
   if (!open.length) skipped.clear();
   const item = open[0] || overview.suggested[0];
-  return item ? go(item.frame, item.reason) : Promise.resolve();
+  if (!item) return Promise.reject(new Error("no other frame shows the instrument's wrist"));
+  return go(item.frame, item.reason);
 }
 
 // a point of the instrument, mm along the shaft, across and towards the camera -> the picture's pixels
