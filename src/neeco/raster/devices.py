@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.util
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import torch
 from torch import Tensor
@@ -158,3 +158,26 @@ def tf32_products(device: torch.device) -> Iterator[None]:
     finally:
         if device.type == "cuda":
             torch.set_float32_matmul_precision(before)
+
+
+@cache
+def processor_has(*features: str) -> bool:
+    """Whether the processor has one of these instruction sets, as PyTorch calls them; no where this PyTorch is too old
+    to tell."""
+    capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(bool(capabilities.get(feature)) for feature in features)
+
+
+@contextmanager
+def bfloat16_products(device: torch.device, wanted: bool) -> Iterator[None]:
+    """Until the end of the block, let a CPU multiply in bfloat16 where `wanted`: eight bits of every factor and result,
+    sums in float32. For networks alone. What the block returns may be bfloat16; parameters and their gradients stay
+    float32. A processor without such instructions would take 4 to 25 times as long as in float32: it stays with that,
+    with a warning.
+    """
+    wanted = wanted and device.type == "cpu"
+    if wanted and not processor_has("amx_bf16", "avx512_bf16", "bf16"):
+        warnings.warn("deformation.half: this processor has no bfloat16; it multiplies in float32", stacklevel=3)
+        wanted = False
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=wanted):
+        yield

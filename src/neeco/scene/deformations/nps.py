@@ -18,10 +18,11 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.raster.devices import tf32_products
+from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.raster.rotations import matrix_to_quat
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
+    HALF_BY_DEFAULT,
     UNPERTURBED,
     LabelledByMotion,
     Perturbation,
@@ -46,7 +47,8 @@ class NPSSettings:
     """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 
     `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
-    `half`: evaluate hidden layers in bfloat16 (pays only where the processor computes in it). `chunk`: Gaussians per
+    `half`: hidden layers multiply in bfloat16 on a CPU that has it; a run is started with it where AMX makes it pay.
+    `chunk`: Gaussians per
     evaluation without gradients. `warm_up`: share of the training over which the network is off; without it the first
     steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight for good. `rate`:
     learning rate at the start.
@@ -79,7 +81,7 @@ class NPS(LabelledByMotion):
 
     method = "neeco"
     Settings = NPSSettings
-    training_defaults: ClassVar[Mapping[str, Any]] = {}  # the paper's
+    training_defaults: ClassVar[Mapping[str, Any]] = HALF_BY_DEFAULT  # the rest is the paper's
     needs_instruments = True
     large_operations = True
 
@@ -197,14 +199,17 @@ class NPS(LabelledByMotion):
             return torch.cat([self.network(part, encoded_state) for part in means.split(self.settings.chunk)])
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         state = encoded_state[None]
-        half = torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.settings.half and means.device.type == "cpu")
-        with tf32_products(means.device), half:
-            features = torch.relu(self.mean_in(encoded) + self.state_in(state))
-            for index, layer in enumerate(self.hidden, start=1):
-                summed = layer(features)
-                if index == self.skip:
-                    summed = summed + self.mean_skip(encoded) + self.state_skip(state)
-                features = torch.relu(summed)
+        with tf32_products(means.device):
+            # one row, and what tells states apart: in float32, as low octaves alone have no place in eight bits
+            begin, again = self.state_in(state), self.state_skip(state) if self.skip > 0 else None
+            with bfloat16_products(means.device, self.settings.half):
+                summed = self.mean_in(encoded)
+                features = torch.relu(summed + begin.to(summed.dtype))
+                for index, layer in enumerate(self.hidden, start=1):
+                    summed = layer(features)
+                    if again is not None and index == self.skip:
+                        summed = summed + self.mean_skip(encoded) + again.to(summed.dtype)
+                    features = torch.relu(summed)
         return nn.functional.linear(features.float(), self.head.weight, self.head.bias)
 
     def learning_rates(self, progress: float) -> dict[str, float]:

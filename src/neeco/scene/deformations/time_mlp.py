@@ -26,9 +26,10 @@ import torch
 from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, State
-from neeco.raster.devices import tf32_products
+from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.deformations.base import (
+    HALF_BY_DEFAULT,
     UNPERTURBED,
     LabelledByMotion,
     Perturbation,
@@ -54,7 +55,8 @@ class TimeMLPSettings:
     """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
     `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;
     `time_noise` at the start, in frame intervals, falling to none at the share `time_noise_stop` of the training;
-    `rate` and `final_rate`: learning rates at its ends."""
+    `rate` and `final_rate`: learning rates at its ends; `half`: layers multiply in bfloat16 on a CPU that has it, and a
+    run is started with it where AMX makes it pay."""
 
     width: int = 256
     L_mean: int = 10
@@ -65,6 +67,7 @@ class TimeMLPSettings:
     time_noise_stop: float = 0.5
     rate: float = 8e-4
     final_rate: float = 1.6e-6
+    half: bool = False
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
@@ -82,7 +85,12 @@ class TimeMLP(LabelledByMotion):
 
     method = "deformable-3dgs"
     Settings = TimeMLPSettings
-    training_defaults: ClassVar[Mapping[str, Any]] = {**PLAIN_TRAINING, "ssim_weight": 0.2, "density_stop": 0.375}
+    training_defaults: ClassVar[Mapping[str, Any]] = {
+        **PLAIN_TRAINING,
+        **HALF_BY_DEFAULT,
+        "ssim_weight": 0.2,
+        "density_stop": 0.375,
+    }
     needs_times = True
     large_operations = True
 
@@ -152,14 +160,15 @@ class TimeMLP(LabelledByMotion):
             for index, layer in enumerate(self.layers):
                 assert isinstance(layer, nn.Linear)
                 if index == SKIP + 1:
-                    features = torch.cat([encoded, features], 1)
+                    features = torch.cat([encoded.to(features.dtype), features], 1)
                 weight: Tensor = layer.weight
                 bias: Tensor = layer.bias
                 if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
                     timeless = features.shape[1]
                     weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
-                features = torch.relu(nn.functional.linear(features, weight, bias))
-        return self.head(features)
+                with bfloat16_products(positions.device, self.settings.half):  # the time, one row, is not
+                    features = torch.relu(nn.functional.linear(features, weight, bias))
+        return self.head(features.float())
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         rate = log_linear(self.settings.rate, self.settings.final_rate, progress)
