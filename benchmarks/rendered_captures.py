@@ -14,6 +14,11 @@ of `ingest`). The same command gives the same pixels on the same machine, with a
                      as many pixels. Sides are multiples of 4. Other sizes than 320x256 always have fine detail
     --detail         fine detail at 320x256, too: the scene of larger sizes, each pixel the mean of what it covers
     --every N        keep one frame in so many
+    --frames N       slow the same motion until it has N training frames, a multiple of 27. Test frames lie midway
+                     between two neighbours. Also transforms-M.json with every third, ninth and 27th training frame,
+                     M in number, and the same test frames, midway there, too, and unseen ones, for
+                     `neeco train OUT --transforms transforms-M.json`
+    --exact          cameras, poses and readings have no errors (sparse points err as before)
     --workers N      processes that draw
     --positive       let the jaw's reading grow as it opens
     --breathing MM   the tissue moves by this amplitude about its mean, with a period of 4 s (truth/breathing.json);
@@ -82,6 +87,7 @@ from pathlib import Path
 import cv2
 import torch
 from rendered.frames import Settings
+from rendered.motion import THINNINGS
 from rendered.render import Lens
 from rendered.scenes import SCENES, SceneSpec
 from rendered.writing import without_sign, write_recording
@@ -110,6 +116,8 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
     parser.add_argument("scene", choices=sorted(SCENES))
     parser.add_argument("output", type=Path)
     parser.add_argument("--every", type=_count, default=1, metavar="N", help="keep one frame in so many")
+    parser.add_argument("--frames", type=_slowed, metavar="N", help="slow the motion until N training frames show it")
+    parser.add_argument("--exact", action="store_true", help="cameras, poses and readings without errors")
     parser.add_argument("--positive", action="store_true", help="let the jaw's reading grow as it opens")
     parser.add_argument("--size", type=_lens, default=Lens(), metavar="WxH", help="of the images (320x256)")
     parser.add_argument("--detail", action="store_true", help="fine detail at 320x256, too")
@@ -133,12 +141,18 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         parser.error(f"--video: the logs of a wrist are not written; {arguments.scene} is a capture only")
     if arguments.stereo and arguments.lens:
         parser.error("--stereo: both cameras are pinholes; leave out --lens")
+    if arguments.frames and (arguments.video or arguments.every > 1):
+        parser.error("--frames: a capture of every frame is written, no recording; leave out --every, --video and such")
+    if arguments.exact and spec.encoders is not None:
+        parser.error(f"--exact: the links that {arguments.scene} states would be off all the same; take another scene")
     still = arguments.still or arguments.stereo or arguments.base_error is not None
     if still and (arguments.bag or arguments.plus or arguments.lerobot):
         parser.error("--still: bags, PLUS and LeRobot files are of a scope that moves; leave out one of the two")
     settings = Settings(
         arguments.size,
         every=arguments.every,
+        frames=arguments.frames,
+        exact=arguments.exact,
         detail=arguments.detail or arguments.size != Lens(),
         breathing_mm=arguments.breathing,
         pulse_mm=arguments.pulse,
@@ -157,6 +171,8 @@ def parse(words: Sequence[str]) -> tuple[SceneSpec, Path, Settings]:
         spec = spec.with_still_camera()
     elif arguments.video:
         spec = spec.with_rolling_camera()
+    if arguments.exact:
+        spec = spec.without_errors()
     return without_sign(spec) if arguments.positive else spec, arguments.output, settings
 
 
@@ -189,6 +205,13 @@ def _base_error(text: str) -> tuple[float, float]:
     if not (0 < mm <= 50 and 0 < degrees <= 30):
         raise argparse.ArgumentTypeError(f"{text} is no error of a base; give MMxDEG, such as 8x5 (up to 50x30)")
     return mm, degrees
+
+
+def _slowed(text: str) -> int:
+    frames, most = _count(text), THINNINGS[-1]
+    if frames % most or frames < 2 * most:
+        raise argparse.ArgumentTypeError(f"{text} is no multiple of {most} that is larger; give such as 2025")
+    return frames
 
 
 def _count(text: str) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -29,6 +29,9 @@ class ErrorModel:
     jaw_drift_rad: float = math.radians(0.7)
     jaw_white_rad: float = math.radians(0.7)
     clock_s: float = 0.002  # the states are read this much late
+
+
+EXACT = ErrorModel(1.0, *[0.0] * (len(fields(ErrorModel)) - 1))
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class Settings:
     lens: Lens = field(default_factory=Lens)
     resolution: int = 2400  # texels along the tissue's side
     every: int = 1  # keep one frame in so many (previews)
+    frames: int | None = None  # slow the motion until it has so many training frames
+    exact: bool = False  # transforms.json has no errors
     detail: bool = False  # texture finer than a pixel of the smallest size
     breathing_mm: float = 0.0  # amplitude about the mean, where the tissue moves most
     pulse_mm: float = 0.0
@@ -73,6 +75,8 @@ class Settings:
             (self.base_error, " --base-error {:g}x{:g}".format(*(self.base_error or (0, 0)))),
             (self.stereo, " --stereo"),
             (self.every > 1, f" --every {self.every}"),
+            (self.frames, f" --frames {self.frames}"),
+            (self.exact, " --exact"),
         ]
         return size + "".join(option for wanted, option in given if wanted)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 FRAME_RATE = 25.0
 TEST_EVERY, TEST_AT = 8, 4
+THINNINGS = (3, 9, 27)  # a slowed recording is also learned from every third training frame, every ninth, every 27th
 Array = np.ndarray
 
 
@@ -87,10 +88,11 @@ class Trajectory:
     _opening: PchipInterpolator
     _roll: PchipInterpolator
     _wrist: CubicSpline | None = None
+    slower: float = 1.0  # the planned motion takes so many times its time
 
     def at(self, time: float) -> Moment:
         """Everything at `time`; times a little outside the recording are as good as its ends."""
-        time = float(np.clip(time, self.times[0] - 0.1, self.times[-1] + 0.1))
+        time = float(np.clip(time, self.times[0] - 0.1, self.times[-1] + 0.1)) / self.slower
         center, target = self._camera(time)
         hinge = np.asarray(self._hinge(time))
         opening, roll = float(self._opening(time)), float(self._roll(time))
@@ -138,6 +140,23 @@ def plan(path: Path, hinge_mm: float, seen: int, unseen: int, seed: int) -> Traj
         _roll_curve(path, end, rest, generator),
         _wrist_curve(path, end, rest, np.random.default_rng((seed, 1))) if any(path.wrist_train) else None,
     )
+
+
+def slowed(trajectory: Trajectory, frames: int) -> Trajectory:
+    """The same motion, so slow that `frames`, a multiple of 27, training frames show what the planned ones do.
+
+    Test frames lie midway between two neighbouring training frames, and do so whichever of `THINNINGS` is learned from.
+    Unseen frames show the states they did. Recordings whose numbers of training frames are multiples share states.
+    """
+    seen = trajectory.splits.index("unseen")
+    slower = frames / FRAME_RATE / float(trajectory.times[seen - 1])
+    every = THINNINGS[-1]
+    train = np.arange(frames) / FRAME_RATE
+    test = np.arange(every / 2, frames - every, every) / FRAME_RATE
+    times = np.concatenate([train, test, trajectory.times[seen:] * slower])
+    splits = ["train"] * len(train) + ["test"] * len(test) + ["unseen"] * (len(trajectory.times) - seen)
+    order = np.argsort(times)
+    return replace(trajectory, times=times[order], splits=tuple(splits[i] for i in order), slower=slower)
 
 
 def is_unseen(path: Path, moment: Moment) -> bool:

@@ -22,6 +22,12 @@ def readme(spec: SceneSpec, settings: Settings, capture: Capture, quality: dict[
         if spec.encoders is None
         else "kinematics.json (links, sensor frame)"
     )
+    test = (
+        "before them number % 8 == 4 is `test`, the rest `train`"
+        if settings.frames is None
+        else "`test` frames lie midway between every 27th `train` frame and the next.\ntransforms-N.json: every third, "
+        "ninth or 27th training frame, with the same `test` and `unseen` frames"
+    )
     errors = "\n".join(f"- {name}: {value:.3f}" for name, value in quality.items())
     return f"""# {spec.organ}: rendered laparoscopic capture
 
@@ -37,7 +43,7 @@ frames with number % 4 == 0 and all unseen ones), transforms.json (exact), {link
 
 Splits: the last frames are `unseen` (opening > {math.degrees(path.opening_train):.0f} deg or |roll| > \
 {math.degrees(path.roll_train):.0f} deg, checked for every frame);
-before them number % 8 == 4 is `test`, the rest `train`.
+{test}.
 
 Errors of transforms.json against the truth (rms; the reconstruction's scale is {spec.errors.scale}):
 

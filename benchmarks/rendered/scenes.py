@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rendered.errors import ErrorModel
+from rendered.errors import EXACT, ErrorModel
 from rendered.instrument import Blade, Design, Material
 from rendered.motion import Array, Path, look, rigid
 from rendered.render import Lamps
@@ -78,6 +78,10 @@ class SceneSpec:
         return replace(
             self, path=still, errors=exact, world_turn=tuple(turn.tolist()), world_shift=tuple(shift.tolist())
         )
+
+    def without_errors(self) -> SceneSpec:
+        """The same scene, its cameras, poses and readings exact."""
+        return replace(self, errors=EXACT)
 
     @property
     def reading_names(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,7 +21,7 @@ from rendered.exposure import meter
 from rendered.frames import Renderer, Settings, Shot, image_name, moved, render_all, take_shots
 from rendered.hinge import describe_hinge
 from rendered.kinematics import describe_kinematics, stated_kinematics
-from rendered.motion import Array, Moment, Trajectory, plan
+from rendered.motion import THINNINGS, Array, Moment, Trajectory, plan, slowed
 from rendered.optics import Optics
 from rendered.points import PointSampler
 from rendered.readme import readme
@@ -39,6 +40,8 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
         raise NeecoError(f"{path}: already holds a capture; choose another folder")
     place = settings.place(spec)
     trajectory = plan(spec.path, spec.design.hinge, SEEN, UNSEEN, spec.seed)
+    if settings.frames is not None:
+        trajectory = slowed(trajectory, settings.frames)
     shots = take_shots(trajectory, spec, settings.every)
     exposure = meter(place, trajectory) if settings.exposure else None
     modes = settings.modes(spec)
@@ -70,7 +73,21 @@ def write_recording(spec: SceneSpec, path: Path, settings: Settings, report: Rep
     quality["smallest clearance mm"] = clearance(place, settings, spec, shots)
     write_text(path / "README.md", readme(spec, settings, capture, quality))
     write_capture(capture, path)
+    if settings.frames is not None:
+        write_thinned(path)
     report(f"{path}: {len(shots)} frames, {(_cpu_seconds() - started) / len(shots):.2f} s CPU each")
+
+
+def write_thinned(path: Path) -> None:
+    """Write transforms-N.json beside transforms.json: every third of its training frames, every ninth, every 27th, N in
+    number, with all of its other frames."""
+    document = json.loads((path / "transforms.json").read_text(encoding="utf-8"))
+    train = [frame["file_path"] for frame in document["frames"] if frame["split"] == "train"]
+    for every in THINNINGS:
+        kept = train[::every]
+        left_out = set(train) - set(kept)
+        frames = [frame for frame in document["frames"] if frame["file_path"] not in left_out]
+        write_json(path / f"transforms-{len(kept)}.json", document | {"frames": frames})
 
 
 def _cpu_seconds() -> float:
