@@ -14,10 +14,12 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.raster.devices import processor_has
 from neeco.scene import Scene
 from neeco.scene.deformations.base import encode, mark_moving, otsu
 from neeco.scene.deformations.nps import NPS, NPSSettings
 from neeco.scene.methods import make_deformation, method_settings
+from neeco.training.config import method_defaults
 
 
 def test_an_untrained_scene_is_its_canonical_one_in_every_state(neeco: Scene) -> None:
@@ -151,3 +153,71 @@ def test_an_unknown_method_is_refused() -> None:
 def test_a_state_that_lacks_something_is_refused(neeco: Scene, state: State) -> None:
     with pytest.raises(NeecoError, match="is missing"):
         neeco.at(state)
+
+
+def in_bfloat16(network: NPS, inputs: tuple[torch.Tensor, torch.Tensor], half: bool) -> list[torch.Tensor]:
+    """What the network makes of `inputs`, and the gradients of its parameters."""
+    network.settings = replace(network.settings, half=half)
+    network.zero_grad()
+    output = network.network(*inputs)
+    output.backward(torch.ones_like(output))
+    return [output.detach(), *(parameter.grad.clone() for parameter in network.parameters())]
+
+
+@pytest.fixture
+def any_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Computes in bfloat16 even where the processor has no instructions for it, slowly."""
+    monkeypatch.setattr("neeco.raster.devices.processor_has", lambda *features: True)
+
+
+@pytest.fixture
+def small() -> tuple[NPS, tuple[torch.Tensor, torch.Tensor]]:
+    """A network of eight layers, places [500, 3] and an encoded state of numbers that bfloat16 holds exactly."""
+    torch.manual_seed(2)
+    network = NPS((GRASPER,), NPSSettings(depth=8, width=32, L_mean=2, L_state=1))
+    torch.nn.init.normal_(network.head.weight)
+    return network, (torch.rand(500, 3) * 2 - 1, torch.randn(16).bfloat16().float())
+
+
+@pytest.mark.usefixtures("any_processor")
+def test_bfloat16_changes_outputs_and_gradients_by_its_rounding(small: tuple) -> None:
+    """Each layer rounds to eight bits, errors of which add in squares; a unit that is as close to zero as the error
+    changes sides, and its whole gradient with it."""
+    exact, rough = (in_bfloat16(*small, half=half) for half in (False, True))
+    of_layer, layers = 2**-8, small[0].settings.depth
+    of_output = of_layer * layers**0.5
+    errors = [float((b - a).norm() / a.norm()) for a, b in zip(exact, rough, strict=True)]
+    assert 0 < errors[0] < 2 * of_output
+    assert max(errors[1:]) < (layers * of_output) ** 0.5
+    assert all(value.dtype == torch.float32 for value in rough)
+
+
+@pytest.mark.usefixtures("any_processor")
+def test_bfloat16_gives_the_same_bits_again(small: tuple) -> None:
+    first, second = (in_bfloat16(*small, half=True) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.usefixtures("any_processor")
+def test_states_that_bfloat16_cannot_tell_apart_stay_apart(small: tuple) -> None:
+    network, (places, state) = small
+    beside = state * (1 + 2**-11)
+    assert torch.equal(beside.bfloat16().float(), state)
+    near, exact = (in_bfloat16(network, (places, beside), half)[0] for half in (True, False))
+    assert not torch.equal(near, in_bfloat16(network, (places, state), half=True)[0])
+    assert torch.allclose(near, exact, rtol=0, atol=0.1 * float(exact.abs().max()))
+
+
+def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(
+    small: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neeco.raster.devices.processor_has", lambda *features: False)
+    with pytest.warns(UserWarning, match="no bfloat16"):
+        half = in_bfloat16(*small, half=True)
+    assert all(torch.equal(a, b) for a, b in zip(half, in_bfloat16(*small, half=False), strict=True))
+
+
+@pytest.mark.parametrize("method", ["neeco", "deformable-3dgs"])
+def test_networks_start_in_bfloat16_where_the_processor_has_tiles(method: str) -> None:
+    assert method_defaults(method).deformation.half is processor_has("amx_bf16")
+    assert not method_settings(method, {}).half  # of a run that does not say: an older one

@@ -172,7 +172,7 @@ def processor_has(*features: str) -> bool:
 def bfloat16_products(device: torch.device, wanted: bool) -> Iterator[None]:
     """Until the end of the block, let a CPU multiply in bfloat16 where `wanted`: eight bits of every factor and result,
     sums in float32. For networks alone. What the block returns may be bfloat16; parameters and their gradients stay
-    float32. A processor without such instructions would take 4 to 25 times as long as in float32: it stays with that,
+    float32. A processor without such instructions would take 4 to 20 times as long as in float32: it stays with that,
     with a warning.
     """
     wanted = wanted and device.type == "cpu"

@@ -26,7 +26,7 @@ MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
 STILL_MM = 1e-6  # what moves less does not move
 # how a training of a network starts: in bfloat16 where tiles (AMX) make it three times as fast on a CPU. With AVX-512
-# BF16 alone it was half as slow again as float32 on an Intel Xeon
+# BF16 alone it took a third longer than float32 on an Intel Xeon
 HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": processor_has("amx_bf16")}
 MARKING_STRIDE = 4  # recorded states between those that moving Gaussians are found from
 
