@@ -12,17 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from html_page import HOSTILE, Page, check_hostile_names
 from PIL import Image
 
 from neeco.capture import read_capture
+from neeco.capture.images import write_image
+from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
 from neeco.ingest.motion import RoughShape
 from neeco.ingest.registration import ClockOffset, Registration
 from neeco.ingest.result import IngestResult
+from neeco.raster.types import Camera
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
 from neeco.report.ingest_assessment import assess_ingest
-from neeco.report.ingest_figures import in_view, main_axes, read_tracks, round_length
+from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length
 from neeco.report.ingest_page import write_ingest_page
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
@@ -142,6 +146,23 @@ def test_the_tracked_frame_is_drawn_where_the_instrument_is(tmp_path):
     assert changed.any()
     assert np.hypot(*(np.argwhere(changed) - [row, column]).T).max() < 0.3 * drawn.shape[1]
     assert (np.abs(drawn - without_shape).max(axis=2) > 120).sum() > 200  # outline and long axis
+
+
+def test_a_shaft_found_in_video_is_outlined_as_wide_as_it_is(tmp_path):
+    camera = Camera(torch.eye(4), 100.0, 100.0, 48.0, 32.0, 96, 64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # z to the image's right
+    pose[2, 3] = 50.0
+    write_image(tmp_path / "grey.png", torch.full((64, 96, 3), 0.3))
+    frame = Frame(tmp_path / "grey.png", camera, State({}, 0.0), "train")
+    uri = posed_picture(frame, {"rod": pose}, {}, {}, 0.001, {"rod": 10.0})
+    drawn = np.asarray(Image.open(io.BytesIO(b64decode(uri.split(",")[1]))).convert("RGB")).astype(int)
+    yellow = drawn[..., 0] - drawn[..., 2] > 40
+    scale = drawn.shape[1] / 96
+    rows = np.flatnonzero(yellow[:, round(20 * scale)])
+    assert rows.min() / scale == pytest.approx(22, abs=1)  # 5 mm of 50 mm to either side of the middle, by 100 px
+    assert rows.max() / scale == pytest.approx(42, abs=1)
+    assert not yellow[:, round(52 * scale) :].any()  # it ends in the middle
 
 
 def test_the_tip_is_the_end_that_is_in_view():

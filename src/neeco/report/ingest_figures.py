@@ -26,6 +26,7 @@ OUTLINE_COLOR = "#ffe14a"
 NEAR = 1.0  # mm: nearer points are not drawn
 AXIS_SHARE = 0.16  # of the image's width: how long the drawn frame axes are
 ORIGIN = np.zeros((1, 3))
+SHAFT_DIAMETERS = 30.0  # of a shaft found in video that are drawn
 
 WIDTH, HEIGHT, MARGIN = 420, 320, 16  # of a view of the tracks, view box units
 SVG_POINTS, CANVAS_POINTS = 1500, 4000
@@ -115,9 +116,11 @@ def posed_picture(
     shapes: Mapping[str, RoughShape],
     axes: Mapping[str, MainAxis],
     length: float,
+    shafts: Mapping[str, float],
 ) -> str:
     """A frame as a data URI, with what is known of instruments at poses, world_from_instrument [4, 4], drawn over it;
-    their axes are `length` mm long. Raises NeecoError when the image cannot be read."""
+    their axes are `length` mm long. `shafts`: diameters in mm, of those whose z goes along a shaft that ends at their
+    origin. Raises NeecoError when the image cannot be read."""
     # drawn at twice the size shown, then shrunk: smooth lines
     scale = 2 * MAX_WIDTH / frame.camera.width
     fx, fy, cx, cy = (scale * value for value in (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy))
@@ -128,6 +131,8 @@ def posed_picture(
         if name in shapes:
             _draw_outline(image, shapes[name], pose, camera)
         painter = ImageDraw.Draw(image)
+        if name in shafts:
+            _draw_shaft(painter, shafts[name], pose, camera)
         if name in axes:
             _draw_main_axis(painter, axes[name], pose, camera)
         _draw_frame(painter, pose, camera, length)
@@ -144,6 +149,22 @@ def _draw_outline(image: Image.Image, shape: RoughShape, pose: Tensor, camera: C
             painter.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
     edge = Image.fromarray(outline(np.asarray(mask) > 0).astype(np.uint8) * 255).filter(ImageFilter.MaxFilter(3))
     image.paste(OUTLINE_COLOR, (0, 0), edge)
+
+
+def _draw_shaft(painter: ImageDraw.ImageDraw, diameter: float, pose: Tensor, camera: Camera) -> None:
+    """The two contours of a shaft and where it ends."""
+    along = np.linspace(-SHAFT_DIAMETERS, 0, 61)[:, None] * diameter * np.array([0.0, 0.0, 1.0])  # [61, 3]
+    centre = np.linalg.inv(pose.numpy()) @ camera.world_from_camera.double().numpy()[:, 3]  # of the camera, [4] mm
+    aside = np.cross(centre[:3] - along, [0.0, 0.0, 1.0])
+    aside *= diameter / 2 / np.linalg.norm(aside, axis=1, keepdims=True)
+    pixels, depth = zip(*(_project(along + side * aside, pose, camera) for side in (-1, 1)), strict=True)
+    lines = [
+        [tuple(place) for place, z in zip(places, depths, strict=True) if z > NEAR]
+        for places, depths in zip(pixels, depth, strict=True)
+    ]
+    for line in (*lines, [line[-1] for line in lines if line]):
+        if len(line) > 1:
+            painter.line(line, fill=OUTLINE_COLOR, width=4)
 
 
 def _draw_main_axis(painter: ImageDraw.ImageDraw, axis: MainAxis, pose: Tensor, camera: Camera) -> None:

@@ -89,6 +89,8 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
     rows = {time: row for row, time in enumerate(np.round(result.selected_times, 6).tolist())}
     start = min(frame.state.time for frame in capture.frames)
     samples, shown_before = [], 0
+    seen = {item.name: item.from_video for item in capture.instruments}
+    shafts = {name: video.shaft_diameter_mm for name, video in seen.items() if video is not None}
     for frame in figures.sample_frames(capture):
         row = rows.get(round(frame.state.time, 6))
         poses = {name: state.pose for name, state in frame.state.instruments.items() if capture.registered}
@@ -96,8 +98,8 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
         shown_before += any(figures.shows(frame, pose) for pose in before.values())
         samples.append(
             (
-                figures.posed_picture(frame, poses, result.shapes, axes, length),
-                figures.posed_picture(frame, before, result.shapes, axes, length) if before else "",
+                figures.posed_picture(frame, poses, result.shapes, axes, length, shafts),
+                figures.posed_picture(frame, before, result.shapes, axes, length, {}) if before else "",
                 frame.name if row is None else result.frame_words(int(result.selected[row])),
                 f"{frame.state.time - start:.2f}",
                 frame.split,
@@ -109,6 +111,7 @@ def _frames(result: IngestResult, capture: Capture, axes: dict[str, figures.Main
         "shown_before": shown_before,
         "axis_mm": f"{length:g}",
         "axis_colors": list(zip("xyz", figures.AXIS_COLORS, strict=True)),
+        "shafts": bool(shafts),
         "shaped": any(name in result.shapes for name in axes),
         "shape_colors": (figures.OUTLINE_COLOR, figures.MAIN_AXIS_COLOR),
     }
