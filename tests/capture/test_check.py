@@ -218,6 +218,18 @@ def test_a_camera_far_from_the_points_is_an_error(folder):
     assert_found(folder, "frames[6].transform_matrix", "far from the points")
 
 
+def test_a_roll_that_nobody_knows_is_a_warning(folder):
+    def found_in_video(document, roll):
+        sure = {"translation_mm": [0.2, 0.2, 1.0], "rotation_deg": [1, 1, roll]}
+        for frame in document["frames"]:
+            frame["instruments"][0].update(uncertainty=sure)
+
+    for roll, doubted in ((180, True), (5, False)):
+        folder.edit(lambda document, roll=roll: found_in_video(document, roll))
+        told = [problem.message for problem in check_capture(folder.root) if "roll" in problem.message]
+        assert bool(told) == doubted
+
+
 def test_a_tracker_dropout_is_a_warning(folder):
     folder.edit(lambda d: [d["frames"][6]["instruments"][0]["pose"][row].__setitem__(3, 200.0) for row in range(3)])
     assert_found(folder, "frames[6].instruments[0].pose", "where it usually is", "warning")

@@ -32,6 +32,7 @@ from neeco.raster.types import Camera
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 STILL_CAMERAS = 2  # of a scope that stands still
+ROLL_UNKNOWN_DEG = 45.0  # standard deviation from which a roll is as good as not known
 FULL_TURN = 2 * math.pi
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
@@ -269,6 +270,7 @@ def _check_states(parsed: Parsed) -> None:
         if instrument.kinematics is not None:
             _check_kinematics(parsed, instrument, instrument.kinematics)
     _check_changes(parsed)
+    _check_rolls(parsed)
 
 
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
@@ -369,6 +371,16 @@ def _check_still(parsed: Parsed) -> None:
     if parsed.still and len(poses) > STILL_CAMERAS:
         message = f"is 'still', but the frames have {len(poses)} different cameras"
         parsed.header("camera_motion").error(message, "write 'moving', or correct transform_matrix")
+
+
+def _check_rolls(parsed: Parsed) -> None:
+    """An instrument found in video whose roll nobody logged or posed cannot be learned."""
+    for instrument in parsed.instruments:
+        sure = [state.uncertainty for _, state in parsed.states_of(instrument.name) if state.uncertainty is not None]
+        unknown = sum(uncertainty.rotation_deg[2] > ROLL_UNKNOWN_DEG for uncertainty in sure)
+        if 2 * unknown > len(sure):
+            message = f"the roll of {printable(instrument.name)} is not known in {unknown} of {len(sure)} frames"
+            parsed.header("frames").warning(message, "log it, or pose frames by hand: neeco view CAPTURE --annotate")
 
 
 def _check_changes(parsed: Parsed) -> None:
