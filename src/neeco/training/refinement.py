@@ -72,9 +72,10 @@ class Refinement:
         rates = torch.tensor([config.rotation_rate] * 3 + [config.translation_rate] * 3)
         usual = torch.tensor([config.prior_rotation] * 3 + [config.prior_translation] * 3)
         self.camera_sigma = usual.to(device)
-        self.prior_sigma = _pose_priors(first, names, usual).to(device)  # [P, I, 6]
+        priors = _pose_priors(first, names, usual)  # [P, I, 6]
+        self.prior_sigma = priors.to(device)
         self.rates = {
-            "poses": (rates * (self.prior_sigma.cpu() / usual).clamp(1, FASTER)).to(device),
+            "poses": (rates * (priors / usual).clamp(1, FASTER)).to(device),
             "joints": per_rad * torch.where(self.unrecorded, config.unrecorded_rate, config.joint_rate),
             "cameras": (rates * config.camera_rate).to(device),
             "latency": torch.tensor(config.latency_rate, device=device),
