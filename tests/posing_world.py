@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 from neeco.capture.model import Capture, Frame, FromVideo, Instrument, InstrumentState, PointCloud, State, Uncertainty
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import write_capture
+from neeco.ingest.posing.posed_capture import prepare
 from neeco.raster.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 200.0
@@ -62,6 +63,13 @@ def posing_world(root: Path, count: int = 40) -> PosingWorld:
     points = PointCloud(np.array([[0.0, 0.0, 140.0]], np.float32), np.array([[0.5, 0.5, 0.5]], np.float32))
     write_capture(Capture(root, tuple(frames), (instrument,), points), root, images=images)
     return PosingWorld(root, read_capture(root), rolls, jaws, np.stack(masks))
+
+
+def measured_world(root: Path) -> PosingWorld:
+    """The same with what its images tell of roll and jaws."""
+    world = posing_world(root)
+    prepare(world.root, {NAME: lambda frame: world.masks[frame]})
+    return world
 
 
 def _draw(origin: np.ndarray, axes: np.ndarray, jaw: float, texture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from posing_world import JOINT, NAME, PosingWorld, posing_world
+from posing_world import JOINT, NAME, PosingWorld, measured_world
 
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import Shafts, crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
 from neeco.ingest.posing.measurements import FILE, measure, read_measurements, write_measurements
-from neeco.ingest.posing.posed_capture import PosedCapture, prepare
+from neeco.ingest.posing.posed_capture import PosedCapture
 from neeco.ingest.posing.roll_pairs import roll_pairs, unrolled_textures
 
 HAND_DEG = 3.0
@@ -26,9 +26,7 @@ HAND_DEG = 3.0
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> PosingWorld:
     """Read only: tests that write take a copy."""
-    made = posing_world(tmp_path_factory.mktemp("posing") / "capture")
-    prepare(made.root, {NAME: lambda frame: made.masks[frame]})
-    return made
+    return measured_world(tmp_path_factory.mktemp("posing") / "capture")
 
 
 @pytest.fixture

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from posing_world import JOINT, NAME, PosingWorld, posing_world
+from posing_world import JOINT, NAME, PosingWorld, measured_world
 
 from neeco.ingest.posing.hand_posed import read_answers
-from neeco.ingest.posing.posed_capture import prepare
 from neeco.viewer.posing_server import PosingServer
 
 pytestmark = pytest.mark.browser
@@ -23,9 +22,7 @@ BLUE, ORANGE = (53, 182, 255), (255, 154, 31)  # lines of the pin and the jaws
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> PosingWorld:
-    world = posing_world(tmp_path_factory.mktemp("posing") / "capture")
-    prepare(world.root, {NAME: lambda frame: world.masks[frame]})
-    return world
+    return measured_world(tmp_path_factory.mktemp("posing") / "capture")
 
 
 @pytest.fixture

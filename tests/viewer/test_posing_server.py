@@ -14,13 +14,12 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from PIL import Image
-from posing_world import JOINT, NAME, PosingWorld, posing_world
+from posing_world import JOINT, NAME, PosingWorld, measured_world
 from viewer_world import grasper_scene, write_run
 
 from neeco.capture.reader import read_capture
 from neeco.cli import main
 from neeco.ingest.posing.hand_posed import read_answers
-from neeco.ingest.posing.posed_capture import prepare
 from neeco.viewer.posing_server import PosingServer
 
 JSON = {"Content-Type": "application/json"}
@@ -28,9 +27,7 @@ JSON = {"Content-Type": "application/json"}
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> PosingWorld:
-    world = posing_world(tmp_path_factory.mktemp("posing") / "capture")
-    prepare(world.root, {NAME: lambda frame: world.masks[frame]})
-    return world
+    return measured_world(tmp_path_factory.mktemp("posing") / "capture")
 
 
 @pytest.fixture
