@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from neeco.capture.images import open_image, write_image, write_labels
-from neeco.capture.lens import Border, Lens
+from neeco.capture.lens import Lens
 from neeco.capture.model import (
     REFERENCE_PIXELS,
     Capture,
@@ -26,18 +23,18 @@ from neeco.capture.model import (
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
+from neeco.ingest.chosen_images import ChosenImages
 from neeco.ingest.clocks import find_instrument_clocks, register, unknown_clocks
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.episodes import Episodes, separate
 from neeco.ingest.find_bases import refuse_frames, require_no_base, take_bases
-from neeco.ingest.frame_selection import LEFT_OUT, choose_frames, frame_features
+from neeco.ingest.frame_selection import LEFT_OUT
 from neeco.ingest.from_video import FoundShaft
-from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.motion import ResidualFlow, RoughShape, carve_shape, observations_on
 from neeco.ingest.passing import passing_masks
 from neeco.ingest.posing.posed_capture import prepare
-from neeco.ingest.recording import MIN_FRAMES, STILL, Recording
+from neeco.ingest.recording import STILL, Recording
 from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.ingest.sfm import SfmResult, StageProgress, StructureFromMotion
@@ -105,22 +102,18 @@ class WorldIngest:
         self.recording = self.data.recording
         self.settings = self.recording.settings
         self.size = self.data.video.size
-        self.lens = self._read_lens()
         self.bases: dict[str, BaseRegistration] = {}  # by instrument, of those found
-        self.dropped: dict[int, str] = {}  # video frame -> why
         self.moving: dict[int, np.ndarray] = {}  # video frame -> [h, w] what moves in it
         self.in_video = seen_in_video(self.data)
         self.shaft: FoundShaft | None = None
         self.masks = np.zeros((0, 1, 1), dtype=bool)  # [M, h, w] of the rows in which it was looked for
         self.shown = self.masks  # the same of the capture's frames
         self.scale = 1.0  # of cameras that nothing registers, beside a plausible one
-        self.selected = self._choose()  # [K] video frames
-        self.names = [f"{frame:06d}.png" for frame in self.selected]
-        self._write_images()
+        self.images = ChosenImages(self.data, folder, progress)
+        self.selected = self.images.selected  # [K] video frames
+        self.dropped = self.images.dropped  # video frame -> why
         (folder / "sfm").mkdir()
-        self.border = self._find_border()
-        self.visible = self._write_visible()
-        self.pinhole = self.lens.pinhole(self.size) if self.lens else None
+        self.pinhole = self.images.lens.pinhole(self.size) if self.images.lens else None
 
     def place(self) -> Placed:
         """Find cameras, registration and states."""
@@ -128,20 +121,19 @@ class WorldIngest:
             return self._place_still()
         refuse_frames(self.data, moving=True)
         self.motion = StructureFromMotion(
-            self.folder / "sfm", self.data.video.path, self.folder / "raw", self.names, self.size, self.pinhole,
-            self.visible, self.settings, self._episodes(),
+            self.folder / "sfm", self.data.video.path, self.folder / "raw", self.images.names, self.size, self.pinhole,
+            self.images.visible, self.settings, self._episodes(),
         )  # fmt: skip
         sfm = self.motion.reconstruct(self.progress)
         self.data.refuse_alone(self.selected[sfm.indices])
         if self.pinhole is None:
             assert sfm.lens is not None
-            self.lens, self.pinhole = sfm.lens, sfm.lens.pinhole(self.size)
+            self.pinhole = sfm.lens.pinhole(self.size)
             self.data.note(
-                f"intrinsics were estimated by structure from motion (focal length {self.lens.fl_x:.1f} px, radial "
-                f"distortion {self.lens.distortion[0]:.3f}); a calibration is better"
+                f"intrinsics were estimated by structure from motion (focal length {sfm.lens.fl_x:.1f} px, radial "
+                f"distortion {sfm.lens.distortion[0]:.3f}); a calibration is better"
             )
-            self._write_images()
-            self._write_visible()
+            self.images.know_lens(sfm.lens)
         registration = self._register(sfm)
         self._find_instrument_clocks(sfm, self.pinhole)
         self._place_bases_seen_from(sfm, self.pinhole, registration)
@@ -169,7 +161,7 @@ class WorldIngest:
         if self.recording.stereo is not None:
             return True
         self.progress("looking whether the scope moves", 0, 0)
-        still = all(stands_still(self._loader(rows), len(rows)) for rows in self._rows_by_episode())
+        still = all(stands_still(self.images.loader(rows), len(rows)) for rows in self._rows_by_episode())
         if still:
             self.data.note("the scope stands still: nothing but what passes before it moves in the images")
         return still
@@ -181,14 +173,6 @@ class WorldIngest:
     def _rows_by_episode(self) -> list[np.ndarray]:
         """Rows of the chosen frames, of every episode that has some."""
         return [np.flatnonzero(self._episodes() == episode) for episode in np.unique(self._episodes())]
-
-    def _loader(self, rows: np.ndarray) -> Callable[[int], np.ndarray]:
-        """`_load`, of some rows alone."""
-        return lambda place: self._load(int(rows[place]))
-
-    def _load(self, row: int) -> np.ndarray:
-        """uint8 [H, W, 3], one of the chosen frames."""
-        return np.asarray(open_image(self.folder / "raw" / self.names[row]).convert("RGB"))
 
     def _place_still(self) -> Placed:
         """The same for a scope that stands still: its frame is the world."""
@@ -205,21 +189,23 @@ class WorldIngest:
         refuse_frames(self.data, moving=False)
         self._refuse_other_places()
         right = self._right_camera()
-        cameras = still_cameras(len(self.names))
+        cameras = still_cameras(len(self.selected))
         self._find_instrument_clocks(cameras, pinhole)
         self._place_bases(cameras, pinhole)
-        visible = self._field_of_view()
+        visible = self.images.field_of_view()
         if self.in_video is not None:
             self.progress("finding what moves", 0, 0)
-            masks = moving_masks(self._load, len(self.names), cameras.indices, visible)
+            masks = moving_masks(self.images.load, len(self.selected), cameras.indices, visible)
             self._find_in_video(cameras, cameras.world_from_camera, masks, None)
         names = [*data.world_from_base, *([self.in_video.name] if self.in_video else [])]
         tracked = {name: data.instrument_poses(name, self._times(cameras)) for name in names}
-        found = look_behind(self._load, len(self.names), pinhole, visible, tracked, self.settings, right, self.progress)
+        found = look_behind(
+            self.images.load, len(self.selected), pinhole, visible, tracked, self.settings, right, self.progress
+        )
         for note in found.notes:
             data.note(note)
         placed = replace(cameras, points=found.points, colors=found.colors, errors=np.zeros(len(found.points)))
-        placed = replace(placed, lengths=np.full(len(found.points), len(self.names)))
+        placed = replace(placed, lengths=np.full(len(found.points), len(self.selected)))
         states, usable = data.states_at(self._times(placed))
         return Placed(placed, pinhole, None, found.shapes, states, usable, right, found.how)
 
@@ -230,7 +216,7 @@ class WorldIngest:
         self.progress("comparing what the recordings show", 0, 0)
         backgrounds, episodes = [], []
         for rows in self._rows_by_episode():
-            load = self._loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
+            load = self.images.loader(rows[evenly_spaced(len(rows), LOOKED_AT)])
             found = find_background(load, min(len(rows), LOOKED_AT))
             backgrounds.append(np.clip(found.colors, 0, 255).astype(np.uint8))
             episodes.append(int(self._episodes()[rows[0]]))
@@ -240,13 +226,13 @@ class WorldIngest:
         """Say of every instrument of a still scope how the frame of its log's poses stands to the camera, as far as
         that is known (`SynchronizedRecording.world_from_base`): it is the camera's, is stated, or is found from what
         moves."""
-        data, visible = self.data, self._field_of_view()
+        data, visible = self.data, self.images.field_of_view()
         for name, log in data.poses.items():
             if log.frame == CAMERA:
                 data.world_from_base[name] = np.eye(4)
         self._find_bases(
             cameras, cameras.world_from_camera, pinhole,
-            lambda rows: moving_masks(self._load, len(self.names), rows, visible),
+            lambda rows: moving_masks(self.images.load, len(self.selected), rows, visible),
         )  # fmt: skip
         unplaced = [name for name in data.poses if name not in data.world_from_base]
         if unplaced:
@@ -266,8 +252,8 @@ class WorldIngest:
 
     def _passing(self, sfm: SfmResult, pinhole: Lens) -> Callable[[np.ndarray], np.ndarray]:
         """What gives the masks of what passes before the tissue, bool [R, h, w], in some rows of `sfm`."""
-        flow, load = self._residual_flow(sfm, pinhole), self._loader(sfm.indices)
-        return lambda some: passing_masks(load, flow, some, self.settings.moving_px, self._field_of_view())
+        flow, load = self._residual_flow(sfm, pinhole), self.images.loader(sfm.indices)
+        return lambda some: passing_masks(load, flow, some, self.settings.moving_px, self.images.field_of_view())
 
     def _find_in_video(self, sfm: SfmResult, cameras: np.ndarray, masks: np.ndarray, tissue: float | None) -> None:
         """Find the instrument that nothing tracked before `cameras` [M, 4, 4], in the rows of `sfm`."""
@@ -277,7 +263,7 @@ class WorldIngest:
         self.masks = masks
         small = Lens.of(self.pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
         self.shaft = find_in_video(
-            self.data, self.in_video, self._loader(sfm.indices), masks, cameras, self._times(sfm),
+            self.data, self.in_video, self.images.loader(sfm.indices), masks, cameras, self._times(sfm),
             self._episodes()[sfm.indices], small, tissue,
         )  # fmt: skip
         self.scale = self.shaft.axes.scale
@@ -293,10 +279,10 @@ class WorldIngest:
         `place_bases`."""
         if any(item.base is not None for item in self.recording.instruments):
             self.progress("finding the robot's base", 0, 0)
-            visible = self._field_of_view()
+            visible = self.images.field_of_view()
             hidden = None if visible is None else reduced(visible.astype(np.uint8) * 255) < 255
             self.bases = take_bases(
-                self.data, self._times(sfm), cameras, pinhole, self._loader(sfm.indices), moving, hidden
+                self.data, self._times(sfm), cameras, pinhole, self.images.loader(sfm.indices), moving, hidden
             )
 
     def _right_camera(self) -> RightCamera | None:
@@ -314,80 +300,6 @@ class WorldIngest:
             cameras.append(replace(found, names={int(rows[row]): name for row, name in found.names.items()}))
         return replace(cameras[0], names={row: name for camera in cameras for row, name in camera.names.items()})
 
-    def _read_lens(self) -> Lens | None:
-        """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
-        lens, where = self.recording.read_lens()
-        if lens is not None:
-            lens.check_size(self.size, where)
-            try:
-                lens.pinhole(self.size)
-            except NeecoError as error:  # it knows nothing of where it came from
-                raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
-        return lens
-
-    def _choose(self) -> np.ndarray:
-        """Video frames to keep."""
-        data, count = self.data, len(self.data.times)
-
-        def images() -> Iterator[np.ndarray]:
-            for done, (_, image) in enumerate(data.video.read(range(count))):
-                self.progress("looking at the frames", done, count)
-                yield image
-
-        features = frame_features(images())
-        states, usable = data.coverage_states()
-        limit = self.recording.frames or self.settings.max_frames
-        selected, self.dropped = choose_frames(features, usable, states, limit, self.settings.min_sharpness)
-        if self.recording.frames is None and count > limit:
-            data.note(f"{limit} of {count} frames are kept; ask for more with --frames")
-        if len(selected) < MIN_FRAMES:
-            reasons = Counter(why.split(":")[0] for why in self.dropped.values())
-            why = reasons.most_common(1)[0][0] if reasons else "the video is short"
-            raise NeecoError(
-                f"{data.video.path}: only {len(selected)} of {count} frames are usable (at least {MIN_FRAMES} are "
-                f"needed); most are dropped because: {why}"
-            )
-        return selected
-
-    def _write_images(self) -> None:
-        """Frames as PNG: as recorded while the lens is unknown, else undistorted."""
-        folder = self.folder / "raw"
-        folder.mkdir(exist_ok=True)
-        frames = self.data.video.read(self.selected.tolist())
-        for done, (name, (_, image)) in enumerate(zip(self.names, frames, strict=True)):
-            self.progress("writing frames", done, len(self.names))
-            straight = self.lens.undistort(image) if self.lens else image
-            write_image(folder / name, torch.from_numpy(straight.astype(np.float32) / 255))
-
-    def _find_border(self) -> Border | None:
-        """The endoscope's dark border, in the frames as recorded."""
-        sample = self.selected[evenly_spaced(len(self.selected), BORDER_SAMPLES, floor=True)]
-        border = find_border(image for _, image in self.data.video.read(sample.tolist()))
-        if border is not None:
-            dark = 1 - visible_mask(border, self.size).mean()
-            self.data.note(f"the endoscope's dark border ({dark:.0%} of the image) is masked")
-        return border
-
-    def _field_of_view(self) -> np.ndarray | None:
-        """bool [H, W]: what lies within the border, undistorted as the images are; None without a border."""
-        if self.border is None:
-            return None
-        seen = visible_mask(self.border, self.size)
-        return seen if self.lens is None else self.lens.undistort_mask(seen)
-
-    def _write_visible(self) -> Path | None:
-        """Masks of the border, one file per frame as SfM wants them, undistorted as the images are; None without."""
-        seen = self._field_of_view()
-        if seen is None:
-            return None
-        folder = self.folder / "visible"
-        folder.mkdir(exist_ok=True)
-        first, *others = (folder / f"{name}.png" for name in self.names)
-        write_labels(first, torch.from_numpy(seen.astype(np.uint8) * 255))
-        for other in others:
-            shutil.copyfile(first, other)
-        return folder
-
     def _times(self, sfm: SfmResult) -> np.ndarray:
         """[M] s of the frames that got a camera."""
         return self.data.times[self.selected[sfm.indices]]
@@ -398,8 +310,8 @@ class WorldIngest:
         return register(self.data, sfm.world_from_camera, self._times(sfm), frames, self.settings)
 
     def _residual_flow(self, sfm: SfmResult, pinhole: Lens) -> ResidualFlow:
-        load, episodes = self._loader(sfm.indices), self._episodes()[sfm.indices]
-        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self._field_of_view(), episodes)
+        load, episodes = self.images.loader(sfm.indices), self._episodes()[sfm.indices]
+        return ResidualFlow(load, sfm, self._times(sfm), pinhole, self.images.field_of_view(), episodes)
 
     def _find_instrument_clocks(self, sfm: SfmResult, pinhole: Lens) -> None:
         """Clocks that neither `sync` nor the scope gave: from how the instruments move in the images."""
@@ -460,11 +372,11 @@ class WorldIngest:
             self.dropped[int(frame)] = "beside an unseen frame"
         capture_frames = tuple(
             Frame(
-                self._named_image(int(frames[i])),
+                self.images.named(int(frames[i])),
                 placed.pinhole.camera(cameras[i]),
                 _state(states, i, float(times[i]), None if sure is None else sure[i]),
                 splits[i],
-                self.visible / f"{frames[i]:06d}.png.png" if self.visible else None,
+                self.images.mask_of(int(frames[i])),
             )
             for i in chosen.tolist()
         )
@@ -477,8 +389,8 @@ class WorldIngest:
         cloud = PointCloud(points[reliable].astype(np.float32), (sfm.colors[reliable] / 255).astype(np.float32))
         instruments = instruments_of(self.recording, self.shaft)
         registered = registration is not None or set(data.poses) <= set(data.world_from_base)
-        assert self.lens is not None
-        lens = replace(self.lens, size=self.size, border=self.border)
+        assert self.images.lens is not None
+        lens = replace(self.images.lens, size=self.size, border=self.images.border)
         capture = Capture(
             self.folder, capture_frames, instruments, cloud, registered, lens=lens, still=tissue is not None
         )
@@ -522,11 +434,6 @@ class WorldIngest:
             return
         self.progress("measuring roll and joints", 0, 0)
         prepare(capture, {self.in_video.name: lambda frame: self.shown[frame]})
-
-    def _named_image(self, frame: int) -> Path:
-        """The image of a frame, under the name that it has in the capture."""
-        image = self.folder / "raw" / f"{frame:06d}.png"  # until now by number: SfM orders images by name
-        return image.rename(image.with_name(f"{self.data.frame_name(frame)}.png"))
 
     def _unregistered(self, states: States, times: np.ndarray, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """`IngestResult.unregistered`, of the `chosen` of frames at times [M] s."""
