@@ -86,6 +86,7 @@ def test_the_recording_names_whole_episodes_to_test(tmp_path: Path) -> None:
     assert words == "test: the recording take_0; unseen: the recording take_1"
 
 
+@pytest.mark.slow
 def test_the_right_camera_of_every_recording_is_one_view_more(tmp_path: Path) -> None:
     stereo = {"images": {"folder": "right", "fps": RATE}, "calibration": "stereo.yaml"}
     capture = ingested(still_recordings(tmp_path, (1, 1), stereo=stereo), tmp_path / "capture")

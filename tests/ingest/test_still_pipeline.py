@@ -71,6 +71,7 @@ def test_a_still_scope_is_noticed_and_the_instruments_clock_found_from_its_motio
     assert any("stands still" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_a_log_that_states_the_cameras_frame_itself_needs_no_word_in_the_recording(
     theatre: Theatre, monkeypatch: pytest.MonkeyPatch
 ) -> None:
