@@ -281,15 +281,7 @@ SCENES |= {
 SCENES["stomach-second"] = replace(
     SCENES["bowel"],
     organ="stomach",
-    path=replace(
-        SCENES["stomach"].path,
-        trocar=(-104.0, 72.0, 128.0),
-        opening_train=48 * DEGREE,
-        opening_most=74 * DEGREE,
-        roll_middle=150 * DEGREE,
-        roll_train=55 * DEGREE,
-        roll_most=95 * DEGREE,
-    ),
+    path=SCENES["stomach-scissors"].path,
     seed=61,
     words="smooth reddish stomach wall; the bowel's scissors, sensor and scope, moved otherwise",
     world_turn=(1.2, 0.8, -1.6),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +12,8 @@ import tyro
 from neeco.errors import NeecoError
 from neeco.settings import Device
 from neeco.synthesis.settings import RECORDED_SIZE, SizeSettings
+
+POLL_S = 0.5  # between two looks for Ctrl-C
 
 
 @dataclass(frozen=True)
@@ -62,17 +64,19 @@ def run(arguments: Arguments) -> int:
     ) as viewer:
         if len(shown := viewer.runs.loaded[0].tissues) > 1:
             print(f"the run has several tissues ({', '.join(shown)}); --tissue chooses which is shown")
-        return _serve(viewer.address, viewer.wait, arguments.no_browser)
+        return _serve(viewer.address, arguments.no_browser)
 
 
-def _serve(address: str, wait: Callable[[], None], no_browser: bool) -> int:
+def _serve(address: str, no_browser: bool) -> int:
+    """Say where a server is, until Ctrl-C."""
     try:
         print(f"{address}  (Ctrl-C ends)", flush=True)
         if not no_browser:
             import webbrowser
 
             webbrowser.open(address)
-        wait()
+        while True:  # in short waits: a signal that comes just before one begins is heard after it
+            time.sleep(POLL_S)
     except KeyboardInterrupt:
         print()
     return 0
@@ -86,7 +90,7 @@ def _annotate(arguments: Arguments) -> int:
     if arguments.export is not None:
         raise NeecoError("--annotate, --export: give one of the two")
     with PosingServer(arguments.runs[0], arguments.host, arguments.port) as server:
-        return _serve(server.address, server.wait, arguments.no_browser)
+        return _serve(server.address, arguments.no_browser)
 
 
 def _export(arguments: Arguments, output: Path) -> int:

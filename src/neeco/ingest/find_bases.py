@@ -124,9 +124,8 @@ def place_bases(
     lens = Lens.of(pinhole.camera(np.eye(4)).within(REFERENCE_PIXELS))
     seen = _Seen(images, lens, times[rows], cameras[rows], hidden, lambda: moving(rows))
     arms = [_arm(data, item, seen) for item in unknown]
-    for arm in sorted(
-        arms, key=lambda arm: -arm.travel
-    ):  # what moves most is found most easily, and then out of the way
+    # what moves most is found most easily, and then out of the way
+    for arm in sorted(arms, key=lambda arm: -arm.travel):
         registration, clock = _find(arm, seen, alone=len(arms) == 1), arm.clock
         if registration is None:
             assert arm.prior is not None

@@ -9,7 +9,6 @@ import json
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable
 from functools import cache
 from http import HTTPStatus
@@ -28,7 +27,6 @@ HOST, PORT = "127.0.0.1", 8080
 TOKEN_BYTES = 24
 MAX_BODY = 2**16  # bytes of a request's
 WAIT_S = 20.0  # for the rest of a request
-POLL_S = 0.5  # between two looks for Ctrl-C
 STATE = {"roll": float, "joints": {str: float}}  # degrees
 ANSWER = {"instrument": str, "frame": int, **STATE}
 
@@ -61,11 +59,6 @@ class PosingServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-    def wait(self) -> None:
-        """Until Ctrl-C."""
-        while True:  # in short waits: a signal that comes just before one begins is heard after it
-            time.sleep(POLL_S)
 
 
 @cache

@@ -14,18 +14,15 @@ import numpy as np
 import torch
 
 from neeco.capture.images import open_image
-from neeco.capture.model import State
 from neeco.errors import NeecoError
 from neeco.ingest.posing.along_shaft import crop
 from neeco.ingest.posing.hand_posed import HandPose, read_answers, write_answers
-from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing
+from neeco.ingest.posing.posed_capture import TEN, PosedCapture, Posing, half_turn
 from neeco.labels.drawing import draw
 from neeco.training.run import load_run
 
-ALONG, ACROSS = (
-    (-0.6, 1.4),
-    0.65,
-)  # of the working length, that a picture shows: before and beyond the origin, beside it
+# of the working length, that a picture shows: before and beyond the origin, beside it
+ALONG, ACROSS = (-0.6, 1.4), 0.65
 PICTURE_PX, THUMB_PX, GHOST_PX = 1000, 160, 500  # wide
 RUN_FILE = "config.yaml"  # tells a run from a capture
 QUALITY = 90
@@ -65,9 +62,9 @@ class PosingSession:
             return {
                 "index": index,
                 "name": self.posed.frames[index],
-                "roll": _known(posing.rolls.values[index], posing.rolls.deviations[index], wrap=True),
+                "roll": _known(posing.rolls.values[index], float(posing.rolls.deviations_deg[index]), wrap=True),
                 "joints": {
-                    name: _known(solved.values[index], solved.deviations[index])
+                    name: _known(solved.values[index], float(solved.deviations_deg[index]))
                     for name, solved in posing.joints.items()
                 },
                 # a point a mm along the shaft, b across, c towards the camera is seen at (a, b) of another depth
@@ -88,14 +85,13 @@ class PosingSession:
         joints = {**given.joints, **{name: math.radians(value) for name, value in joints_deg.items()}}
         state = replace(given, pose=pose, joints=joints)
         with self._drawing, self.scene.torch_threads():
-            drawing = draw(
-                self.scene, State({**frame.state.instruments, instrument: state}, frame.state.time), frame.camera
-            )
+            shown = replace(frame.state, instruments={**frame.state.instruments, instrument: state})
+            drawing = draw(self.scene, shown, frame.camera)
         if drawing.parts is None:
             raise NeecoError("ghost: the run's scene does not tell instruments from tissue; train method kinematic")
         color = (drawing.image.numpy() * 255).round().astype(np.uint8)
-        shown = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
-        return _encoded(self._along(posing, index, shown, GHOST_PX), ".png")
+        clear = np.dstack([color, (drawing.parts.numpy() > 0).astype(np.uint8) * 255])
+        return _encoded(self._along(posing, index, clear, GHOST_PX), ".png")
 
     def picture(self, instrument: str, index: int, small: bool) -> bytes:
         """A frame along the shaft, which points to the right, as JPEG. Raises NeecoError."""
@@ -186,7 +182,7 @@ class PosingSession:
             "done": len(answered),
             "sure": {name: [round(value, 1) for value in pair] for name, pair in posing.sureness().items()},
             "breaks": len(posing.breaks),
-            "deviations": [round(min(math.degrees(value), 180.0), 1) for value in posing.rolls.deviations],
+            "deviations": posing.rolls.deviations_deg.round(1).tolist(),
             "window": self._window(posing),
             "length": posing.shafts.working_length_mm,
             "radius": posing.shafts.diameter_mm / 2,
@@ -216,6 +212,4 @@ def _encoded(pixels: np.ndarray, kind: str) -> bytes:
 
 def _known(value: float, deviation: float, wrap: bool = False) -> dict[str, float]:
     degrees = math.degrees(float(value))
-    if wrap:
-        degrees = (degrees + 180) % 360 - 180
-    return {"value": degrees, "deviation": min(math.degrees(float(deviation)), 180.0)}
+    return {"value": half_turn(degrees) if wrap else degrees, "deviation": deviation}

@@ -12,7 +12,6 @@ import http
 import io
 import logging
 import secrets
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 HOST, PORT = "127.0.0.1", 8080
 MAX_RUNS = 2
 TOKEN_BYTES = 24
-POLL_S = 0.5  # between two looks for Ctrl-C
 MISSING = "view: needs viser; install neeco[view]"
 MAX_BROWSERS = 32  # at once
 MAX_MESSAGE = 2**20  # bytes; a browser's messages have some hundred
@@ -86,11 +84,6 @@ class ViewerServer:
         self.runs.end_watch()
         self.render_thread.stop()
         _stop_server(self._server)
-
-    def wait(self) -> None:
-        """Until Ctrl-C."""
-        while True:  # in short waits: a signal that comes just before one begins is heard after it
-            time.sleep(POLL_S)
 
     def _prepare_scene(self) -> None:
         """What all browsers share: which way is up, where a new one and the home button stand."""

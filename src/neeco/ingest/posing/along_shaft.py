@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -58,7 +59,7 @@ class Shafts:
             seen.working_length_mm,
         )
 
-    @property
+    @cached_property
     def view_axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit vectors `towards` the camera and `across` [F, 3], both orthogonal to the shaft, in the camera's axes."""
         across = np.cross(self.directions, -self.origins)

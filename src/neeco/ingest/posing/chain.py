@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neeco.capture.fromvideofile import UNKNOWN_DEG
 from neeco.ingest.posing.roll_pairs import RollPairs
 from neeco.ingest.posing.silhouette_shapes import Shapes
 
@@ -24,11 +25,8 @@ TEXTURE_DEG = 4.0  # of the roll that a texture shows in one frame: an axis .2 m
 EXACT_DEG, VAGUE_DEG = 3.0, 8.0  # of a pair of correlation 1, and what is added towards 0
 TRUSTED_SCORE, SCORE_WIDTH = 0.5, 0.08  # correlation at which a hypothesis is as likely right as wrong, and its scale
 PAIR_WEIGHT = 0.01  # what shading is left shifts all pairs of the same two moments, some hundred, by the same angle
-SHOWN, SHOWN_PRIOR, ENOUGH = (
-    (0.4, 1.2),
-    0.02,
-    3,
-)  # share of a turn that textures show; weight of 1; answers that tell it
+SHOWN, SHOWN_PRIOR = (0.4, 1.2), 0.02  # share of a turn that textures show; weight of 1
+ENOUGH = 3  # answers that tell it
 ROUNDS, VAGUE_AT_FIRST = 8, 4.0  # of expectation maximisation; by how much the first ones widen what pairs say
 AGREEING_DEG, WEAK = 6.0, 12  # a pair that fits; fewer of them across a gap between two frames leave it open
 READING_SWING, SHAPE_SWING = 0.7, 0.35  # rad, what the silhouette's width and its whole shape tell of a joint
@@ -51,6 +49,11 @@ class Solved:
         """[F] rad."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
+    @property
+    def deviations_deg(self) -> np.ndarray:
+        """[F] degrees, at most those of an angle of which nothing is known."""
+        return np.minimum(np.degrees(self.deviations), UNKNOWN_DEG)
+
     def with_answer(self, frame: int) -> Solved:
         """What would be known with one more hand-posed frame; the values stay."""
         column = self.covariance[:, frame]
@@ -65,12 +68,12 @@ def solve_rolls(
     change of an instrument that turns as little as it can. Without hand-posed frames the first roll is called 0."""
     view = np.concatenate([[0.0], np.cumsum(carried)])
     frames, angles = _answers(posed)
+    alone = _chained(pairs, view, times, np.array([0]), np.array([0.0]))
     if not len(frames):
-        return _chained(pairs, view, times, np.array([0]), np.array([0.0]))
+        return alone
     # which of the turns an answer means: the nearest to what textures alone say, all answers together
-    alone = _chained(pairs, view, times, np.array([0]), np.array([0.0])).values
-    beside = np.exp(1j * (angles - alone[frames])).mean()
-    expected = alone[frames] + np.angle(beside)
+    beside = np.exp(1j * (angles - alone.values[frames])).mean()
+    expected = alone.values[frames] + np.angle(beside)
     return _chained(pairs, view, times, frames, expected + _wrapped(angles - expected))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from neeco.capture.fromvideofile import UNKNOWN_DEG
 from neeco.capture.model import Capture, Instrument
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
@@ -78,7 +79,9 @@ class Posing:
             if not self.answers and not chosen:  # all are alike; open jaws show their hinge best
                 doubt = self.measured.shapes.widths
             frame = int(np.argmax(np.where(usable, doubt, -np.inf)))
-            chosen.append(Suggestion(frame, self._reason(frame, [some.deviations[frame] for some in solved], breaks)))
+            chosen.append(
+                Suggestion(frame, self._reason(frame, [some.deviations_deg[frame] for some in solved], breaks))
+            )
             usable[frame] = False
             solved = [some.with_answer(frame) for some in solved]
         return chosen
@@ -93,7 +96,7 @@ class Posing:
             return "jaws at their narrowest"
         names = ["roll", *self.joints]
         least = int(np.argmax(deviations))
-        return f"least sure: {names[least]} ± {min(math.degrees(deviations[least]), 180):.0f}°"
+        return f"least sure: {names[least]} ± {deviations[least]:.0f}°"
 
     def doubts(self) -> list[Doubt]:
         """Answers that differ from an earlier one of the same frame; and of roll and of each joint the one that differs
@@ -104,14 +107,14 @@ class Posing:
             for position, (frame, answer) in enumerate(self.answers):
                 angle = _angle(answer, what)
                 earlier = next((old for other, old in self.answers[:position][::-1] if other == frame), None)
-                if earlier is not None and abs(apart := _turn(angle - _angle(earlier, what))) > DOUBTED_DEG:
+                if earlier is not None and abs(apart := half_turn(angle - _angle(earlier, what))) > DOUBTED_DEG:
                     found.append(Doubt(frame, what, apart, "an earlier answer"))
                 # leaving one answer out of a Gaussian posterior
                 left = max(1 - (float(solved.deviations[frame]) / math.radians(HAND_DEG)) ** 2, 0.02)
-                apart = _turn(angle - math.degrees(solved.values[frame])) / left
+                apart = half_turn(angle - math.degrees(solved.values[frame])) / left
                 far = abs(apart) * math.sqrt(left) / HAND_DEG
                 if len(self.answers) >= FEW and abs(apart) > DOUBTED_DEG and far > least:
-                    worst, least = Doubt(frame, what, _turn(apart), "what its neighbours say"), far
+                    worst, least = Doubt(frame, what, half_turn(apart), "what its neighbours say"), far
             found += [] if worst is None else [worst]
         return found
 
@@ -120,9 +123,9 @@ class Posing:
         where nothing is known."""
         found = {}
         for name, solved in {"roll": self.rolls, **self.joints}.items():
-            deviations = np.minimum(np.degrees(solved.deviations), 180.0)
+            deviations = solved.deviations_deg
             if name == "roll" and not self.answers:
-                deviations = np.full(len(deviations), 180.0)
+                deviations = np.full(len(deviations), UNKNOWN_DEG)
             found[name] = (float(np.median(deviations)), float(np.quantile(deviations, 0.95)))
         return found
 
@@ -206,12 +209,12 @@ class PosedCapture:
         }
         known = item.get("uncertainty", {})
         tilts = known.get("rotation_deg", [0.0, 0.0, 0.0])[:2]
-        roll = min(math.degrees(posing.rolls.deviations[frame]), 180.0) if posing.answers else 180.0
+        roll = float(posing.rolls.deviations_deg[frame]) if posing.answers else UNKNOWN_DEG
         item["uncertainty"] = {
             "translation_mm": known.get("translation_mm", [0.0, 0.0, 0.0]),
             "rotation_deg": [*tilts, roll],
             "joints_deg": known.get("joints_deg", {})
-            | {name: min(math.degrees(solved.deviations[frame]), 180.0) for name, solved in posing.joints.items()},
+            | {name: float(solved.deviations_deg[frame]) for name, solved in posing.joints.items()},
         }
 
 
@@ -226,6 +229,6 @@ def _angle(answer: HandPose, what: str) -> float:
     return answer.roll_deg if what == "roll" else answer.joints_deg[what]
 
 
-def _turn(degrees: float) -> float:
-    """The same angle between -180 and 180."""
+def half_turn(degrees: float) -> float:
+    """The same angle, in degrees, between -180 and 180."""
     return (degrees + 180) % 360 - 180
