@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from neeco.scene.training_session import InstrumentSearch, Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
 from neeco.training.instruments.chains import find_trees
-from neeco.training.instruments.discovery import bound_volume, find_instruments
+from neeco.training.instruments.discovery import bound_volume, carve_seeds, find_instruments
 from neeco.training.instruments.finish import conclude
 from neeco.training.instruments.label_shares import store_label_shares
 from neeco.training.instruments.shadow import find_shadow
@@ -44,6 +45,7 @@ def begin_session(
     session.timed = capture.timed
     session.instruments = InstrumentSearch(
         find=_searching(session, find_instruments),
+        carve=_searching(session, carve_seeds),
         bound=_searching(session, bound_volume),
         place_wrists=_searching(session, place_wrists),
         replace_wrists=_searching(session, replace_wrists),
@@ -71,12 +73,12 @@ def _with_trees(capture: Capture, scene: Scene, views: TrainingViews, config: Tr
     return again
 
 
-def _searching(session: GaussianSession, search: Callable[..., None], as_learned: bool = False) -> Callable[..., None]:
+def _searching(session: GaussianSession, search: Callable[..., Any], as_learned: bool = False) -> Callable[..., Any]:
     """`search` of this session, on images of the size that searches take, or `as_learned` so far."""
 
-    def run(*arguments: object) -> None:
+    def run(*arguments: object) -> Any:
         with session.searching(as_learned):
-            search(session, *arguments)
+            return search(session, *arguments)
 
     return run
 

@@ -9,7 +9,7 @@ detached and the network off for the first 7.5 % of the training (Deformable-3DG
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import bfloat16_products, tf32_products
-from neeco.raster.rotations import matrix_to_quat
-from neeco.scene.canonical import CanonicalGaussians
+from neeco.raster.rotations import matrix_to_quat, quat_multiply
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.deformations.base import (
     HALF_BY_DEFAULT,
     UNPERTURBED,
@@ -40,6 +40,8 @@ from neeco.scene.training_session import GaussianTraining
 # width * rate = 0.2; without these the first steps throw Gaussians across the scene.
 MEAN_UNIT = 0.05  # of the points' half extent
 SHAPE_UNIT = 0.1  # of quaternion and log scale
+MEMBER_LOGITS = "member_logits"  # the per-Gaussian extra [N, I] of learned membership
+SURE = 6.0  # its size at the start: 0.2 % of a motion smear what does not take part
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,15 @@ class NPSSettings:
     warm_up: float = 0.075
     gate_mm: float | None = None
     rate: float = 8e-4
+    anneal: float = 0.0
+    carried_places: bool = False
+    seeds: bool = False
+    membership: bool = False
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
+        if not 0 <= self.anneal <= 1:
+            raise NeecoError(f"deformation.anneal: {self.anneal} is not a share of the training in [0, 1]")
         if self.gate_mm is not None and not self.gate_mm > 0:
             raise NeecoError(
                 f"deformation.gate_mm: {self.gate_mm} is not a positive distance in mm; leave it out for no gate"
@@ -85,11 +93,15 @@ class NPS(LabelledByMotion):
     needs_instruments = True
     large_operations = True
 
+    extra_rates: ClassVar[Mapping[str, float]] = {MEMBER_LOGITS: 1e-2}
+
     state_center: Tensor
     state_halfwidth: Tensor
     mean_center: Tensor
     mean_halfwidth: Tensor
     first_quats: Tensor
+    rest: Tensor  # [I, 4, 4] mm: the instruments' poses in the state in which the canonical Gaussians are placed
+    opened: Tensor  # share of the octaves that are open
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: NPSSettings | None = None) -> None:
         super().__init__(instruments, settings)
@@ -102,7 +114,13 @@ class NPS(LabelledByMotion):
         self.register_buffer("mean_center", torch.zeros(3))
         self.register_buffer("mean_halfwidth", torch.ones(()))
         self.register_buffer("first_quats", torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(max(len(instruments), 1), 1))
-        mean_inputs = 3 * (2 * sizes.L_mean + sizes.identity)
+        if sizes.carried_places or sizes.seeds or sizes.membership:
+            self.register_buffer("rest", torch.eye(4).repeat(len(instruments), 1, 1))
+        if sizes.anneal > 0:
+            self.register_buffer("opened", torch.zeros(()))
+        if sizes.membership:
+            self.label_names = tuple((instrument.name, "instrument") for instrument in instruments)
+        mean_inputs = 3 * (2 * sizes.L_mean + sizes.identity + sizes.carried_places * len(instruments))
         state_inputs = size * (2 * sizes.L_state + sizes.identity)
         # gamma(mu) and gamma(p) enter through separate weights of one linear layer: the state's share is computed once
         self.skip = depth // 2 if depth >= 8 else -1
@@ -145,11 +163,52 @@ class NPS(LabelledByMotion):
             low, high = vectors.min(0).values, vectors.max(0).values
             self.state_center = (low + high) / 2
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
+            if self._carries:
+                middle = int(((vectors - self.state_center) / self.state_halfwidth).square().sum(1).argmin())
+                self.rest = self._poses(states[middle])
         self.mean_center, self.mean_halfwidth = robust_bounds(means)
+
+    @property
+    def _carries(self) -> bool:
+        return hasattr(self, "rest")
+
+    def _poses(self, state: State) -> Tensor:
+        """World-from-instrument [I, 4, 4] mm."""
+        return torch.stack([state_of(instrument, state).pose.to(self.state_center) for instrument in self.instruments])
+
+    def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
+        if not self.settings.membership:
+            return {}
+        return {MEMBER_LOGITS: canonical.means.new_full((len(canonical), len(self.instruments)), -SURE)}
 
     def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
             training.instruments.bound(self.gate)
+        if self.settings.seeds and (found := training.instruments.carve()) is not None:
+            training.scene.canonical = self._with_seeds(training.scene.canonical, found)
+
+    def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
+        """`canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame and the
+        radius of its shaft, where the state of rest puts them: all together half as many as there are."""
+        most = max(1, len(canonical) // (2 * len(found)))
+        bodies = [canonical]
+        for index, (points, radius) in enumerate(found):
+            points = points[:: -(-len(points) // most)]
+            pose = self.rest[index].to(points)
+            points = points @ pose[:3, :3].T + pose[:3, 3]
+            body = seed_gaussians(
+                points, points.new_full((len(points), 3), 0.4), points.new_full((len(points),), 0.4 * radius)
+            )
+            extras = self.initial_extras(body)
+            if extras:
+                extras[MEMBER_LOGITS][:, index] = SURE
+            bodies.append(body.with_extras(**extras))
+        joined = join_bodies(bodies)
+        return joined.map(lambda tensor: tensor, (len(joined),))
+
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
+        if self.settings.anneal > 0:
+            self.opened.fill_(min(1.0, training.progress / self.settings.anneal))
 
     def _raw_state(self, state: State) -> Tensor:
         """p before normalisation [S]: position mm, sign-continuous quaternion, joints rad."""
@@ -170,10 +229,44 @@ class NPS(LabelledByMotion):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if not self.instruments or self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        change = self._change(canonical.means.detach(), self._encoded_state(state, perturbation.state_noise))
+        carried = self._poses(state) @ self.rest.inverse() if self._carries else None
+        change = self._change(
+            canonical.means.detach(),
+            self._encoded_state(state, perturbation.state_noise),
+            self._carried_places(canonical.means.detach(), carried),
+        )
         means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
         quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
-        return Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
+        scales = (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp()
+        if not self.settings.membership:
+            return Posed(means, quats, scales)
+        assert carried is not None
+        shares = members(canonical)  # [N, 1 + I]
+        turns = matrix_to_quat(carried[:, :3, :3])  # [I, 4]
+        turns = torch.where(turns[:, :1] < 0, -turns, turns)
+        frames = [turns.new_tensor([1.0, 0.0, 0.0, 0.0]), *turns]
+        placed = [means, *(means @ moved[:3, :3].T + moved[:3, 3] for moved in carried)]
+        turned = [quats, *(quat_multiply(turn, quats) for turn in turns)]
+        blended = [
+            sum(share[:, None] * value for share, value in zip(shares.unbind(1), values, strict=True))
+            for values in (placed, turned, frames)
+        ]
+        return Posed(blended[0], blended[1], scales, nn.functional.normalize(blended[2], dim=-1).detach())
+
+    def _carried_places(self, means: Tensor, carried: Tensor | None) -> Tensor | None:
+        """[N, 3 I] how far means [N, 3] would be carried with each instrument, in the points' half extent."""
+        if carried is None or not self.settings.carried_places:
+            return None
+        moved = means @ carried[:, :3, :3].transpose(1, 2) + carried[:, None, :3, 3] - means  # [I, N, 3]
+        return moved.movedim(0, 1).flatten(1) / self.mean_halfwidth
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        """The learned membership [N, I], or the moving Gaussians."""
+        return members(canonical)[:, 1:] if self.settings.membership else super().label_channels(canonical)
+
+    def finish(self, training: GaussianTraining) -> None:
+        if not self.settings.membership:
+            super().finish(training)
 
     def _encoded_state(self, state: State, noise: float) -> Tensor:
         """gamma(p) + Delta, Delta = N(0, noise^2) (the paper's compensation)."""
@@ -183,21 +276,30 @@ class NPS(LabelledByMotion):
     def _encode(self, values: Tensor, octaves: int) -> Tensor:
         """gamma of values [..., D], with the values themselves behind where `identity` asks for them."""
         encoded = encode(values, octaves)
+        if self.settings.anneal > 0:
+            done = (self.opened * octaves - torch.arange(octaves, device=values.device)).clamp(0, 1)
+            encoded = encoded * (0.5 - 0.5 * torch.cos(math.pi * done)).repeat(2 * values.shape[-1])
         return torch.cat([encoded, values], -1) if self.settings.identity else encoded
 
-    def _change(self, means: Tensor, encoded_state: Tensor) -> Tensor:
+    def _change(self, means: Tensor, encoded_state: Tensor, places: Tensor | None) -> Tensor:
         """The network's output [N, 10]; zero for means [N, 3] outside the gate."""
         if self.gate is None or not self.gate.bounded:
-            return self.network(means, encoded_state)
+            return self.network(means, encoded_state, places)
         near = torch.nonzero(self.gate.contains(means))[:, 0]
-        evaluated = self.network(means[near], encoded_state)
+        evaluated = self.network(means[near], encoded_state, None if places is None else places[near])
         return evaluated.new_zeros(len(means), evaluated.shape[1]).index_copy(0, near, evaluated)
 
-    def network(self, means: Tensor, encoded_state: Tensor) -> Tensor:
-        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above)."""
-        if not torch.is_grad_enabled() and means.shape[0] > self.settings.chunk:
-            return torch.cat([self.network(part, encoded_state) for part in means.split(self.settings.chunk)])
+    def network(self, means: Tensor, encoded_state: Tensor, places: Tensor | None = None) -> Tensor:
+        """F: means [N, 3] mm and gamma(p) [E] to [N, 10] (mean, quaternion, log scale; units above). `places`: further
+        inputs of each Gaussian."""
+        chunk = self.settings.chunk
+        if not torch.is_grad_enabled() and means.shape[0] > chunk:
+            rest = [None] * len(means.split(chunk)) if places is None else places.split(chunk)
+            return torch.cat(
+                [self.network(part, encoded_state, more) for part, more in zip(means.split(chunk), rest, strict=True)]
+            )
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
+        encoded = encoded if places is None else torch.cat([encoded, places], -1)
         state = encoded_state[None]
         with tf32_products(means.device):
             # one row, and what tells states apart: in float32, as low octaves alone have no place in eight bits
@@ -216,3 +318,8 @@ class NPS(LabelledByMotion):
         return dict.fromkeys(
             (name for name, _ in self.named_parameters()), self.settings.rate * floored_decay(progress)
         )
+
+
+def members(canonical: CanonicalGaussians) -> Tensor:
+    """[N, 1 + I] in [0, 1]: how far each Gaussian belongs to the tissue and to each instrument; rows sum to 1."""
+    return nn.functional.pad(canonical.extras[MEMBER_LOGITS], (1, 0)).softmax(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.scene.articulation import LINK_LOGITS, ArticulatedInstruments
@@ -91,16 +92,14 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
     Where carving cannot be trusted the volume stays unbounded: slow, but never wrong. Raises NeecoError when hardly any
     Gaussian lies inside: the network moves tissue onto the instrument, so the volume has to reach the tissue.
     """
-    scene, views, config, report = session.scene, session.views, session.config, session.report
+    scene, views, report = session.scene, session.views, session.report
     report("looking for the instruments, to bound where the network is evaluated")
-    evidence = tissue_evidence(scene, views, config)
-    generator = torch.Generator().manual_seed(config.seed)
+    shapes = carve_instruments(session)
+    if shapes is None:
+        report("warning: the network is evaluated everywhere")
+        return
     swept = []
-    for instrument in scene.instruments:
-        shape = carve(evidence, instrument.name, generator, config.search)
-        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
-            report(f"warning: {instrument.name}: its shape cannot be carved; the network is evaluated everywhere")
-            return
+    for instrument, shape in zip(scene.instruments, shapes, strict=True):
         recorded = [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
         poses = torch.stack(recorded).to(shape.seeds)  # [F, 4, 4]
         swept.append((shape.seeds @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3))
@@ -112,6 +111,28 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
             "mm of the instruments' path; give a greater distance"
         )
     report(f"the network is evaluated on {int(inside.sum())} of {len(inside)} Gaussians")
+
+
+def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]] | None:
+    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm; None, with a warning, where
+    carving cannot be trusted."""
+    session.report("looking for the instruments, on which Gaussians begin")
+    shapes = carve_instruments(session)
+    return None if shapes is None else [(shape.seeds, shape.radius) for shape in shapes]
+
+
+def carve_instruments(session: GaussianSession) -> list[CarvedShape] | None:
+    """The shape of every instrument; None, with a warning, where one cannot be trusted."""
+    evidence = tissue_evidence(session.scene, session.views, session.config)
+    generator = torch.Generator().manual_seed(session.config.seed)
+    shapes = []
+    for instrument in session.scene.instruments:
+        shape = carve(evidence, instrument.name, generator, session.config.search)
+        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
+            session.report(f"warning: {instrument.name}: its shape cannot be carved")
+            return None
+        shapes.append(shape)
+    return shapes
 
 
 def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:
