@@ -56,6 +56,10 @@ class NPSSettings:
     learning rate at the start.
     `gate_mm` (None: off, as published): Gaussians farther than this from all that the instruments were recorded to
     sweep stay canonical without being evaluated.
+    Not in the paper: `anneal`: share of the training over which the octaves open, coarse to fine; `carried_places`: the
+    network is also given how far each Gaussian would be carried with each instrument; `seeds`: Gaussians begin on the
+    carved instruments, too; `membership`: each Gaussian learns its share of each instrument's recorded motion, by which
+    what the network deformed is carried, and which is its label.
     """
 
     depth: int = 12
