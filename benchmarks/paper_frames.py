@@ -44,6 +44,10 @@ from neeco.training.run import read_config
 
 OUTPUT_FILE = "paper_frames.json"
 SPLITS = {SEEN: "seen", "unseen": "unseen"}
+LINES: dict[str, dict[str, Any]] = {
+    SEEN: {"linestyle": "-", "marker": "o", "markersize": 4},
+    "unseen": {"linestyle": "--", "marker": "o", "markersize": 4, "markerfacecolor": "none"},
+}
 SUBJECT = "neeco"  # whom the paper has before all others
 COMPARED = {"psnr": "PSNR", "psnr_instrument": "PSNR instrument"}
 RESAMPLES = 10_000
@@ -204,7 +208,7 @@ def markdown(summary: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]])
 
 
 def curves(summary: Sequence[dict[str, Any]]) -> Figure:
-    """Means over the number of training frames: a colour per method, seen solid, unseen dashed."""
+    """Means over the number of training frames: a colour per method, seen solid, unseen dashed with hollow points."""
     present = dict.fromkeys(row["name"] for row in summary)
     further = [name for name in present if name not in COLOURS]
     colours = COLOURS | {name: FURTHER[k % len(FURTHER)] for k, name in enumerate(further)}
@@ -219,8 +223,7 @@ def curves(summary: Sequence[dict[str, Any]]) -> Figure:
                 line = [row for row in summary if (row["name"], row["split"]) == (name, split) and row[key]["n"]]
                 line.sort(key=lambda row: row["frames"])
                 places, means = [row["frames"] for row in line], [row[key]["mean"] for row in line]
-                style = {"linestyle": "-" if split == SEEN else "--", "marker": "o", "markersize": 4}
-                axes.plot(places, means, color=colours[name], linewidth=1.6, **style)
+                axes.plot(places, means, color=colours[name], linewidth=1.6, **LINES[split])
         axes.set_xscale("log")
         axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=8)
         axes.xaxis.set_minor_locator(NullLocator())
@@ -233,8 +236,7 @@ def curves(summary: Sequence[dict[str, Any]]) -> Figure:
         if key.endswith("iou"):
             axes.set_ylim(0, 1)
     handles = [Line2D([], [], color=colours[name], linewidth=2, label=name) for name in names]
-    styles = [("-", "seen"), ("--", "unseen")]
-    handles += [Line2D([], [], color=GREY, linestyle=style, label=label) for style, label in styles]
+    handles += [Line2D([], [], color=GREY, label=SPLITS[split], **style) for split, style in LINES.items()]
     figure.legend(handles=handles, fontsize=8, frameon=False, ncols=4, loc="outside lower center")
     return figure
 
