@@ -116,6 +116,12 @@ def seed_gaussians(positions: Tensor, colors: Tensor, spacing: Tensor, *, opacit
     )
 
 
+def seed_instrument(points: Tensor, radius: float) -> CanonicalGaussians:
+    """Grey Gaussians of one body at `points` [P, 3] mm on an instrument whose shaft has this `radius`, mm."""
+    count = len(points)
+    return seed_gaussians(points, points.new_full((count, 3), 0.4), points.new_full((count,), 0.4 * radius))
+
+
 def neighbour_spacing(positions: np.ndarray) -> Tensor:
     """Mean distance to the three nearest neighbours [N] mm, the initial size of 3DGS; at most the 99th percentile."""
     if len(positions) < 4:

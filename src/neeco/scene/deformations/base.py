@@ -257,6 +257,12 @@ def octave_angles(values: Tensor, count: int, unit: float = math.pi) -> Tensor:
     return values[..., None] * (unit * 2.0 ** torch.arange(count, dtype=values.dtype, device=values.device))
 
 
+def octave_weights(opened: Tensor, count: int) -> Tensor:
+    """Weight [L] of each octave k < L = `count`: (1 - cos(pi clamp(opened - k, 0, 1))) / 2 (Nerfies eq. 5)."""
+    octaves = torch.arange(count, device=opened.device)
+    return (1 - torch.cos(math.pi * (opened - octaves).clamp(0, 1))) / 2
+
+
 def encode(values: Tensor, count: int, unit: float = math.pi) -> Tensor:
     """gamma: [..., D] to [..., 2 D L]: the sines of every coordinate's L = `count` octaves, then the cosines."""
     angles = octave_angles(values, count, unit).flatten(-2)

@@ -20,7 +20,7 @@ from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
 from neeco.raster.devices import bfloat16_products, tf32_products
 from neeco.raster.rotations import matrix_to_quat, quat_multiply
-from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
+from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_instrument
 from neeco.scene.deformations.base import (
     HALF_BY_DEFAULT,
     UNPERTURBED,
@@ -30,6 +30,7 @@ from neeco.scene.deformations.base import (
     check_warm_up,
     encode,
     floored_decay,
+    octave_weights,
     robust_bounds,
     state_of,
 )
@@ -167,14 +168,10 @@ class NPS(LabelledByMotion):
             low, high = vectors.min(0).values, vectors.max(0).values
             self.state_center = (low + high) / 2
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
-            if self._carries:
+            if hasattr(self, "rest"):
                 middle = int(((vectors - self.state_center) / self.state_halfwidth).square().sum(1).argmin())
                 self.rest = self._poses(states[middle])
         self.mean_center, self.mean_halfwidth = robust_bounds(means)
-
-    @property
-    def _carries(self) -> bool:
-        return hasattr(self, "rest")
 
     def _poses(self, state: State) -> Tensor:
         """World-from-instrument [I, 4, 4] mm."""
@@ -199,10 +196,7 @@ class NPS(LabelledByMotion):
         for index, (points, radius) in enumerate(found):
             points = points[:: -(-len(points) // most)]
             pose = self.rest[index].to(points)
-            points = points @ pose[:3, :3].T + pose[:3, 3]
-            body = seed_gaussians(
-                points, points.new_full((len(points), 3), 0.4), points.new_full((len(points),), 0.4 * radius)
-            )
+            body = seed_instrument(points @ pose[:3, :3].T + pose[:3, 3], radius)
             extras = self.initial_extras(body)
             if extras:
                 extras[MEMBER_LOGITS][:, index] = SURE
@@ -233,19 +227,22 @@ class NPS(LabelledByMotion):
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if not self.instruments or self.warming_up:
             return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        carried = self._poses(state) @ self.rest.inverse() if self._carries else None
-        change = self._change(
-            canonical.means.detach(),
-            self._encoded_state(state, perturbation.state_noise),
-            self._carried_places(canonical.means.detach(), carried),
-        )
+        given = canonical.means.detach()
+        places = self._carried_places(given, state) if self.settings.carried_places else None
+        change = self._change(given, self._encoded_state(state, perturbation.state_noise), places)
         means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
         quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
         scales = (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp()
-        if not self.settings.membership:
-            return Posed(means, quats, scales)
-        assert carried is not None
-        shares = members(canonical)  # [N, 1 + I]
+        deformed = Posed(means, quats, scales)
+        return self._carried(deformed, members(canonical), state) if self.settings.membership else deformed
+
+    def _motions(self, state: State) -> Tensor:
+        """[I, 4, 4] mm: how each instrument moved since the state of rest, world frame."""
+        return self._poses(state) @ self.rest.inverse()
+
+    def _carried(self, deformed: Posed, shares: Tensor, state: State) -> Posed:
+        """What stays where it is and what moves with each instrument, blended by shares [N, 1 + I]."""
+        means, quats, carried = deformed.means, deformed.quats, self._motions(state)
         turns = matrix_to_quat(carried[:, :3, :3])  # [I, 4]
         turns = torch.where(turns[:, :1] < 0, -turns, turns)
         frames = [turns.new_tensor([1.0, 0.0, 0.0, 0.0]), *turns]
@@ -255,12 +252,11 @@ class NPS(LabelledByMotion):
             sum(share[:, None] * value for share, value in zip(shares.unbind(1), values, strict=True))
             for values in (placed, turned, frames)
         ]
-        return Posed(blended[0], blended[1], scales, nn.functional.normalize(blended[2], dim=-1).detach())
+        return Posed(blended[0], blended[1], deformed.scales, nn.functional.normalize(blended[2], dim=-1).detach())
 
-    def _carried_places(self, means: Tensor, carried: Tensor | None) -> Tensor | None:
+    def _carried_places(self, means: Tensor, state: State) -> Tensor:
         """[N, 3 I] how far means [N, 3] would be carried with each instrument, in the points' half extent."""
-        if carried is None or not self.settings.carried_places:
-            return None
+        carried = self._motions(state)
         moved = means @ carried[:, :3, :3].transpose(1, 2) + carried[:, None, :3, 3] - means  # [I, N, 3]
         return moved.movedim(0, 1).flatten(1) / self.mean_halfwidth
 
@@ -281,8 +277,7 @@ class NPS(LabelledByMotion):
         """gamma of values [..., D], with the values themselves behind where `identity` asks for them."""
         encoded = encode(values, octaves)
         if self.settings.anneal > 0:
-            done = (self.opened * octaves - torch.arange(octaves, device=values.device)).clamp(0, 1)
-            encoded = encoded * (0.5 - 0.5 * torch.cos(math.pi * done)).repeat(2 * values.shape[-1])
+            encoded = encoded * octave_weights(self.opened * octaves, octaves).repeat(2 * values.shape[-1])
         return torch.cat([encoded, values], -1) if self.settings.identity else encoded
 
     def _change(self, means: Tensor, encoded_state: Tensor, places: Tensor | None) -> Tensor:
@@ -298,10 +293,9 @@ class NPS(LabelledByMotion):
         inputs of each Gaussian."""
         chunk = self.settings.chunk
         if not torch.is_grad_enabled() and means.shape[0] > chunk:
-            rest = [None] * len(means.split(chunk)) if places is None else places.split(chunk)
-            return torch.cat(
-                [self.network(part, encoded_state, more) for part, more in zip(means.split(chunk), rest, strict=True)]
-            )
+            parts = means.split(chunk)
+            more = [None] * len(parts) if places is None else places.split(chunk)
+            return torch.cat([self.network(part, encoded_state, p) for part, p in zip(parts, more, strict=True)])
         encoded = self._encode((means - self.mean_center) / self.mean_halfwidth, self.settings.L_mean)
         encoded = encoded if places is None else torch.cat([encoded, places], -1)
         state = encoded_state[None]

@@ -22,7 +22,6 @@ Departures, for a CPU or for states that were not trained:
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ from neeco.errors import NeecoError
 from neeco.raster.devices import tf32_products
 from neeco.raster.optics import draw_through
 from neeco.raster.types import Rendering
-from neeco.scene.deformations.base import octave_angles
+from neeco.scene.deformations.base import octave_angles, octave_weights
 from neeco.scene.drawable import Recorded
 
 HEAD_RANGE = 1e-4  # the warp's heads start in U(-1e-4, 1e-4): the untrained field hardly moves anything
@@ -117,12 +116,6 @@ def encode_by_octave(values: Tensor, count: int, opened: Tensor | None = None) -
     if opened is not None:
         waves = waves * octave_weights(opened, count)[:, None]
     return torch.cat([values, waves.flatten(-2)], -1)
-
-
-def octave_weights(opened: Tensor, count: int) -> Tensor:
-    """Weight [L] of each octave k < L = `count`: (1 - cos(pi clamp(opened - k, 0, 1))) / 2 (Nerfies eq. 5)."""
-    octaves = torch.arange(count, device=opened.device)
-    return (1 - torch.cos(math.pi * (opened - octaves).clamp(0, 1))) / 2
 
 
 def exponential_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -12,7 +12,7 @@ from neeco.scene.articulation import LINK_LOGITS, ArticulatedInstruments
 from neeco.scene.articulation.hinges import Hinges
 from neeco.scene.articulation.stated import StatedLinks
 from neeco.scene.breathing import Breathing, BreathingTissue
-from neeco.scene.canonical import join_bodies, seed_gaussians
+from neeco.scene.canonical import join_bodies, seed_instrument
 from neeco.scene.deformations.static import Static
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene
@@ -79,9 +79,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
         else:
             assert isinstance(articulation, Hinges)
             seeds, logits = start_hinges(session, articulation, evidence, instrument.name, shape, columns, generator)
-        count = len(seeds)
-        body = seed_gaussians(seeds, seeds.new_full((count, 3), 0.4), seeds.new_full((count,), 0.4 * shape.radius))
-        bodies.append(body.with_extras(**{LINK_LOGITS: logits}))
+        bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
     scene.canonical = join_bodies(bodies)
 
 
@@ -94,9 +92,8 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
     """
     scene, views, report = session.scene, session.views, session.report
     report("looking for the instruments, to bound where the network is evaluated")
-    shapes = carve_instruments(session)
+    shapes = carve_instruments(session, "the network is evaluated everywhere")
     if shapes is None:
-        report("warning: the network is evaluated everywhere")
         return
     swept = []
     for instrument, shape in zip(scene.instruments, shapes, strict=True):
@@ -117,19 +114,20 @@ def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]] | None:
     """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm; None, with a warning, where
     carving cannot be trusted."""
     session.report("looking for the instruments, on which Gaussians begin")
-    shapes = carve_instruments(session)
+    shapes = carve_instruments(session, "no Gaussian begins on an instrument")
     return None if shapes is None else [(shape.seeds, shape.radius) for shape in shapes]
 
 
-def carve_instruments(session: GaussianSession) -> list[CarvedShape] | None:
-    """The shape of every instrument; None, with a warning, where one cannot be trusted."""
+def carve_instruments(session: GaussianSession, otherwise: str) -> list[CarvedShape] | None:
+    """The shape of every instrument; None, with a warning that says what happens `otherwise`, where one cannot be
+    trusted."""
     evidence = tissue_evidence(session.scene, session.views, session.config)
     generator = torch.Generator().manual_seed(session.config.seed)
     shapes = []
     for instrument in session.scene.instruments:
         shape = carve(evidence, instrument.name, generator, session.config.search)
         if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
-            session.report(f"warning: {instrument.name}: its shape cannot be carved")
+            session.report(f"warning: {instrument.name}: its shape cannot be carved; {otherwise}")
             return None
         shapes.append(shape)
     return shapes
