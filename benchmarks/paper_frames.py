@@ -2,8 +2,8 @@
 
     neeco compare CAPTURE --transforms transforms-225.json --methods neeco 4dgs+dta … --output c225     # and so on
     python benchmarks/paper_frames.py labels c75 c225 c675 c2025            # or run folders
-    python benchmarks/paper_frames.py tables c75 c225 c675 c2025 --output DIR --figure docs/images/paper-frames.svg \\
-        [--run 'neeco practical=RUN' ...]
+    python benchmarks/paper_frames.py tables c75 c225 c675 c2025 [--run 'neeco practical=RUN' ...] [--output DIR]
+    python benchmarks/paper_frames.py figure docs/reproducing-the-paper.md --output docs/images/paper-frames.svg
 
 `labels`: for every finished run of a network whose deltas tell what moves, the mask IoU (mean over a split's frames)
 of its own labels, of the paper's thresholds by Otsu's method, and of the best thresholds that a scan finds by the true
@@ -13,6 +13,9 @@ masks of `test` (`label_scan.py`): on deltas from canonical, and from their mean
 `tables`: means over frames and seeds by number of training frames, and what `neeco` has more than each other method on
 the same frames, with a 95% bootstrap interval over frames (seeds averaged first; frames count as independent). Markdown
 to standard output, everything to DIR/paper_frames.json. Runs of a comparison that have not finished are left out.
+
+`figure`: curves over the number of training frames, from the first table that `tables` printed or a page quotes, so
+that it never says anything else.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,7 +33,7 @@ from label_scan import SCAN_FILE, SEEN, label_scan, read_evaluation, read_scan
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
-from result_plots import GREY, write
+from result_plots import GREY, number, table, write
 
 from neeco.capture import read_capture
 from neeco.errors import NeecoError
@@ -52,6 +55,8 @@ SUBJECT = "neeco"  # whom the paper has before all others
 COMPARED = {"psnr": "PSNR", "psnr_instrument": "PSNR instrument"}
 RESAMPLES = 10_000
 SCANNED = Column("scanned_iou", "IoU, best thresholds", 3, "high")
+COLUMNS = (*SPLIT_COLUMNS, SCANNED)
+KEYS = ("frames", "states", "method")
 COLOURS = {  # further runs take those that are left
     "neeco": "#0f9488",
     "deformable-3dgs+dta": "#d97706",
@@ -140,7 +145,7 @@ def summarise(entries: Sequence[Entry]) -> list[dict[str, Any]]:
     for frames, split, name in sorted(keys, key=lambda key: key[0]):
         runs = [entry for entry in entries if (entry.frames, entry.name) == (frames, name)]
         row: dict[str, Any] = {"frames": frames, "split": split, "name": name, "seeds": [run.seed for run in runs]}
-        for column in (*SPLIT_COLUMNS, SCANNED):
+        for column in COLUMNS:
             values = [run.mean(split, column.key) for run in runs]
             row[column.key] = spread(values) | {"values": values}
         rows.append(row)
@@ -186,25 +191,38 @@ def differences(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def markdown(summary: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]]) -> str:
-    """A table per number of frames and split, then the differences, a row per number of frames and other method."""
-    lines: list[str] = []
-    for frames, split in dict.fromkeys((row["frames"], row["split"]) for row in summary):
-        rows = [row for row in summary if (row["frames"], row["split"]) == (frames, split)]
-        entries = [SummaryRow((row["name"],), row) for row in rows]
-        title = f"{frames:,} training frames, {SPLITS[split]}"
-        lines += [*markdown_table(summary_table(title, ("method",), (*SPLIT_COLUMNS, SCANNED), entries)), ""]
-    columns = [(key, split) for key in COMPARED for split in SPLITS]
-    heads = " | ".join(f"{COMPARED[key]}, {SPLITS[split]}" for key, split in columns)
+    """The means, then the differences, a row per number of frames and other method."""
+    rows = [SummaryRow((f"{row['frames']:,}", SPLITS[row["split"]], row["name"]), row) for row in summary]
+    columns = tuple(replace(column, better=None) for column in COLUMNS)  # no best over all numbers of frames
+    lines = [*markdown_table(summary_table("By training frames", KEYS, columns, rows)), ""]
+    compared = [(key, split) for key in COMPARED for split in SPLITS]
+    heads = " | ".join(f"{COMPARED[key]}, {SPLITS[split]}" for key, split in compared)
     lines += [f"## {SUBJECT} minus the other, dB (95% interval over frames)", ""]
-    lines += [f"| frames | other | {heads} |", "|---|---|" + "---:|" * len(columns)]
+    lines += [f"| frames | other | {heads} |", "|---|---|" + "---:|" * len(compared)]
     for frames, other in dict.fromkeys((row["frames"], row["other"]) for row in found):
         cells = {
             (row["key"], row["split"]): f"{row['mean']:+.2f} ({row['low']:+.2f} to {row['high']:+.2f}) {row['word']}"
             for row in found
             if (row["frames"], row["other"]) == (frames, other)
         }
-        lines.append(f"| {frames:,} | {other} | {' | '.join(cells.get(column, '-') for column in columns)} |")
+        lines.append(f"| {frames:,} | {other} | {' | '.join(cells.get(column, '-') for column in compared)} |")
     return "\n".join(lines) + "\n"
+
+
+def quoted(page: Path) -> list[dict[str, Any]]:
+    """The means of the table that `markdown` wrote and `page` quotes, as `summarise` has them. Raises NeecoError."""
+    headings, *rows = table(KEYS[0], page, headings=True)
+    keys = {column.title: column.key for column in COLUMNS}
+    splits = {word: split for split, word in SPLITS.items()}
+    summary = []
+    for frames, states, name, *cells in rows:
+        row: dict[str, Any] = {"frames": int(frames.replace(",", "")), "split": splits[states], "name": name}
+        row |= {key: {"n": 0} for key in keys.values()}
+        for title, cell in zip(headings[len(KEYS) :], cells, strict=True):
+            if (mean := number(cell.split(" ± ")[0])) == mean:  # NaN where the cell has none
+                row[keys[title]] = {"n": 1, "mean": mean}
+        summary.append(row)
+    return summary
 
 
 def curves(summary: Sequence[dict[str, Any]]) -> Figure:
@@ -261,8 +279,10 @@ def run_tables(args: argparse.Namespace) -> None:
         args.output.mkdir(parents=True, exist_ok=True)
         runs = [{"name": e.name, "frames": e.frames, "seed": e.seed, "folder": str(e.folder)} for e in entries]
         write_json(args.output / OUTPUT_FILE, {"runs": runs, "summary": summary, "differences": found})
-    if args.figure is not None:
-        write(curves(summary), args.figure)
+
+
+def run_figure(args: argparse.Namespace) -> None:
+    write(curves(quoted(args.page)), args.output)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -271,12 +291,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     labels = verbs.add_parser("labels", help="mask IoU by the paper's thresholds, found by a scan")
     labels.add_argument("runs", type=Path, nargs="+", help="run folders, or folders of comparisons")
     labels.set_defaults(act=run_labels)
-    tables = verbs.add_parser("tables", help="numbers by training frames, differences, a figure")
+    tables = verbs.add_parser("tables", help="numbers by training frames, and differences")
     tables.add_argument("folders", type=Path, nargs="+", help="of `neeco compare`")
     tables.add_argument("--run", action="append", default=[], metavar="NAME=FOLDER", help="a further run")
     tables.add_argument("--output", type=Path, help=f"folder of {OUTPUT_FILE}")
-    tables.add_argument("--figure", type=Path, help="SVG (or PNG) of the curves")
     tables.set_defaults(act=run_tables)
+    figure = verbs.add_parser("figure", help="curves over training frames")
+    figure.add_argument("page", type=Path, help="Markdown with the table that `tables` prints")
+    figure.add_argument("--output", type=Path, required=True, help="SVG (or PNG)")
+    figure.set_defaults(act=run_figure)
     args = parser.parse_args(arguments)
     try:
         args.act(args)

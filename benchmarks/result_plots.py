@@ -13,21 +13,27 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from neeco.errors import NeecoError
+
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 COLOURS = ("#0f766e", "#b45309", "#6d28d9", "#64748b")
 GREY = "#808080"  # readable on light and on dark pages
 
 
-def table(first_heading: str) -> list[list[str]]:
-    """The rows of the table whose first heading is given, cells without Markdown."""
-    lines = PAGE.read_text(encoding="utf-8").splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith(f"| {first_heading} |"))
+def table(first_heading: str, page: Path = PAGE, headings: bool = False) -> list[list[str]]:
+    """The rows of the first table whose first heading is given, cells without Markdown; before them its headings, where
+    asked for. Raises NeecoError when the page has no such table."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    starts = (k for k, line in enumerate(lines) if line.startswith(f"| {first_heading} |"))
+    if (start := next(starts, None)) is None:
+        raise NeecoError(f"{page}: has no table whose first heading is {first_heading}")
     rows = []
-    for line in lines[start + 2 :]:
+    for line in lines[start:]:
         if not line.startswith("|"):
             break
-        rows.append([re.sub(r"[`*]", "", cell).strip() for cell in line.strip("|").split("|")])
-    return rows
+        rows.append([re.sub(r"[`*\\]", "", cell).strip() for cell in line.strip().strip("|").split("|")])
+    del rows[1]  # the rule
+    return rows if headings else rows[1:]
 
 
 def number(cell: str) -> float:

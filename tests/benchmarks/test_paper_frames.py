@@ -120,7 +120,7 @@ def test_differences_are_paired_by_frame_and_average_the_seeds(paper: ModuleType
     assert rows["3dgs", "test"]["mean"] == pytest.approx(0)
     text = paper.markdown(paper.summarise(entries), paper.differences(entries))
     assert "| 75 | 4dgs+dta | +0.50 (+0.50 to +0.50) before |" in text
-    assert "## 225 training frames, unseen" in text
+    assert "| 225 | unseen | 3dgs | 1.50 |" in text
 
 
 def test_the_figure_has_a_line_per_method_and_split(paper: ModuleType, tmp_path: Path) -> None:
@@ -129,7 +129,12 @@ def test_the_figure_has_a_line_per_method_and_split(paper: ModuleType, tmp_path:
         for frames in (75, 225, 2025)
         for name in ("neeco", "3dgs", "another")
     ]
-    paper.write(paper.curves(paper.summarise(entries)), tmp_path / "figure.svg")
+    page = tmp_path / "page.md"
+    page.write_text("# A page\n\n| other | table |\n|---|---|\n\n" + paper.markdown(paper.summarise(entries), []))
+    assert paper.main(["figure", str(page), "--output", str(tmp_path / "figure.svg")]) == 0
+    row = next(row for row in paper.quoted(page) if row["split"] == "unseen" and row["frames"] == 2025)
+    assert row["psnr"] == {"n": 1, "mean": 20.5}
+    assert row["mask_iou"] == {"n": 0}
     paths = ElementTree.parse(tmp_path / "figure.svg").getroot().iter("{http://www.w3.org/2000/svg}path")
     lines = [style for path in paths if path.get("clip-path") and "1.6" in (style := path.get("style", ""))]
     assert len(lines) == 3 * 6  # PSNR, in the instrument, best thresholds: nobody has labels of its own
@@ -172,6 +177,8 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
     for file in [*unfinished.glob("runs/*/evaluation.json"), *unfinished.glob("runs/*/label_scan.json")]:
         file.unlink()
     run = compared / "runs" / "3dgs-seed0"
+    no_table = tmp_path / "page.md"
+    no_table.write_text("# A page\n")
     for words, said in (
         (["tables", str(tmp_path / "nowhere")], "comparison.json"),
         (["tables", str(unfinished)], "none of its 2 runs has finished"),
@@ -180,6 +187,7 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
         (["labels", str(tmp_path / "nowhere")], "no such run folder"),
         (["tables", str(compared), "--run", "neeco"], "expected NAME=FOLDER"),
         (["tables", str(compared), "--run", f"3dgs={run}"], "is there already"),
+        (["figure", str(no_table), "--output", str(tmp_path / "x.svg")], "no table whose first heading is frames"),
     ):
         assert paper.main(words) == 1
         printed = capsys.readouterr()
