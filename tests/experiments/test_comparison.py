@@ -29,7 +29,7 @@ from neeco.experiments.comparison import (
     read_comparison,
 )
 from neeco.experiments.training_job import Budget
-from neeco.raster.devices import processor_has
+from neeco.raster.devices import fast_bfloat16
 from neeco.scene.methods import method_settings
 from neeco.settings import plain
 from neeco.training.session import GaussianSession
@@ -269,9 +269,7 @@ def test_settings_reach_the_methods_that_have_them(spec: ComparisonSpec) -> None
         for name in ("3dgs", "neeco")
     }
     assert [configs[name]["max_tissue_gaussians"] for name in configs] == [70, 70]
-    assert configs["neeco"]["deformation"] == plain(
-        method_settings("neeco", {"width": 16, "half": processor_has("amx_bf16")})
-    )
+    assert configs["neeco"]["deformation"] == plain(method_settings("neeco", {"width": 16, "half": fast_bfloat16()}))
     assert configs["3dgs"]["deformation"] == {}
     assert result["settings"] == list(given)
 

@@ -14,7 +14,7 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.devices import processor_has
+from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import Scene
 from neeco.scene.deformations.base import encode, mark_moving, otsu
 from neeco.scene.deformations.nps import NPS, NPSSettings
@@ -217,7 +217,29 @@ def test_a_processor_without_bfloat16_stays_with_float32_and_says_so(
     assert all(torch.equal(a, b) for a, b in zip(half, in_bfloat16(*small, half=False), strict=True))
 
 
+@pytest.mark.parametrize(
+    ("name", "features", "fast"),
+    [
+        ("Intel(R) Xeon(R)", ["amx_bf16", "avx512_bf16"], True),
+        ("Intel(R) Xeon(R)", ["avx512_bf16"], False),
+        ("AMD EPYC", ["avx512_bf16"], True),
+        ("AMD EPYC", ["avx2"], False),
+        (None, [], False),  # an older PyTorch, or another architecture
+    ],
+)
+def test_bfloat16_is_fast_with_tiles_and_on_amd(
+    monkeypatch: pytest.MonkeyPatch, name: str | None, features: list[str], fast: bool
+) -> None:
+    said = dict.fromkeys(features, True) | ({} if name is None else {"cpu_name": name})
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: said, raising=False)
+    processor_has.cache_clear()
+    try:
+        assert fast_bfloat16() is fast
+    finally:
+        processor_has.cache_clear()
+
+
 @pytest.mark.parametrize("method", ["neeco", "deformable-3dgs"])
-def test_networks_start_in_bfloat16_where_the_processor_has_tiles(method: str) -> None:
-    assert method_defaults(method).deformation.half is processor_has("amx_bf16")
+def test_networks_start_in_bfloat16_where_that_is_fast(method: str) -> None:
+    assert method_defaults(method).deformation.half is fast_bfloat16()
     assert not method_settings(method, {}).half  # of a run that does not say: an older one

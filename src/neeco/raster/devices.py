@@ -168,6 +168,14 @@ def processor_has(*features: str) -> bool:
     return any(bool(capabilities.get(feature)) for feature in features)
 
 
+def fast_bfloat16() -> bool:
+    """Whether the processor multiplies in bfloat16 several times as fast as in float32, as measured: with tiles (AMX)
+    3 times on an Intel Xeon, with AVX-512 BF16 alone 4 times on an AMD EPYC; that took a third longer on the Xeon."""
+    capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
+    by_amd = str(capabilities.get("cpu_name", "")).startswith("AMD")
+    return processor_has("amx_bf16") or (by_amd and processor_has("avx512_bf16"))
+
+
 @contextmanager
 def bfloat16_products(device: torch.device, wanted: bool) -> Iterator[None]:
     """Until the end of the block, let a CPU multiply in bfloat16 where `wanted`: eight bits of every factor and result,

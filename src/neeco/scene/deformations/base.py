@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
-from neeco.raster.devices import processor_has
+from neeco.raster.devices import fast_bfloat16
 from neeco.raster.types import Camera, Rendering
 from neeco.scene.articulation import Skeleton
 from neeco.scene.canonical import CanonicalGaussians
@@ -25,9 +25,7 @@ FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are sh
 MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
 STILL_MM = 1e-6  # what moves less does not move
-# how a training of a network starts: in bfloat16 where tiles (AMX) make it three times as fast on a CPU. With AVX-512
-# BF16 alone it took a third longer than float32 on an Intel Xeon
-HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": processor_has("amx_bf16")}
+HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": fast_bfloat16()}  # how a training of a network starts
 MARKING_STRIDE = 4  # recorded states between those that moving Gaussians are found from
 
 
