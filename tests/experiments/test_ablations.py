@@ -176,6 +176,9 @@ def test_every_table_compares_with_one_of_its_own_entries_and_no_run_has_two_mea
             assert len(set(labels)) == len(labels)
     variants = distinct_variants(chosen_ablations(("paper", "ours")))
     assert len({variant.name for variant in variants}) == len(variants) == 26
+    network = distinct_variants(chosen_ablations(["network"]))
+    assert {variant.method for variant in network} == {"neeco"}
+    assert all(other == variant for variant in network for other in variants if other.name == variant.name)
     published = [entry.paper for table in chosen_ablations(["paper"]) for entry in table.entries]
     assert sum(map(len, published)) == 9 + 4 * len(CHECKPOINTS) + 2
 
@@ -263,6 +266,22 @@ def test_noise_is_seeded_grows_with_its_level_and_spares_held_out_frames(capture
     assert 0.4 < float(shifts.std()) < 2
     assert 0.0005 < float(turns.square().sum((1, 2)).mean().sqrt()) < 0.02  # 0.2 degrees per axis are 0.0035 rad
     assert any(bool((one[name] != other[name]).any()) for name in one)
+
+
+def test_poses_seen_from_the_camera_stand_still_when_both_move_alike(capture: Path, tmp_path: Path) -> None:
+    recipe = Derived("from-camera", from_camera=True)
+    made = derive_capture(read_capture(capture), "transforms.json", recipe, 0, tmp_path / "made")
+    for old, new in zip(read_capture(capture).frames, read_capture(made).frames, strict=True):
+        seen = old.camera.world_from_camera @ new.state.instruments["bar"].pose.to(old.camera.world_from_camera)
+        torch.testing.assert_close(seen.double(), old.state.instruments["bar"].pose.double(), atol=1e-4, rtol=0)
+
+
+def test_a_capture_derived_before_a_field_was_there_is_kept(capture: Path, tmp_path: Path) -> None:
+    made = derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, tmp_path / "made")
+    stored = json.loads((made / "derived.json").read_text())
+    del stored["from_camera"]
+    (made / "derived.json").write_text(json.dumps(stored))
+    assert derive_capture(read_capture(capture), "transforms.json", Derived("half", 0.5), 0, made) == made
 
 
 def test_a_derived_capture_is_kept_and_another_recipe_refused(capture: Path, tmp_path: Path) -> None:

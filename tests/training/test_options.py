@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import yaml
 
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
-from neeco.scene.methods import METHODS, method_settings
+from neeco.scene.methods import METHODS, method_class, method_settings
 from neeco.training.config import (
     TrainConfig,
     config_from_dict,
@@ -33,6 +35,24 @@ def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     assert stored_config(tmp_path, read_config(tmp_path)) == config
     assert config.schedule.opacity_reset == "inverse"
     assert config.refine.cameras
+
+
+def test_a_preset_comes_before_whatever_else_is_set() -> None:
+    published = training_config("neeco", {}, ["deformation.preset=published"])
+    assert published == training_config("neeco", {})
+    practical = training_config("neeco", {}, ["deformation.preset=practical"])
+    assert practical.deformation.preset == "practical"
+    assert practical.deformation.membership
+    changed = training_config("neeco", {"iterations": 10}, ["deformation.width=64", "deformation.preset=practical"])
+    assert changed == replace(practical, iterations=10, deformation=replace(practical.deformation, width=64))
+    assert method_class("neeco").presets.keys() == set(get_args(get_type_hints(type(practical.deformation))["preset"]))
+
+
+@pytest.mark.parametrize("method", ["neeco", "kinematic"])
+def test_an_unknown_preset_is_refused(method: str) -> None:
+    said = "'fast' is none of published, practical" if method == "neeco" else "method kinematic has no such field"
+    with pytest.raises(NeecoError, match=f"deformation.preset: {said}"):
+        training_config(method, {}, ["deformation.preset=fast"])
 
 
 @pytest.mark.parametrize(

@@ -319,7 +319,7 @@ def table_of(
                 names = {"comparison": comparison.title, "label": entry.label}
                 points = [row for row in read_json_lines(folder / CURVE_FILE) if row["split"] == primary]
                 curves += [names | {key: row[key] for key in ("iteration", "progress", "psnr")} for row in points]
-    final = FINAL_SCORES if table.group == "ours" else ("psnr",)
+    final = ("psnr",) if table.group == "paper" else FINAL_SCORES
     known = dict.fromkeys(key for row in rows for key, value in row.values.items() if value is not None)
     shown = [key for key in known if key not in judged and key.partition(".")[0] in final]
     return AblationTable(table.name, table.group, table.title, table.question, judged, [*judged, *shown], rows, curves)

@@ -33,8 +33,8 @@ class AblationPlan:
     """Folder for tables, report.html and the runs."""
     tables: tuple[str, ...] = ("paper", "ours")
     """paper (density, sh-compensation, density-off, uniform-motion), ours (joints, refinement, shaft-roll, parts,
-    shadow, extrapolation, labels, frames, tracker-noise), or tables by name; kinematics, of captures that state the
-    links of an instrument, by name only."""
+    shadow, extrapolation, labels, frames, tracker-noise), or tables by name. By name only: kinematics, of captures that
+    state the links of an instrument; network, what the published network lacks, over many frames."""
     iterations: int = 1_000
     """Steps of every neeco run; the paper's schedule, stated for 20,000, is scaled to them."""
     kinematic_iterations: int | None = None
@@ -56,12 +56,14 @@ class Derived:
     """A capture made from the given one: a share of its training frames, or noise on their instrument poses.
 
     Noise: per frame, normal with `noise_mm` per axis, and a rotation of NOISE_DEGREES_PER_MM times as much about the
-    tracked origin. Held-out frames stay as they are.
+    tracked origin. Held-out frames stay as they are. `from_camera`: the instruments' poses in every frame, held-out
+    ones too, are stated in that frame's camera; only a network that takes them for numbers can be trained on it.
     """
 
     name: str
     train_share: float = 1.0
     noise_mm: float = 0.0
+    from_camera: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class Ablation:
     """
 
     name: str
-    group: Literal["paper", "ours", "links"]
+    group: Literal["paper", "ours", "links", "network"]
     title: str
     question: str
     comparisons: tuple[Comparison, ...]

@@ -1,4 +1,5 @@
-"""Captures made from a capture: fewer training frames, or noisier instrument poses. The input is never touched."""
+"""Captures made from a capture: fewer training frames, instrument poses with noise or stated in the camera. The input
+is never touched."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def derive_capture(capture: Capture, transforms: str, derived: Derived, seed: in
     recipe: dict[str, Any] = {"source": str(capture.root.absolute()), "transforms": transforms}
     recipe |= {"states_sha256": _digest(capture), "seed": seed, **asdict(derived)}
     if (path := output / RECIPE_FILE).exists():
-        stored = read_json(path)
+        stored = asdict(Derived(derived.name)) | read_json(path)  # written when there were fewer fields, perhaps
         for key, value in recipe.items():
             if stored.get(key) != value:
                 raise NeecoError(f"{path}: {key}: is {stored.get(key)!r}, not {value!r}; give another --output")
@@ -75,7 +76,17 @@ def _frames(capture: Capture, derived: Derived, seed: int) -> tuple[Frame, ...]:
         elif index in used:
             state = _with_noise(frame.state, derived.noise_mm, rng) if derived.noise_mm > 0 else frame.state
             frames.append(replace(frame, state=state))
-    return tuple(frames)
+    return tuple(map(_from_camera, frames)) if derived.from_camera else tuple(frames)
+
+
+def _from_camera(frame: Frame) -> Frame:
+    """`frame` with every instrument's pose as its camera sees it, joints as they were."""
+    camera_from_world = frame.camera.world_from_camera.double().inverse()
+    seen = {
+        name: InstrumentState(camera_from_world @ given.pose.double(), given.joints)
+        for name, given in frame.state.instruments.items()
+    }
+    return replace(frame, state=replace(frame.state, instruments=seen))
 
 
 def _with_noise(state: State, level: float, rng: np.random.Generator) -> State:

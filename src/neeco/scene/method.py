@@ -47,12 +47,14 @@ class Method:
 
     `Settings` is a frozen dataclass of its own settings (`--set deformation.NAME=VALUE`), each with a type and a
     default; its docstring describes them. `training_defaults` are fields of the training config that differ from the
-    paper's, dotted names as in `neeco train --set`.
+    paper's, dotted names as in `neeco train --set`. `presets`: sets of such fields by name, of a method whose
+    `Settings` have a field `preset`; `--set deformation.preset=NAME` sets them before all other `--set`.
     """
 
     method: ClassVar[str]
     Settings: ClassVar[type[Any]] = NoSettings
     training_defaults: ClassVar[Mapping[str, Any]] = PLAIN_TRAINING
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     needs_instruments: ClassVar[bool] = False  # without recorded states there is nothing to learn
     needs_times: ClassVar[bool] = False  # without recorded times there is nothing to learn
     learns_tissues: ClassVar[bool] = False  # several in one scene: it moves no tissue, so each Gaussian is of one

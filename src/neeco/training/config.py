@@ -211,13 +211,14 @@ def schedule_parts() -> tuple[str, ...]:
 
 def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
     """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment), changed by
-    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
+    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields). A preset of the method
+    that `assignments` name comes before all of them.
 
     Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
     variant, or one that is the method itself.
     """
     given = {field: value for field, value in values.items() if value is not None}
-    config: TrainConfig = with_fields(_variant_defaults(name), given)
+    config: TrainConfig = with_fields(_with_preset(_variant_defaults(name), assignments), given)
     _check_length(config)
     changed = config_to_dict(config)
     for assignment in assignments:
@@ -228,6 +229,16 @@ def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[
         raise NeecoError(f"--set: {error}") from None
     check_ranges(config)
     return config
+
+
+def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:
+    """`config` with the fields of the preset that `assignments` name; one that the method does not have is refused
+    where the others are read."""
+    named = (assignment.partition("=") for assignment in assignments)
+    chosen = [value for name, _, value in named if name == "deformation.preset"]
+    presets = method_class(config.method).presets
+    preset: TrainConfig = with_fields(config, presets.get(chosen[-1], {}) if chosen else {})
+    return preset
 
 
 def check_ranges(config: TrainConfig) -> None:

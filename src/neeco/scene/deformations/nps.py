@@ -49,12 +49,13 @@ SURE = 6.0  # its size at the start: 0.2 % of a motion smear what does not take 
 class NPSSettings:
     """depth, width, L_mean, L_state as published; `identity` keeps the raw inputs beside their encodings.
 
-    `state`: "full" (position, quaternion, joints) or "rotation_jaw" (the 2024 drafts: quaternion and joints).
-    `half`: hidden layers multiply in bfloat16 on a CPU that has it; a run is started with it where AMX makes it pay.
-    `chunk`: Gaussians per
-    evaluation without gradients. `warm_up`: share of the training over which the network is off; without it the first
-    steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight for good. `rate`:
-    learning rate at the start.
+    `preset`: what the fields below were set to before each was set for itself; "practical" departs from the paper.
+    `state`: "full" (position, quaternion, joints), "rotation_jaw" (the 2024 drafts: quaternion and joints) or, with
+    `membership`, which carries what poses move, "joints".
+    `half`: hidden layers multiply in bfloat16 on a CPU that has it; a run is started with it where that is fast.
+    `chunk`: Gaussians per evaluation without gradients. `warm_up`: share of the training over which the network is off;
+    without it the first steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight
+    for good. `rate`: learning rate at the start.
     `gate_mm` (None: off, as published): Gaussians farther than this from all that the instruments were recorded to
     sweep stay canonical without being evaluated.
     Not in the paper: `anneal`: share of the training over which the octaves open, coarse to fine; `carried_places`: the
@@ -63,12 +64,13 @@ class NPSSettings:
     what the network deformed is carried, and which is its label.
     """
 
+    preset: Literal["published", "practical"] = "published"
     depth: int = 12
     width: int = 256
     L_mean: int = 10
     L_state: int = 10
     identity: bool = False
-    state: Literal["full", "rotation_jaw"] = "full"
+    state: Literal["full", "rotation_jaw", "joints"] = "full"
     half: bool = False
     chunk: int = 65536
     warm_up: float = 0.075
@@ -81,6 +83,10 @@ class NPSSettings:
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
+        if self.state == "joints" and not self.membership:
+            raise NeecoError(
+                "deformation.state: joints do not tell where an instrument is; set deformation.membership=true, too"
+            )
         if not 0 <= self.anneal <= 1:
             raise NeecoError(f"deformation.anneal: {self.anneal} is not a share of the training in [0, 1]")
         if self.gate_mm is not None and not self.gate_mm > 0:
@@ -95,6 +101,19 @@ class NPS(LabelledByMotion):
     method = "neeco"
     Settings = NPSSettings
     training_defaults: ClassVar[Mapping[str, Any]] = HALF_BY_DEFAULT  # the rest is the paper's
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "published": {},
+        "practical": {
+            "deformation.preset": "practical",
+            "deformation.seeds": True,
+            "deformation.membership": True,
+            "deformation.state": "joints",
+            "deformation.L_state": 0,
+            "deformation.identity": True,
+            "deformation.depth": 6,
+            "deformation.width": 128,
+        },
+    }
     needs_instruments = True
     large_operations = True
 
@@ -153,9 +172,9 @@ class NPS(LabelledByMotion):
         nn.init.zeros_(self.head.bias)
 
     def state_size(self) -> int:
-        """Numbers in the state vector p."""
-        per_instrument = 4 if self.settings.state == "rotation_jaw" else 7
-        return sum(per_instrument + len(instrument.joints) for instrument in self.instruments)
+        """Numbers in the state vector p; at least one, which is 0 where no joint is recorded and poses do not count."""
+        per_instrument = {"full": 7, "rotation_jaw": 4, "joints": 0}[self.settings.state]
+        return max(1, sum(per_instrument + len(instrument.joints) for instrument in self.instruments))
 
     def fit_ranges(self, states: list[State], means: Tensor) -> None:
         """Normalise p by the recorded range and mu by the points' extent, both to [-1, 1]."""
@@ -169,8 +188,10 @@ class NPS(LabelledByMotion):
             self.state_center = (low + high) / 2
             self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
             if hasattr(self, "rest"):
-                middle = int(((vectors - self.state_center) / self.state_halfwidth).square().sum(1).argmin())
-                self.rest = self._poses(states[middle])
+                whole = torch.stack([self._raw_state(state, "full") for state in states])
+                low, high = whole.min(0).values, whole.max(0).values
+                from_middle = (2 * whole - low - high) / (high - low).clamp_min(2e-4)
+                self.rest = self._poses(states[int(from_middle.square().sum(1).argmin())])
         self.mean_center, self.mean_halfwidth = robust_bounds(means)
 
     def _poses(self, state: State) -> Tensor:
@@ -208,17 +229,18 @@ class NPS(LabelledByMotion):
         if self.settings.anneal > 0:
             self.opened.fill_(min(1.0, training.progress / self.settings.anneal))
 
-    def _raw_state(self, state: State) -> Tensor:
-        """p before normalisation [S]: position mm, sign-continuous quaternion, joints rad."""
-        parts = []
+    def _raw_state(self, state: State, kind: str | None = None) -> Tensor:
+        """p before normalisation [S], or the state as another `kind` has it: position mm, sign-continuous quaternion,
+        joints rad."""
+        kind, parts = kind or self.settings.state, []
         for index, instrument in enumerate(self.instruments):
             given = state_of(instrument, state)
             pose = given.pose.to(self.first_quats)
             quat = matrix_to_quat(pose[:3, :3])
             quat = torch.where((quat * self.first_quats[index]).sum() < 0, -quat, quat)
-            parts += [quat] if self.settings.state == "rotation_jaw" else [pose[:3, 3], quat]
+            parts += {"full": [pose[:3, 3], quat], "rotation_jaw": [quat], "joints": []}[kind]
             parts += [pose.new_full((1,), given.joints[name]) for name in instrument.joints]
-        return torch.cat(parts)
+        return torch.cat(parts) if parts else self.first_quats.new_zeros(1)
 
     def state_vector(self, state: State) -> Tensor:
         """p [S], each number in [-1, 1] over the recording."""
@@ -226,14 +248,14 @@ class NPS(LabelledByMotion):
 
     def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
         if not self.instruments or self.warming_up:
-            return Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
-        given = canonical.means.detach()
-        places = self._carried_places(given, state) if self.settings.carried_places else None
-        change = self._change(given, self._encoded_state(state, perturbation.state_noise), places)
-        means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
-        quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
-        scales = (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp()
-        deformed = Posed(means, quats, scales)
+            deformed = Posed(canonical.means, canonical.quats, canonical.log_scales.exp())
+        else:
+            given = canonical.means.detach()
+            places = self._carried_places(given, state) if self.settings.carried_places else None
+            change = self._change(given, self._encoded_state(state, perturbation.state_noise), places)
+            means = canonical.means + change[:, :3] * (MEAN_UNIT * self.mean_halfwidth)
+            quats = nn.functional.normalize(canonical.quats, dim=-1) + SHAPE_UNIT * change[:, 3:7]
+            deformed = Posed(means, quats, (canonical.log_scales + SHAPE_UNIT * change[:, 7:]).exp())
         return self._carried(deformed, members(canonical), state) if self.settings.membership else deformed
 
     def _motions(self, state: State) -> Tensor:
