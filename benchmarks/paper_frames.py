@@ -212,6 +212,8 @@ def markdown(summary: Sequence[dict[str, Any]], found: Sequence[dict[str, Any]])
 def quoted(page: Path) -> list[dict[str, Any]]:
     """The means of the table that `markdown` wrote and `page` quotes, as `summarise` has them. Raises NeecoError."""
     headings, *rows = table(KEYS[0], page, headings=True)
+    if tuple(headings[: len(KEYS)]) != KEYS or not {*headings[len(KEYS) :]} <= {column.title for column in COLUMNS}:
+        raise NeecoError(f"{page}: the table that begins with {KEYS[0]} is not one that `tables` printed")
     keys = {column.title: column.key for column in COLUMNS}
     splits = {word: split for split, word in SPLITS.items()}
     summary = []

@@ -179,6 +179,8 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
     run = compared / "runs" / "3dgs-seed0"
     no_table = tmp_path / "page.md"
     no_table.write_text("# A page\n")
+    other_table = tmp_path / "other.md"
+    other_table.write_text("| frames | dB |\n|---|---|\n| 75 | 20 |\n")
     for words, said in (
         (["tables", str(tmp_path / "nowhere")], "comparison.json"),
         (["tables", str(unfinished)], "none of its 2 runs has finished"),
@@ -188,6 +190,7 @@ def test_what_is_missing_or_unfinished_ends_in_one_line(
         (["tables", str(compared), "--run", "neeco"], "expected NAME=FOLDER"),
         (["tables", str(compared), "--run", f"3dgs={run}"], "is there already"),
         (["figure", str(no_table), "--output", str(tmp_path / "x.svg")], "no table whose first heading is frames"),
+        (["figure", str(other_table), "--output", str(tmp_path / "x.svg")], "is not one that `tables` printed"),
     ):
         assert paper.main(words) == 1
         printed = capsys.readouterr()

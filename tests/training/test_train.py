@@ -24,16 +24,10 @@ SMALL = {
 
 
 def config_of(method: str):
-    """`practical`: neeco so set, the search for instruments at its smallest."""
-    if method == "practical":
-        quick = ["search.tissue_steps=20", "search.long_tissue_steps=20", "search.grid=16", "search.fine_grid=16"]
-        method, more = "neeco", ["deformation.preset=practical", *quick]
-    else:
-        more = []
-    return training_config(method, {"iterations": 60}, [*SMALL.get(method, []), *more, *SHORT])
+    return training_config(method, {"iterations": 60}, [*SMALL.get(method, []), *SHORT])
 
 
-@pytest.mark.parametrize("method", ["3dgs", "neeco", "practical", "deformable-3dgs+dta", "4dgs"])
+@pytest.mark.parametrize("method", ["3dgs", "neeco", "deformable-3dgs+dta", "4dgs"])
 def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path) -> None:
     scenes = [train(capture, tmp_path / name, config_of(method)) / "scene.safetensors" for name in ("a", "b")]
     assert scenes[0].read_bytes() == scenes[1].read_bytes()
@@ -45,7 +39,7 @@ def test_two_runs_give_the_same_bytes(method: str, capture: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("method", "stop"),
     [(method, stop) for method in ("3dgs", "neeco") for stop in (10, 35, 55)]
-    + [("practical", 35), ("deformable-3dgs+dta", 35), ("4dgs+dta", 35)],
+    + [("deformable-3dgs+dta", 35), ("4dgs+dta", 35)],
 )
 def test_an_interrupted_run_ends_in_the_same_bytes(method: str, stop: int, capture: Path, tmp_path: Path) -> None:
     def interrupt(row: ProgressRow) -> None:

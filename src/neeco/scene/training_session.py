@@ -139,9 +139,8 @@ class InstrumentSearch:
     find: Callable[[ArticulatedInstruments], None]
     # bound the volume by what the carved instruments sweep
     bound: Callable[[SweptVolume], None]
-    # carve every instrument: points [P, 3] mm on it, in its own frame, and its shaft's radius, mm; None where that
-    # cannot be trusted
-    carve: Callable[[], Sequence[tuple[Tensor, float]] | None]
+    # carve every instrument: points [P, 3] mm on it, in its own frame, and its shaft's radius, mm
+    carve: Callable[[], Sequence[tuple[Tensor, float]]]
     # find where each shaft ends and the wrist begins
     place_wrists: Callable[[ArticulatedInstruments], None]
     # find it again, and move a wrist where spinning the shaft behind it costs no more than before

@@ -206,8 +206,8 @@ class NPS(LabelledByMotion):
     def begin(self, training: GaussianTraining) -> None:
         if self.gate is not None:
             training.instruments.bound(self.gate)
-        if self.settings.seeds and (found := training.instruments.carve()) is not None:
-            training.scene.canonical = self._with_seeds(training.scene.canonical, found)
+        if self.settings.seeds:
+            training.scene.canonical = self._with_seeds(training.scene.canonical, training.instruments.carve())
 
     def _with_seeds(self, canonical: CanonicalGaussians, found: Sequence[tuple[Tensor, float]]) -> CanonicalGaussians:
         """`canonical` with Gaussians on the carved instruments, given as points [P, 3] mm in each one's frame and the

@@ -47,7 +47,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     `articulated` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame:
     its poses do not match the images.
     """
-    scene, report, search = session.scene, session.report, session.config.search
+    scene, report = session.scene, session.report
     if not scene.instruments:
         return
     report("looking for the instruments: fitting the tissue alone")
@@ -58,14 +58,7 @@ def find_instruments(session: GaussianSession, articulated: ArticulatedInstrumen
     generator = torch.Generator().manual_seed(session.config.seed)
     bodies = [scene.canonical]
     for index, instrument in enumerate(scene.instruments):
-        shape = carve(evidence, instrument.name, generator, search)
-        if shape is None:
-            raise NeecoError(
-                f"instrument {instrument.name!r}: nothing in the images moves with its recorded pose; check that its "
-                "poses are in the cameras' world frame and in mm (`neeco check`), or train with --method neeco"
-            )
-        if not moves_with_pose(session, evidence, instrument.name, shape):
-            shape = shape_around_frame(shape, evidence.distance, search.seeds, generator)
+        shape = carved_shape(session, evidence, instrument.name, generator)
         articulation = articulated.articulations[index]
         if isinstance(articulation, StatedLinks):
             shape = along_links(session, articulation, evidence, instrument.name, shape, generator)
@@ -92,9 +85,15 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
     """
     scene, views, report = session.scene, session.views, session.report
     report("looking for the instruments, to bound where the network is evaluated")
-    shapes = carve_instruments(session, "the network is evaluated everywhere")
-    if shapes is None:
-        return
+    evidence = tissue_evidence(scene, views, session.config)
+    generator = torch.Generator().manual_seed(session.config.seed)
+    shapes = []
+    for instrument in scene.instruments:
+        shape = carve(evidence, instrument.name, generator, session.config.search)
+        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
+            report(f"warning: {instrument.name}: its shape cannot be carved; the network is evaluated everywhere")
+            return
+        shapes.append(shape)
     swept = []
     for instrument, shape in zip(scene.instruments, shapes, strict=True):
         recorded = [frame.state.instruments[instrument.name].pose.float() for frame in views.frames]
@@ -110,27 +109,30 @@ def bound_volume(session: GaussianSession, volume: SweptVolume) -> None:
     report(f"the network is evaluated on {int(inside.sum())} of {len(inside)} Gaussians")
 
 
-def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]] | None:
-    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm; None, with a warning, where
-    carving cannot be trusted."""
+def carve_seeds(session: GaussianSession) -> list[tuple[Tensor, float]]:
+    """Points [P, 3] mm on every instrument in its own frame, and its shaft's radius, mm. Raises NeecoError as
+    `find_instruments` does."""
     session.report("looking for the instruments, on which Gaussians begin")
-    shapes = carve_instruments(session, "no Gaussian begins on an instrument")
-    return None if shapes is None else [(shape.seeds, shape.radius) for shape in shapes]
-
-
-def carve_instruments(session: GaussianSession, otherwise: str) -> list[CarvedShape] | None:
-    """The shape of every instrument; None, with a warning that says what happens `otherwise`, where one cannot be
-    trusted."""
     evidence = tissue_evidence(session.scene, session.views, session.config)
     generator = torch.Generator().manual_seed(session.config.seed)
-    shapes = []
-    for instrument in session.scene.instruments:
-        shape = carve(evidence, instrument.name, generator, session.config.search)
-        if shape is None or not moves_with_pose(session, evidence, instrument.name, shape):
-            session.report(f"warning: {instrument.name}: its shape cannot be carved; {otherwise}")
-            return None
-        shapes.append(shape)
-    return shapes
+    names = [instrument.name for instrument in session.scene.instruments]
+    shapes = [carved_shape(session, evidence, name, generator) for name in names]
+    return [(shape.seeds, shape.radius) for shape in shapes]
+
+
+def carved_shape(session: GaussianSession, evidence: Evidence, name: str, generator: torch.Generator) -> CarvedShape:
+    """The carved shape, or what of it is around the instrument's frame where the rest may be static parts of the scene.
+    Raises NeecoError when there is nothing."""
+    search = session.config.search
+    shape = carve(evidence, name, generator, search)
+    if shape is None:
+        raise NeecoError(
+            f"instrument {name!r}: nothing in the images moves with its recorded pose; check that its poses are in the "
+            "cameras' world frame and in mm (`neeco check`), or train with --method neeco as published"
+        )
+    if moves_with_pose(session, evidence, name, shape):
+        return shape
+    return shape_around_frame(shape, evidence.distance, search.seeds, generator)
 
 
 def moves_with_pose(session: GaussianSession, evidence: Evidence, name: str, shape: CarvedShape) -> bool:

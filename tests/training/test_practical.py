@@ -1,0 +1,53 @@
+"""The practical preset of `neeco` from recorded images to labels: it begins on the instrument or says why not."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import write_grasper
+
+from neeco.errors import NeecoError
+from neeco.training.config import training_config
+from neeco.training.run import load_run
+from neeco.training.train import ProgressRow, train
+
+SHORT = ["density_start=10", "log_interval=1", "checkpoint_interval=20", "search.tissue_steps=100"]
+SMALL = ["deformation.preset=practical", "deformation.width=16", "deformation.depth=2", *SHORT]
+CONFIG = training_config("neeco", {"iterations": 60}, SMALL)
+
+
+@pytest.fixture(scope="module")
+def grasper(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_grasper(tmp_path_factory.mktemp("grasper") / "capture", sizes=((80, 64), (64, 72)))
+
+
+def test_runs_repeat_and_resume_and_label_what_moves(grasper: Path, tmp_path: Path) -> None:
+    def interrupt(row: ProgressRow) -> None:
+        if row.iteration == 35 and not row.note:
+            raise KeyboardInterrupt
+
+    first, second = (train(grasper, tmp_path / name, CONFIG) for name in ("first", "second"))
+    with pytest.raises(KeyboardInterrupt):
+        train(grasper, tmp_path / "cut", CONFIG, progress=interrupt)
+    cut = train(grasper, tmp_path / "cut", CONFIG, resume=True)
+    written = {path.name: (path / "scene.safetensors").read_bytes() for path in (first, second, cut)}
+    assert len(set(written.values())) == 1
+    scene = load_run(first).scene
+    moved = scene.deltas(scene.recorded.states[0]).means.norm(dim=1)
+    channels = scene.deformation.label_channels(scene.canonical)[:, 0]
+    assert 0 < int((channels > 0.5).sum()) < len(channels)
+    assert float(moved[channels > 0.5].median()) > 5 * float(moved[channels < 0.5].median())
+
+
+def test_a_recording_in_which_nothing_moves_with_the_poses_is_refused(grasper: Path, tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    shutil.copytree(grasper, capture)
+    for path in (capture / "images").iterdir():
+        cv2.imwrite(str(path), np.full_like(cv2.imread(str(path)), 128))
+    with pytest.raises(NeecoError, match="nothing in the images moves with its recorded pose") as raised:
+        train(capture, tmp_path / "run", CONFIG)
+    assert "\n" not in str(raised.value)
