@@ -57,7 +57,8 @@ class Derived:
 
     Noise: per frame, normal with `noise_mm` per axis, and a rotation of NOISE_DEGREES_PER_MM times as much about the
     tracked origin. Held-out frames stay as they are. `from_camera`: the instruments' poses in every frame, held-out
-    ones too, are stated in that frame's camera; only a network that takes them for numbers can be trained on it.
+    ones too, are as that frame's camera sees them, stated as if it stood where the first frame's does; only a network
+    that takes them for numbers can be trained on it.
     """
 
     name: str

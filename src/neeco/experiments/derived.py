@@ -76,14 +76,14 @@ def _frames(capture: Capture, derived: Derived, seed: int) -> tuple[Frame, ...]:
         elif index in used:
             state = _with_noise(frame.state, derived.noise_mm, rng) if derived.noise_mm > 0 else frame.state
             frames.append(replace(frame, state=state))
-    return tuple(map(_from_camera, frames)) if derived.from_camera else tuple(frames)
+    return tuple(_seen_from(frames[0], frame) for frame in frames) if derived.from_camera else tuple(frames)
 
 
-def _from_camera(frame: Frame) -> Frame:
-    """`frame` with every instrument's pose as its camera sees it, joints as they were."""
-    camera_from_world = frame.camera.world_from_camera.double().inverse()
+def _seen_from(first: Frame, frame: Frame) -> Frame:
+    """`frame` with the instruments' poses as its camera sees them, stated as if that stood where `first`'s does."""
+    moved = first.camera.world_from_camera.double() @ frame.camera.world_from_camera.double().inverse()
     seen = {
-        name: InstrumentState(camera_from_world @ given.pose.double(), given.joints)
+        name: InstrumentState(moved @ given.pose.double(), given.joints)
         for name, given in frame.state.instruments.items()
     }
     return replace(frame, state=replace(frame.state, instruments=seen))
