@@ -104,7 +104,6 @@ class NPS(LabelledByMotion):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "practical": {
-            "deformation.preset": "practical",
             "deformation.seeds": True,
             "deformation.membership": True,
             "deformation.state": "joints",
@@ -184,14 +183,12 @@ class NPS(LabelledByMotion):
                 [matrix_to_quat(first[i.name].pose[:3, :3]) for i in self.instruments]
             ).float()
             vectors = torch.stack([self._raw_state(state) for state in states])
-            low, high = vectors.min(0).values, vectors.max(0).values
-            self.state_center = (low + high) / 2
-            self.state_halfwidth = ((high - low) / 2).clamp_min(1e-4)
+            self.state_center, self.state_halfwidth = _ranges(vectors)
             if hasattr(self, "rest"):
                 whole = torch.stack([self._raw_state(state, "full") for state in states])
-                low, high = whole.min(0).values, whole.max(0).values
-                from_middle = (2 * whole - low - high) / (high - low).clamp_min(2e-4)
-                self.rest = self._poses(states[int(from_middle.square().sum(1).argmin())])
+                center, halfwidth = _ranges(whole)
+                middle = int(((whole - center) / halfwidth).square().sum(1).argmin())
+                self.rest = self._poses(states[middle])
         self.mean_center, self.mean_halfwidth = robust_bounds(means)
 
     def _poses(self, state: State) -> Tensor:
@@ -338,6 +335,12 @@ class NPS(LabelledByMotion):
         return dict.fromkeys(
             (name for name, _ in self.named_parameters()), self.settings.rate * floored_decay(progress)
         )
+
+
+def _ranges(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre and half width [S] of what vectors [F, S] cover."""
+    low, high = vectors.min(0).values, vectors.max(0).values
+    return (low + high) / 2, ((high - low) / 2).clamp_min(1e-4)
 
 
 def members(canonical: CanonicalGaussians) -> Tensor:
