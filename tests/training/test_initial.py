@@ -12,7 +12,7 @@ from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, Stat
 from neeco.errors import NeecoError
 from neeco.raster.rotations import rigid_from_vector
 from neeco.training.config import TrainConfig
-from neeco.training.initial import moving_joints
+from neeco.training.initial import hinge_joints, moving_joints
 
 ARM = Instrument("arm", {"insertion": None, "jaw": (0.0, 1.0), "stuck": None})
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 50.0, 50.0, 20.0, 16.0, 40, 32)
@@ -47,3 +47,12 @@ def test_joints_that_are_asked_for_are_taken_as_given() -> None:
 def test_a_joint_that_is_not_there_is_refused_by_name() -> None:
     with pytest.raises(NeecoError, match="--joints: arm has no joint 'jow'; it has insertion, jaw, stuck"):
         moving_joints(ARM, frames(), TrainConfig(joints=("jow",)), print)
+
+
+def test_several_joints_without_kinematics_are_hinges_with_a_warning_and_prismatic_ones_are_left_out() -> None:
+    wristed = Instrument("arm", {"insertion": None, "jaw": (0.0, 1.0), "stuck": None, "rod_mm": None})
+    told: list[str] = []
+    assert hinge_joints(wristed, ("jaw", "stuck"), frames(), told.append) == ("jaw", "stuck")
+    assert told == []  # one joint moves
+    assert hinge_joints(wristed, ("insertion", "jaw", "rod_mm"), frames(), told.append) == ("insertion", "jaw")
+    assert ["rod_mm is prismatic" in told[0], "insertion, jaw: several joints and no kin" in told[1]] == [True, True]

@@ -20,13 +20,17 @@ from neeco.scene.scene import Scene
 from neeco.scene.training_session import InstrumentSearch, Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
-from neeco.training.instruments.chains import find_trees
 from neeco.training.instruments.discovery import bound_volume, carve_seeds, find_instruments
 from neeco.training.instruments.finish import conclude
+from neeco.training.instruments.hinge_search import MIN_READING_RANGE
 from neeco.training.instruments.label_shares import store_label_shares
 from neeco.training.instruments.shadow import find_shadow
 from neeco.training.instruments.wrist import place_wrists, replace_wrists
 from neeco.training.session import GaussianSession, new_session
+
+STATE_LINKS = (
+    "state its links (`kinematics`, from a ruler and a protractor, a dVRK tool file or a URDF: docs/capture.md)"
+)
 
 
 def begin_session(
@@ -39,7 +43,7 @@ def begin_session(
         return method.session(capture, views, config.deformation, config.length, config.seed, scene)
     is_new = scene is None
     if scene is None:
-        scene = _with_trees(capture, initial_scene(capture, views.frames, config, report), views, config, report)
+        scene = initial_scene(capture, views.frames, config, report)
     assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
@@ -57,20 +61,6 @@ def begin_session(
         scene.deformation.begin(session)
     session.start()
     return session
-
-
-def _with_trees(capture: Capture, scene: Scene, views: TrainingViews, config: TrainConfig, report: Report) -> Scene:
-    """`scene`, a new one, or where several joints move an instrument whose axes nobody stated, one with the kinematic
-    trees that the images show."""
-    if config.joints is not None or not getattr(config.deformation, "kinematics", False):
-        return scene
-    session = new_session(scene.to(views.device), views, config, report)
-    found = find_trees(session)
-    if found is None:
-        return scene
-    again = initial_scene(replace(capture, instruments=found), views.frames, config, lambda text: None)
-    again.diagnostics |= session.scene.diagnostics
-    return again
 
 
 def _searching(session: GaussianSession, search: Callable[..., Any], as_learned: bool = False) -> Callable[..., Any]:
@@ -141,11 +131,12 @@ def _learned_instrument(
     """The instrument with the joints that are learned: those of stated kinematics, where the method takes such and no
     `config.joints` are asked for, else those that may move something (`moving_joints`)."""
     tree = instrument.kinematics
-    if tree is None or config.joints is not None or not getattr(config.deformation, "kinematics", False):
-        return Instrument(
-            instrument.name,
-            {joint: instrument.joints[joint] for joint in moving_joints(instrument, frames, config, report)},
-        )
+    stated = getattr(config.deformation, "kinematics", False)
+    if tree is None or config.joints is not None or not stated:
+        joints = moving_joints(instrument, frames, config, report)
+        if stated and config.joints is None:
+            joints = hinge_joints(instrument, joints, frames, report)
+        return Instrument(instrument.name, {joint: instrument.joints[joint] for joint in joints})
     if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
         raise NeecoError(
             f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
@@ -154,6 +145,25 @@ def _learned_instrument(
     unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
     joints = {reading: instrument.joints[reading] for reading in tree.readings}
     return replace(instrument, joints=joints, unrecorded=unrecorded)
+
+
+def hinge_joints(
+    instrument: Instrument, joints: tuple[str, ...], frames: tuple[Frame, ...], report: Report
+) -> tuple[str, ...]:
+    """Those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic joints, and
+    of several that move, for which this is the wrong model."""
+    for joint in joints:
+        if instrument.slides(joint):
+            report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
+    turning = tuple(joint for joint in joints if not instrument.slides(joint))
+    states = [frame.state.instruments[instrument.name] for frame in frames]
+    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > MIN_READING_RANGE]
+    if len(used) > 1:
+        report(
+            f"warning: {instrument.name}: {', '.join(used)}: several joints and no kinematics; each is learned as a "
+            f"hinge across the shaft, which fits jaws but no wrist; {STATE_LINKS}"
+        )
+    return turning
 
 
 def moving_joints(
