@@ -41,6 +41,7 @@ from neeco.errors import NeecoError
 from neeco.experiments.machine import machine
 from neeco.experiments.training_job import Budget, TrainingJob
 from neeco.files import write_json, write_text
+from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster import Camera, Gaussians, rasterize
 from neeco.raster.devices import device_of, readable_failures
 from neeco.raster.losses import photometric_loss
@@ -48,8 +49,7 @@ from neeco.raster.native import synchronise
 from neeco.raster.optimizer import adam_step
 from neeco.raster.triton import ready
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 from neeco.training.config import training_config

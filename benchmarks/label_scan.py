@@ -34,7 +34,7 @@ from neeco.labels.labellers import (
 )
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene import Scene
-from neeco.scene.deformations.base import Deltas, LabelledByMotion
+from neeco.scene.deformation import Deltas, LabelledByMotion
 from neeco.training.run import open_run
 
 SCAN_FILE, SCAN_SCHEMA = "label_scan.json", "neeco-label-scan/1"

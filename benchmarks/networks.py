@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Instrument
+from neeco.methods.nps import NPS
+from neeco.methods.time_mlp import TimeMLP
 from neeco.raster.native import keep_freed_memory, torch_threads
-from neeco.scene.deformations.nps import NPS
-from neeco.scene.deformations.time_mlp import TimeMLP
 
 INSTRUMENT = Instrument("scissors", {"jaw_angle": None})
 

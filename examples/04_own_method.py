@@ -17,8 +17,8 @@ from torch import nn
 import neeco
 from neeco.capture.model import State
 from neeco.scene.canonical import CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, Posed, log_linear
-from neeco.scene.methods import add_method
+from neeco.scene.deformation import UNPERTURBED, Deformation, Perturbation, Posed, log_linear
+from neeco.scene.method_registry import add_method
 
 SAMPLE = Path(__file__).parents[1] / "samples" / "liver-mini"
 

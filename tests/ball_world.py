@@ -9,9 +9,9 @@ import torch
 from rod_world import CAMERA, WALL_MM, FakeRun
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.methods.kinematic.articulation import LINK_LOGITS
+from neeco.methods.kinematic.deformation import Kinematic
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.deformations.kinematic import Kinematic
 from neeco.scene.io import save_scene
 
 RADIUS = 6.0  # mm, of a ball

@@ -15,7 +15,7 @@ from torch import Tensor
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
+from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation, Posed
 
 WALL_MM = 100.0
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)

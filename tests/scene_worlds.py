@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.methods.kinematic.articulation import LINK_LOGITS
+from neeco.methods.nerfies.field import NerfiesSettings, NerfScene
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.methods import make_deformation, method_settings
-from neeco.scene.nerfies.field import NerfiesSettings, NerfScene
+from neeco.scene.method_registry import make_deformation, method_settings
 
 TISSUE, INSTRUMENT = 20, 40
 GRASPER = Instrument("grasper", {"jaw_angle": (0.0, 1.5)})

@@ -17,6 +17,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("tracking",),
     ("evaluation",),
     ("labels",),
+    ("methods",),
     ("training",),
     ("scene",),
     ("ingest",),

@@ -14,12 +14,12 @@ from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
 from neeco.capture.writer import write_capture
 from neeco.labels.drawing import draw
+from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
 from neeco.scene.drawable import Learned
 from neeco.scene.io import save_scene
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import TrainConfig
 from neeco.training.run import write_config
 

@@ -8,9 +8,9 @@ from scene_worlds import CAMERA, TISSUE, pose_of, random_canonical
 
 from neeco.capture.kinematics import PRISMATIC, REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.scene import Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 
 X, Y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
 READINGS = {"pitch": 0.4, "yaw": -0.3, "jaw": 0.5}

@@ -1,9 +1,10 @@
-"""What the files of a folder define: to add one of a kind is to add a file."""
+"""Plug-ins: classes that the modules of one of our packages define, and entry points of installed packages."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from importlib.metadata import entry_points
 from types import ModuleType
 from typing import TypeVar
 
@@ -12,26 +13,53 @@ from neeco.errors import NeecoError
 T = TypeVar("T")
 
 
-def named_classes(base: type[T], attribute: str, *packages: ModuleType) -> dict[str, type[T]]:
-    """Every class of `base` that a public module of the packages defines, by the name under its own `attribute`.
+def plugins(base: type[T], attribute: str, package: str) -> dict[str, type[T]]:
+    """Every class of `base` with its own `attribute`, by the name under it: those of the public modules and packages in
+    `package`, and those of entry points in the group `package`. Sorted by name.
+
+    Raises NeecoError when two share a name, or an entry point cannot be loaded.
+    """
+    found = named_classes(base, attribute, importlib.import_module(package))
+    for point in entry_points(group=package):
+        try:
+            kind = point.load()
+        except Exception as error:  # another's code: whatever it raises, the user has to know whose it is
+            raise NeecoError(
+                f"{point.value}: entry point of {_owner(point.dist)} in {package} cannot be loaded "
+                f"({type(error).__name__}: {error}); update or uninstall it"
+            ) from None
+        if not (isinstance(kind, type) and issubclass(kind, base) and attribute in vars(kind)):
+            raise NeecoError(
+                f"{point.value}: entry point of {_owner(point.dist)} in {package} is no {base.__name__} with a "
+                f"`{attribute}`; update or uninstall it"
+            )
+        _add(found, getattr(kind, attribute), kind, attribute)
+    return dict(sorted(found.items()))
+
+
+def named_classes(base: type[T], attribute: str, package: ModuleType) -> dict[str, type[T]]:
+    """Every class of `base` that a public module of the package defines, or a public package in it offers as its own,
+    by the name under its own `attribute`.
 
     Sorted by name. Raises NeecoError when two share one.
     """
     found: dict[str, type[T]] = {}
-    for package in packages:
-        for entry in pkgutil.iter_modules(package.__path__):
-            if entry.name.startswith("_"):
-                continue
-            module = importlib.import_module(f"{package.__name__}.{entry.name}")
-            for kind in vars(module).values():
-                named = isinstance(kind, type) and issubclass(kind, base) and attribute in vars(kind)
-                if not named or kind.__module__ != module.__name__:
-                    continue
-                name = getattr(kind, attribute)
-                if name in found:
-                    other = found[name].__module__
-                    raise NeecoError(
-                        f"{module.__name__}: {attribute} {name!r} is also in {other}; give it another name"
-                    )
-                found[name] = kind
+    for entry in pkgutil.iter_modules(package.__path__):
+        if entry.name.startswith("_"):
+            continue
+        module = importlib.import_module(f"{package.__name__}.{entry.name}")
+        for kind in vars(module).values():
+            named = isinstance(kind, type) and issubclass(kind, base) and attribute in vars(kind)
+            if named and f"{kind.__module__}.".startswith(f"{module.__name__}."):
+                _add(found, getattr(kind, attribute), kind, attribute)
     return dict(sorted(found.items()))
+
+
+def _add(found: dict[str, type[T]], name: str, kind: type[T], attribute: str) -> None:
+    if (other := found.get(name, kind)) is not kind:
+        raise NeecoError(f"{kind.__module__}: {attribute} {name!r} is also in {other.__module__}; give it another name")
+    found[name] = kind
+
+
+def _owner(distribution: object) -> str:
+    return getattr(distribution, "name", "an installed package")

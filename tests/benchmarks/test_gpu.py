@@ -123,7 +123,7 @@ def test_training_and_synthesis_are_timed_too(device: str, quick: ModuleType, tm
         "--iterations",
         "4",
         "--set",
-        "search.tissue_steps=5",
+        "deformation.carving.tissue_steps=5",
         "--synthesize",
         str(run),
         "--count",

@@ -20,7 +20,7 @@ from neeco.capture.writer import write_capture
 from neeco.experiments.comparison import ComparisonSpec, compare, plan_comparison
 from neeco.experiments.training_job import Budget
 from neeco.labels.labellers import DeltaThresholds
-from neeco.scene.deformations.base import Deltas
+from neeco.scene.deformation import Deltas
 
 SMALL = ("deformation.width=8", "deformation.depth=2", "deformation.warm_up=0")
 

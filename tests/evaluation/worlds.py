@@ -13,9 +13,9 @@ from torch import Tensor
 
 from neeco.capture.images import write_image, write_labels
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.methods.static import Static
 from neeco.raster import Camera, Gaussians, Rendering, rasterize
 from neeco.scene import Recorded
-from neeco.scene.deformations.static import Static
 
 WIDTH, HEIGHT = 48, 40
 

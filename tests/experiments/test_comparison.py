@@ -30,7 +30,7 @@ from neeco.experiments.comparison import (
 )
 from neeco.experiments.training_job import Budget
 from neeco.raster.devices import fast_bfloat16
-from neeco.scene.methods import method_settings
+from neeco.scene.method_registry import method_settings
 from neeco.settings import plain
 from neeco.training.session import GaussianSession
 

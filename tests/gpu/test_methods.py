@@ -17,16 +17,16 @@ from viewer_world import grasper_scene, write_recorded_images
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
+from neeco.methods.nerfies.field import Rays
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.scene.methods import METHODS
-from neeco.scene.nerfies.field import Rays
+from neeco.scene.method_registry import methods
 from neeco.scene.scene import Scene
 from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
-OF_GAUSSIANS = [name for name, kind in METHODS.items() if kind.has_gaussians]
+OF_GAUSSIANS = [name for name, kind in methods().items() if kind.has_gaussians]
 STEPS = 40
 SMALL = {
     "neeco": ["deformation.width=16"],
@@ -38,7 +38,7 @@ SMALL = {
     ],
     # all that a long run does happens within 40 iterations
     "kinematic": [
-        "search.tissue_steps=60",
+        "deformation.carving.tissue_steps=60",
         "density_start=10",
         "refine.start=8",
         "schedule.plain_density.interval=15",
@@ -118,7 +118,7 @@ def config_of(method: str) -> TrainConfig:
 
 
 @slowly
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", methods())
 def test_a_method_learns_there_as_well_as_here(
     method: str, device: torch.device, capture: Path, tmp_path: Path
 ) -> None:
@@ -133,7 +133,7 @@ def test_a_method_learns_there_as_well_as_here(
 def test_an_instrument_is_found_there_and_an_interrupted_run_goes_on(device: torch.device, tmp_path: Path) -> None:
     """Carving, the search for the hinge, its wrist and the shadow; on the CPU with the same bits."""
     capture = write_grasper(tmp_path / "capture", sizes=((80, 64), (64, 72)))
-    settings = [*SMALL["kinematic"], "search.tissue_steps=100", "log_interval=1"]
+    settings = [*SMALL["kinematic"], "deformation.carving.tissue_steps=100", "log_interval=1"]
     config = training_config("kinematic", {"iterations": STEPS}, settings)
 
     def interrupt(row: ProgressRow) -> None:

@@ -179,7 +179,7 @@ def test_otsu_falls_between_two_clusters_orders_of_magnitude_apart():
 
 
 def test_a_scene_that_does_not_move_cannot_be_labelled_by_threshold(scene, monkeypatch):
-    from neeco.scene.deformations.base import Deltas
+    from neeco.scene.deformation import Deltas
 
     count = len(scene.canonical)
     still = Deltas(torch.zeros(count, 3), torch.zeros(count, 4), torch.zeros(count, 3))

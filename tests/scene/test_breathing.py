@@ -12,9 +12,9 @@ from safetensors.torch import save_file
 from scene_worlds import TISSUE, grasper_state, make_scene, pose_of
 
 from neeco.errors import NeecoError
+from neeco.methods.breathing import HARMONICS, Breathing
 from neeco.raster.types import Camera
 from neeco.scene import Scene
-from neeco.scene.breathing import HARMONICS, Breathing
 from neeco.scene.io import load_scene, save_scene
 
 CAMERAS = [

@@ -13,8 +13,8 @@ from scene_worlds import GRASPER, grasper_state, pose_of, random_canonical
 
 from neeco.capture.model import Instrument, State
 from neeco.errors import NeecoError
-from neeco.scene.deformations.base import Posed
-from neeco.scene.deformations.nps import MEMBER_LOGITS, NPS, SURE, NPSSettings, members
+from neeco.methods.nps import MEMBER_LOGITS, NPS, SURE, NPSSettings, members
+from neeco.scene.deformation import Posed
 
 
 def state(k: int) -> State:

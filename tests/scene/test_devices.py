@@ -14,18 +14,18 @@ import torch
 from scene_worlds import CAMERA, make_nerf, make_scene
 from torch import Tensor
 
+from neeco.methods import hexplane, nps, time_mlp
+from neeco.methods.nerfies import field
+from neeco.methods.nerfies.field import Rays
+from neeco.methods.nerfies.session import elastic_loss, geman_mcclure
 from neeco.raster import rasterize
 from neeco.raster.losses import photometric_loss
-from neeco.scene.deformations import hexplane, nps, time_mlp
-from neeco.scene.deformations.base import UNPERTURBED, Perturbation
-from neeco.scene.methods import METHODS
-from neeco.scene.nerfies import field
-from neeco.scene.nerfies.field import Rays
-from neeco.scene.nerfies.session import elastic_loss, geman_mcclure
+from neeco.scene.deformation import UNPERTURBED, Perturbation
+from neeco.scene.method_registry import methods
 from neeco.scene.scene import Scene
 
 META = torch.device("meta")
-OF_GAUSSIANS = [name for name, kind in METHODS.items() if kind.has_gaussians]
+OF_GAUSSIANS = [name for name, kind in methods().items() if kind.has_gaussians]
 
 
 def all_meta(*tensors: Tensor | None) -> bool:

@@ -11,7 +11,7 @@ from neeco.capture.model import State
 from neeco.raster.types import Camera
 from neeco.scene.canonical import SH_C0, CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.scene.scene import Scene
 from neeco.scene.visibility import EXTRAPOLATED, count_views, extrapolate_tissue, outside_all_views
 

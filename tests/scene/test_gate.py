@@ -12,11 +12,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scene_worlds import GRASPER, grasper_state, make_scene, pose_of, random_canonical, rounding
 
 from neeco.errors import NeecoError
+from neeco.methods.nps import NPS, NPSSettings
+from neeco.methods.swept_volume import SweptVolume
 from neeco.scene import Scene
-from neeco.scene.deformations.base import mark_moving
-from neeco.scene.deformations.nps import NPS, NPSSettings
+from neeco.scene.deformation import mark_moving
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.swept_volume import SweptVolume
 
 MARGIN_MM = 4.0
 

@@ -13,10 +13,10 @@ from scene_worlds import SURE, TISSUE, grasper_state, pose_of
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.methods.kinematic.articulation import LINK_LOGITS
+from neeco.methods.kinematic.deformation import Kinematic, Spin
 from neeco.raster.rotations import quat_to_matrix, rotate_about
 from neeco.scene import Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.deformations.kinematic import Kinematic, Spin
 
 POSE = pose_of(0.5, -0.2, 0.9, 10, -4, 70)
 UNIT = torch.nn.functional.normalize

@@ -12,9 +12,7 @@ from torch import Tensor
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
-from neeco.raster.rotations import skew
-from neeco.scene.drawable import Recorded
-from neeco.scene.nerfies.field import (
+from neeco.methods.nerfies.field import (
     PUBLISHED,
     NerfiesSettings,
     NerfScene,
@@ -26,7 +24,9 @@ from neeco.scene.nerfies.field import (
     octave_weights,
     stratified_depths,
 )
-from neeco.scene.nerfies.session import elastic_loss, geman_mcclure
+from neeco.methods.nerfies.session import elastic_loss, geman_mcclure
+from neeco.raster.rotations import skew
+from neeco.scene.drawable import Recorded
 from neeco.scene.scene import gaussian_scene
 
 

@@ -14,11 +14,11 @@ from scene_worlds import GRASPER, TISSUE, grasper_state, pose_of, random_canonic
 
 from neeco.capture.model import InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import Scene
-from neeco.scene.deformations.base import encode, mark_moving, otsu
-from neeco.scene.deformations.nps import NPS, NPSSettings
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.deformation import encode, mark_moving, otsu
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import method_defaults
 
 

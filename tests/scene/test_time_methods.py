@@ -17,11 +17,11 @@ from scene_worlds import GRASPER, SMALL, TISSUE, grasper_state, make_scene, pose
 
 from neeco.capture.model import State
 from neeco.errors import NeecoError
+from neeco.methods.hexplane import HexPlane, HexPlaneSettings
+from neeco.methods.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
 from neeco.scene import Scene
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Perturbation, mark_moving
-from neeco.scene.deformations.hexplane import HexPlane, HexPlaneSettings
-from neeco.scene.deformations.time_mlp import NoisyTime, TimeMLP, TimeMLPSettings, octaves
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.deformation import UNPERTURBED, Deformation, Perturbation, mark_moving
+from neeco.scene.method_registry import make_deformation, method_settings
 
 METHODS = ("deformable-3dgs", "4dgs")
 

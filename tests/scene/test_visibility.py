@@ -14,7 +14,7 @@ from neeco.raster import rasterize
 from neeco.raster.types import Camera
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.scene.scene import Scene
 from neeco.scene.visibility import DIRECTIONS, EXTRAPOLATED, measure_visibility
 

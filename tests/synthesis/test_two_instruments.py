@@ -10,7 +10,7 @@ from neeco.labels.annotation import annotate
 from neeco.labels.drawing import draw_layers
 from neeco.labels.labellers import LABEL_THRESHOLD, CompositedLabels, ThresholdLabels
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
+from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
 from neeco.synthesis.states import InterpolatedStates
 
 WALL, BAR = 300, 40

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, PointCloud, State
+from neeco.methods.kinematic.articulation import LINK_LOGITS
 from neeco.raster.types import Camera
 from neeco.scene import CanonicalGaussians, Recorded, Scene
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.methods import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_settings
 from neeco.training.config import config_to_dict, method_defaults
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), fx=90.0, fy=90.0, cx=48.0, cy=32.0, width=96, height=64)

@@ -14,14 +14,15 @@ import pytest
 import torch
 from capture_files import write_capture
 
+import neeco.methods
 from neeco.capture.images import write_image
 from neeco.capture.model import Capture, Frame, PointCloud, State
 from neeco.capture.writer import write_capture as write_folder
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.raster import Camera, Gaussians, rasterize
-from neeco.scene import deformations, methods
 from neeco.scene.io import load_scene
+from neeco.scene.method_registry import methods
 from neeco.settings import plain
 from neeco.training.config import training_config
 from neeco.training.run import load_run
@@ -33,14 +34,15 @@ PERIOD = 2.0  # s
 
 @pytest.fixture(autouse=True)
 def breathing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The page's only block of Python as a file of a folder that stands for `deformations/`."""
+    """The page's only block of Python as a file of a folder that stands for `methods/`."""
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    (tmp_path / "deformations").mkdir()
-    (tmp_path / "deformations" / "breathing.py").write_text(code, encoding="utf-8")
-    monkeypatch.setattr(deformations, "__path__", [*deformations.__path__, str(tmp_path / "deformations")])
-    monkeypatch.setattr(methods, "METHODS", methods.find_methods())
+    (tmp_path / "methods").mkdir()
+    (tmp_path / "methods" / "breathing_tissue.py").write_text(code, encoding="utf-8")
+    monkeypatch.setattr(neeco.methods, "__path__", [*neeco.methods.__path__, str(tmp_path / "methods")])
+    methods.cache_clear()
     yield
-    del sys.modules["neeco.scene.deformations.breathing"]
+    methods.cache_clear()
+    del sys.modules["neeco.methods.breathing_tissue"]
 
 
 def test_it_trains_and_comes_back_from_disk_as_it_was(tmp_path: Path) -> None:

@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from neeco.capture.model import Frame, State
+from neeco.methods.breathing import HARMONICS, Breathing
+from neeco.methods.carving.tissue_fit import fit_tissue
+from neeco.methods.kinematic.breathing_search import find_breathing, find_period
+from neeco.methods.static import Static
 from neeco.raster import Camera, rasterize
 from neeco.scene import Recorded, Scene
-from neeco.scene.breathing import HARMONICS, Breathing
 from neeco.scene.canonical import seed_gaussians
-from neeco.scene.deformations.static import Static
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
-from neeco.training.instruments.breathing import find_breathing, find_period
-from neeco.training.instruments.discovery import fit_tissue
 from neeco.training.train import ProgressRow, train
 
 PERIOD, SWING = 3.1, (1.0, 0.6, 2.0)  # s, mm

@@ -18,7 +18,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from neeco.capture.model import Frame
-from neeco.scene.methods import METHODS
+from neeco.scene.method_registry import methods
 from neeco.scene.training_views import TrainingViews
 from neeco.training import session as module
 from neeco.training.config import training_config
@@ -103,7 +103,7 @@ def session_on_meta(method: str, batch_size: int) -> GaussianSession:
 
 
 @pytest.mark.parametrize(
-    ("method", "batch_size"), [*((name, 1) for name, kind in METHODS.items() if kind.has_gaussians), ("neeco", 3)]
+    ("method", "batch_size"), [*((name, 1) for name, kind in methods().items() if kind.has_gaussians), ("neeco", 3)]
 )
 def test_a_step_asks_the_device_once_and_copies_nothing_there(
     method: str, batch_size: int, monkeypatch: pytest.MonkeyPatch

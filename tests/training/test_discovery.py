@@ -14,17 +14,18 @@ from torch import Tensor
 
 from neeco.capture import read_capture
 from neeco.capture.model import Frame, InstrumentState, State
+from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, carve
+from neeco.methods.carving.shapes import shape_around_frame
+from neeco.methods.carving.tissue_fit import tissue_evidence
+from neeco.methods.kinematic import discovery
+from neeco.methods.kinematic.articulation.hinges import Hinges
+from neeco.methods.kinematic.hinge_search import search_hinge, unbend_seeds
 from neeco.raster.rotations import rigid_from_vector
-from neeco.scene.articulation.hinges import Hinges
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import SearchConfig, training_config
+from neeco.training.config import training_config
 from neeco.training.initial import begin_session, initial_scene
-from neeco.training.instruments import discovery
-from neeco.training.instruments.discovery import shape_around_frame, tissue_evidence
-from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
-from neeco.training.instruments.hinge_search import search_hinge, unbend_seeds
 
-SEARCH = SearchConfig(seeds=500)
+SEARCH = CarvingSettings(seeds=500)
 MOUNTINGS = {
     "straight": torch.eye(4, dtype=torch.float64),
     "tilted and off axis": rigid_from_vector(torch.tensor([0.5, -0.7, 0.3, 5.0, -4.0, 6.0], dtype=torch.float64)),
@@ -116,7 +117,9 @@ def test_what_lies_behind_transparent_images_is_no_evidence(tmp_path: Path) -> N
     capture = read_capture(write_capture(tmp_path / "capture"))
     frames = capture.split("train")
     white = tuple(torch.full((24, 32, 3), 255, dtype=torch.uint8) for _ in frames)
-    config = training_config("kinematic", {}, ["search.tissue_steps=5", "search.long_tissue_steps=5"])
+    config = training_config(
+        "kinematic", {}, [f"deformation.carving.{name}=5" for name in ("tissue_steps", "long_tissue_steps")]
+    )
     scene = initial_scene(capture, frames, config, print)
     scene.background = 1.0  # as of images cut out of their surroundings
     evidence = tissue_evidence(scene, TrainingViews(frames, white, (None,) * len(frames)), config)

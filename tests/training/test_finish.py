@@ -11,17 +11,18 @@ import torch
 from capture_files import PIVOT_MM, WRIST_MM, grasper_body, write_grasper
 
 from neeco.capture import read_capture
+from neeco.methods.kinematic import wrist
+from neeco.methods.kinematic.articulation import LINK_LOGITS
+from neeco.methods.kinematic.articulation.hinges import Hinges
+from neeco.methods.kinematic.finish import conclude, extend_shaft, settle_links, shaft_coverage
+from neeco.methods.kinematic.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
 from neeco.raster import rasterize
-from neeco.scene.articulation import LINK_LOGITS
-from neeco.scene.articulation.hinges import Hinges
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
 from neeco.scene.drawable import Recorded
-from neeco.scene.methods import make_deformation
+from neeco.scene.method_registry import make_deformation
 from neeco.scene.scene import Scene
 from neeco.scene.training_views import TrainingViews
-from neeco.training.config import SearchConfig, TrainConfig
-from neeco.training.instruments.finish import conclude, extend_shaft, settle_links, shaft_coverage
-from neeco.training.instruments.wrist import color_boundary, measure_radius, place_wrists, replace_wrists
+from neeco.training.config import TrainConfig
 from neeco.training.session import GaussianSession, new_session
 
 
@@ -138,10 +139,9 @@ def test_the_colours_border_is_found_to_a_fraction_of_the_radius(session: Gaussi
 
 
 def test_a_wrist_found_again_moves_unless_spinning_then_costs_more(
-    session: GaussianSession,
+    session: GaussianSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search = SearchConfig(spin_angle=math.pi / 4)  # the rings have eight Gaussians each
-    session.config = replace(session.config, search=search)
+    monkeypatch.setattr(wrist, "SPIN_ANGLE", math.pi / 4)  # the rings have eight Gaussians each
     hinges = hinges_of(session)
     hinges.wrist_start.fill_(3.0)
     replace_wrists(session, session.scene.deformation)

@@ -12,7 +12,7 @@ from capture_files import write_capture, write_grasper
 from neeco.capture import read_capture
 from neeco.raster import kernels
 from neeco.raster.native import Family
-from neeco.scene.methods import METHODS
+from neeco.scene.method_registry import methods
 from neeco.scene.training_session import Session
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
@@ -22,6 +22,7 @@ STEPS = 100
 SMALL = {
     "neeco": ["deformation.depth=3", "deformation.width=16"],
     "deformable-3dgs": ["deformation.width=16"],
+    "kinematic": ["deformation.carving.seeds=300"],
     "4dgs": [
         "deformation.resolution=8",
         "deformation.channels=4",
@@ -35,7 +36,7 @@ SMALL = {
 def begun(method: str, folder: Path) -> Session:
     """A session before its first step, always begun by the kernels."""
     # few seeds: the reference rasteriser evaluates every Gaussian at every pixel
-    small = ["density_start=50", "refine.start=20", "search.seeds=300", *SMALL.get(method, [])]
+    small = ["density_start=50", "refine.start=20", *SMALL.get(method, [])]
     config = training_config(
         method, {"iterations": STEPS, "max_tissue_gaussians": 60, "max_instrument_gaussians": 60}, small
     )
@@ -47,7 +48,7 @@ def begun(method: str, folder: Path) -> Session:
     return begin_session(capture, views, config, print)
 
 
-@pytest.mark.parametrize("method", list(METHODS))
+@pytest.mark.parametrize("method", list(methods()))
 def test_a_hundred_steps_agree(method: str, tmp_path: Path) -> None:
     """Losses within float32's rounding. A field's first gradients are noise, whose sign Adam follows: there the end."""
     losses: dict[Family, torch.Tensor] = {}
@@ -59,7 +60,7 @@ def test_a_hundred_steps_agree(method: str, tmp_path: Path) -> None:
         sizes[family] = session.scene.num_gaussians
     native, plain = losses["native"], losses["torch"]
     assert sizes["native"] == sizes["torch"]
-    if METHODS[method].has_gaussians:
+    if methods()[method].has_gaussians:
         apart = (plain - native).abs()
         # a loss of order 1 is a sum and product of some hundred float32 numbers, each rounded to 2**-24
         assert float(apart[:50].max()) < 256 * 2**-24

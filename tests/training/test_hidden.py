@@ -6,7 +6,7 @@ import torch
 from ball_world import RADIUS, ball_scene
 from rod_world import WALL_MM
 
-from neeco.training.instruments.finish import drop_occluded
+from neeco.methods.kinematic.finish import drop_occluded
 
 PLACES = [(0.0, 0.0, 60.0), (10.0, 5.0, 65.0), (-12.0, 3.0, 70.0), (4.0, -6.0, 55.0), (0.0, 9.0, 62.0)]
 

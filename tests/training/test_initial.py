@@ -10,9 +10,10 @@ import torch
 
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.methods.kinematic.hinge_search import hinge_joints
 from neeco.raster.rotations import rigid_from_vector
 from neeco.training.config import TrainConfig
-from neeco.training.initial import hinge_joints, moving_joints
+from neeco.training.initial import moving_joints
 
 ARM = Instrument("arm", {"insertion": None, "jaw": (0.0, 1.0), "stuck": None})
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 50.0, 50.0, 20.0, 16.0, 40, 32)

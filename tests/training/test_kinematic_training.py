@@ -14,6 +14,8 @@ from capture_files import PIVOT_MM, write_grasper
 
 from neeco.capture import read_capture
 from neeco.evaluation.evaluate import evaluate_run
+from neeco.methods.carving.evidence import gather_evidence
+from neeco.methods.kinematic import deformation
 from neeco.scene.io import load_scene
 from neeco.scene.training_views import TrainingViews
 from neeco.synthesis.dataset import synthesize
@@ -21,7 +23,6 @@ from neeco.synthesis.settings import Settings
 from neeco.training import initial
 from neeco.training.config import training_config
 from neeco.training.initial import initial_scene
-from neeco.training.instruments.evidence import gather_evidence
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
@@ -33,7 +34,7 @@ EARLY = [
     "refine.cameras=true",
     "refine.registration=true",
     "deformation.shaft_roll_start=5",
-    "search.tissue_steps=100",
+    "deformation.carving.tissue_steps=100",
     "log_interval=1",
     "deformation.hinge_start=12",
     "deformation.shadow_at=[10]",
@@ -75,11 +76,12 @@ def test_two_runs_and_an_interrupted_one_give_the_same_bytes(capture: Path, tmp_
 def test_labels_are_weighed_in_images_of_the_size_learned(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In images of the searches' size thin Gaussians share their pixels with tissue: edges and dark rings were lost."""
     looked_at = []
-    monkeypatch.setattr(initial, "store_label_shares", lambda session: looked_at.append(session.scale))
+    monkeypatch.setattr(deformation, "store_label_shares", lambda session: looked_at.append(session.scale))
+    monkeypatch.setattr(deformation, "conclude", lambda *_: None)
     taken = read_capture(capture)
     session = initial.begin_session(taken, TrainingViews.read(taken.split("train")), CONFIG, print)
     assert session.resolution.search_scale < 1
-    session.instruments.weigh_labels()
+    session.scene.deformation.finish(session)
     assert looked_at == [1.0]
 
 
@@ -113,12 +115,12 @@ def test_evidence_of_images_of_two_sizes_lies_in_each_ones_own(capture: Path) ->
     views = TrainingViews.read(frames)
     plain = training_config("3dgs", {"iterations": 1})
     scene = initial_scene(read_capture(capture), frames, plain, print)
-    together = gather_evidence(scene, views, plain.search)
+    together = gather_evidence(scene, views, plain.deformation.carving)
     assert together.hits.shape == (len(frames), 72, 80)
     points = torch.tensor([[0.0, 0.0, 60.0], [38.0, 0.0, 80.0], [0.0, 42.0, 80.0], [10.0, -20.0, 70.0]])
     for index in range(4):
         single = TrainingViews(frames[index : index + 1], views.images[index : index + 1], (None,))
-        alone = gather_evidence(scene, single, plain.search)
+        alone = gather_evidence(scene, single, plain.deformation.carving)
         expected = alone.look_up_camera(points[None])
         found = together.subset(torch.tensor([index])).look_up_camera(points[None])
         assert torch.equal(found[1], expected[1])

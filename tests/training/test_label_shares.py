@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from neeco.methods.kinematic import label_shares as module
+from neeco.methods.kinematic.articulation import LABEL_SHARE
+from neeco.methods.kinematic.label_shares import store_label_shares
 from neeco.raster.types import Camera, Gaussians
-from neeco.scene.articulation import LABEL_SHARE
 from neeco.scene.canonical import CanonicalGaussians, join_bodies, seed_gaussians
-from neeco.training.instruments import label_shares as module
-from neeco.training.instruments.label_shares import store_label_shares
 
 TISSUE, METAL = (0.6, 0.25, 0.2), (0.55, 0.57, 0.6)
 SHADE = 0.35  # of the tissue's light, in the shadow
@@ -68,11 +68,9 @@ def session_of(scene: StillScene) -> Any:
     with torch.no_grad():
         image: Tensor = module.rasterize(scene.at(None), CAMERA).color
     views = SimpleNamespace(target=lambda index: image, mask=lambda index: None)
-    config = SimpleNamespace(search=SimpleNamespace(label_frames=1))
     return SimpleNamespace(
         scene=scene,
         views=views,
-        config=config,
         corrected=lambda index: (None, CAMERA),
         frames_along_poses=lambda count: [0],
     )

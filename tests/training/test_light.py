@@ -10,11 +10,11 @@ import torch
 from rod_world import CAMERA, make_scene
 
 from neeco.capture.model import Frame
+from neeco.methods.kinematic.shadow import find_shadow
 from neeco.raster import rasterize
 from neeco.scene import Scene
 from neeco.scene.training_views import TrainingViews
 from neeco.training.config import training_config
-from neeco.training.instruments.shadow import find_shadow
 from neeco.training.session import GaussianSession, new_session
 
 OFFSET, STRENGTH = (9.0, -6.0, 0.0), 0.5  # mm, of the lamp of the recorded images

@@ -15,16 +15,16 @@ from wristed_world import shifted
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Instrument, InstrumentState, State
+from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, carve
+from neeco.methods.kinematic.articulation.stated import StatedLinks
+from neeco.methods.kinematic.link_seeds import along_links, readings_of, start_links
+from neeco.methods.kinematic.reading_doubts import doubt_readings
 from neeco.raster.rotations import rotate_about
-from neeco.scene.articulation.stated import StatedLinks
 from neeco.scene.drawable import Recorded
-from neeco.training.config import RefineConfig, SearchConfig
-from neeco.training.instruments.evidence import CarvedShape, Evidence, carve
-from neeco.training.instruments.link_seeds import along_links, readings_of, start_links
-from neeco.training.instruments.reading_doubts import doubt_readings
+from neeco.training.config import RefineConfig
 from neeco.training.refinement import Refinement
 
-SEARCH = SearchConfig(seeds=600)
+SEARCH = CarvingSettings(seeds=600)
 PITCH_AT, YAW_AT, TIP, RADIUS = 4.0, 14.0, 30.0, 3.0  # mm along the shaft
 
 
@@ -77,7 +77,7 @@ def session(evidence: Evidence, unrecorded: tuple[str, ...] = ()) -> Any:
     return cast(
         Any,
         SimpleNamespace(
-            config=SimpleNamespace(search=SEARCH, seed=0),
+            config=SimpleNamespace(deformation=SimpleNamespace(carving=SEARCH), seed=0),
             report=said.append,
             said=said,
             scene=SimpleNamespace(

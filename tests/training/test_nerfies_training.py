@@ -13,8 +13,8 @@ from safetensors.torch import load_file, save_file
 
 from neeco.cli import main
 from neeco.errors import NeecoError
+from neeco.methods.nerfies.field import NerfScene
 from neeco.scene.io import load_scene, save_scene
-from neeco.scene.nerfies.field import NerfScene
 from neeco.training.config import training_config
 from neeco.training.train import ProgressRow, train
 

@@ -12,10 +12,12 @@ import torch
 from capture_files import write_capture
 from torch import Tensor
 
+import neeco.methods
 from neeco.errors import NeecoError
-from neeco.scene import CanonicalGaussians, deformations, methods
-from neeco.scene.deformations.base import Posed
+from neeco.scene import CanonicalGaussians
+from neeco.scene.deformation import Posed
 from neeco.scene.io import load_scene
+from neeco.scene.method_registry import methods
 from neeco.training.config import method_defaults, training_config
 from neeco.training.train import train
 
@@ -25,7 +27,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Posed
+from neeco.scene.deformation import UNPERTURBED, Deformation, Posed
 
 
 @dataclass(frozen=True)
@@ -73,27 +75,29 @@ class Drift(Deformation):
 
 @pytest.fixture(autouse=True)
 def drift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The class, as found in a new file of a folder that stands for `deformations/`."""
-    folder = tmp_path / "deformations"
+    """The class, as found in a new file of a folder that stands for `methods/`."""
+    folder = tmp_path / "methods"
     folder.mkdir()
     (folder / "drift.py").write_text(FILE)
-    monkeypatch.setattr(deformations, "__path__", [*deformations.__path__, str(folder)])
-    monkeypatch.setattr(methods, "METHODS", methods.find_methods())
-    yield methods.METHODS["drift"]
-    del sys.modules["neeco.scene.deformations.drift"]
+    monkeypatch.setattr(neeco.methods, "__path__", [*neeco.methods.__path__, str(folder)])
+    methods.cache_clear()
+    yield methods()["drift"]
+    methods.cache_clear()
+    del sys.modules["neeco.methods.drift"]
 
 
 def test_methods_are_found_in_their_files_the_default_one_first() -> None:
-    assert list(methods.METHODS) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco", "nerfies"]
+    assert list(methods()) == ["kinematic", "3dgs", "4dgs", "deformable-3dgs", "drift", "neeco", "nerfies"]
 
 
 def test_two_files_of_one_method_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "deformations" / "drifting.py").write_text(FILE)
+    (tmp_path / "methods" / "drifting.py").write_text(FILE)
+    methods.cache_clear()
     try:
-        with pytest.raises(NeecoError, match=r"drifting: method 'drift' is also in neeco.scene.deformations.drift"):
-            methods.find_methods()
+        with pytest.raises(NeecoError, match=r"drifting: method 'drift' is also in neeco.methods.drift"):
+            methods()
     finally:
-        del sys.modules["neeco.scene.deformations.drifting"]
+        del sys.modules["neeco.methods.drifting"]
 
 
 def test_a_methods_own_term_of_the_loss_moves_it(drift: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,7 +148,7 @@ def test_extras_with_a_rate_are_learned_and_others_hold_still(
             extent = canonical.extras["share"] * canonical.extras["still"]
             return Posed(canonical.means + extent[:, None], posed.quats, posed.scales)
 
-    monkeypatch.setitem(methods.METHODS, "drift", Shared)
+    monkeypatch.setitem(methods(), "drift", Shared)
     run = train(write_capture(tmp_path / "capture"), tmp_path / "run", training_config("drift", {"iterations": 12}))
     extras = load_scene(run / "scene.safetensors").canonical.extras
     assert bool((extras["share"] != 0).any())

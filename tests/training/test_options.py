@@ -12,7 +12,7 @@ import yaml
 
 from neeco.capture.model import Instrument
 from neeco.errors import NeecoError
-from neeco.scene.methods import METHODS, method_class, method_settings
+from neeco.scene.method_registry import method_class, method_settings, methods
 from neeco.training.config import (
     TrainConfig,
     config_from_dict,
@@ -26,7 +26,7 @@ from neeco.training.run import read_config, stored_config, write_config
 ROD = (Instrument("rod"),)
 
 
-@pytest.mark.parametrize("method", list(METHODS))
+@pytest.mark.parametrize("method", list(methods()))
 def test_a_config_comes_back_from_yaml(method: str, tmp_path: Path) -> None:
     values = {"joints": ("jaw_angle", "wrist"), "minutes": 2.5, "seed": 7}
     config = training_config(method, values, ["schedule.opacity_reset=inverse", "refine.cameras=true"])
@@ -206,7 +206,7 @@ def test_old_names_are_read_from_the_command_line_with_a_warning_and_from_config
 @pytest.mark.parametrize(
     ("assignment", "named"),
     [
-        ("search.grid=0", "search.grid: 0 is too small"),
+        ("deformation.carving.grid=0", "deformation.carving.grid: 0 is too small"),
         ("density.prune_interval=0", "density.prune_interval: 0 is too small"),
         ("density.reset_opacity=1.0", "density.reset_opacity: 1.0 is not between 0 and 1"),
         ("schedule.phase_1.interval=0", "schedule.phase_1.interval: 0 is too small"),

@@ -15,7 +15,7 @@ from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import ProgressRow, train
 
-SHORT = ["density_start=10", "log_interval=1", "checkpoint_interval=20", "search.tissue_steps=100"]
+SHORT = ["density_start=10", "log_interval=1", "checkpoint_interval=20", "deformation.carving.tissue_steps=100"]
 SMALL = ["deformation.preset=practical", "deformation.width=16", "deformation.depth=2", *SHORT]
 CONFIG = training_config("neeco", {"iterations": 60}, SMALL)
 

@@ -10,9 +10,9 @@ import torch
 from capture_files import write_capture
 
 from neeco.errors import NeecoError
-from neeco.scene.deformations.base import UNPERTURBED
-from neeco.scene.deformations.hexplane import HexPlane
-from neeco.scene.deformations.time_mlp import TimeMLP
+from neeco.methods.hexplane import HexPlane
+from neeco.methods.time_mlp import TimeMLP
+from neeco.scene.deformation import UNPERTURBED
 from neeco.training.config import training_config
 from neeco.training.run import load_run
 from neeco.training.train import train

@@ -33,7 +33,7 @@ from neeco.viewer.splats import exported_state, splats_of
 # everything that a long run does happens within 40 iterations
 EARLY = [
     "density_start=10", "schedule.plain_density.interval=15", "refine.start=8", "deformation.shaft_roll_start=5",
-    "search.tissue_steps=60", "log_interval=1", "deformation.hinge_start=12", "deformation.shadow_at=[10]",
+    "deformation.carving.tissue_steps=60", "log_interval=1", "deformation.hinge_start=12", "deformation.shadow_at=[10]",
     "deformation.label_sharpness_start=14",
 ]  # fmt: skip
 CONFIG = training_config("kinematic", {"iterations": 40}, EARLY)

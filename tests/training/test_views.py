@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neeco.capture import read_capture
+from neeco.methods.nerfies.session import RayTable
 from neeco.scene import training_views as module
-from neeco.scene.nerfies.session import RayTable
 from neeco.scene.training_views import PixelPrefetcher, TrainingViews
 from neeco.training.config import training_config
 from neeco.training.initial import begin_session

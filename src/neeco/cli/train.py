@@ -75,11 +75,11 @@ def run(args: Arguments) -> int:
 
 def explain() -> str:
     """What `--help` adds: each method's own settings."""
-    from neeco.scene.methods import METHODS
+    from neeco.scene.method_registry import methods
     from neeco.settings import described
 
     paragraphs = ["Settings of each method, as --set deformation.NAME=VALUE:"]
-    for name, method in METHODS.items():
+    for name, method in methods().items():
         fields = [f"{field}: {kind} = {default}" for field, kind, default in described(method.Settings)]
         if fields:
             words = " ".join((method.Settings.__doc__ or "").split())

@@ -53,7 +53,7 @@ from neeco.experiments.training_job import (
 )
 from neeco.files import own_folder, read_json, write_json
 from neeco.raster.devices import device_of
-from neeco.scene.methods import method_settings
+from neeco.scene.method_registry import method_settings
 from neeco.settings import plain, warn_renamed
 from neeco.training.config import TISSUE_GAUSSIANS, TrainConfig, training_config
 from neeco.training.run import open_run

@@ -45,7 +45,7 @@ from neeco.experiments.training_job import (
 )
 from neeco.files import own_folder, read_json, require_like, write_json
 from neeco.raster.devices import device_of
-from neeco.scene.methods import unmet_need
+from neeco.scene.method_registry import unmet_need
 from neeco.settings import plain
 from neeco.training.config import TrainConfig, training_config
 from neeco.training.run import load_run, require_same_capture

@@ -26,7 +26,7 @@ from neeco.experiments.study import JobProgress, Result
 from neeco.files import read_json, read_text, require_like, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
-from neeco.scene.methods import method_class
+from neeco.scene.method_registry import method_class
 from neeco.training.config import TrainConfig
 from neeco.training.run import open_run, read_config, stored_config
 from neeco.training.train import ProgressRow, train

@@ -18,7 +18,7 @@ from neeco.capture.model import State, evenly_spaced
 from neeco.errors import NeecoError
 from neeco.raster import rasterize
 from neeco.raster.types import Camera, Gaussians, Rendering
-from neeco.scene.deformations.base import otsu
+from neeco.scene.deformation import otsu
 
 if TYPE_CHECKING:
     from neeco.scene import Drawable, Scene

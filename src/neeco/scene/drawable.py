@@ -16,9 +16,19 @@ from torch import Tensor
 from neeco.capture.lens import Lens
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
 from neeco.raster.types import Rendering
-from neeco.scene.articulation import JointMotion
 
+Skeleton = tuple[tuple[str, str], ...]  # pairs of keypoints' names that a line joins
 BESIDE = 4  # training frames beside one of which a joint is not known
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """An axis about which a reading turns, or along which it slides, what it moves; instrument frame."""
+
+    pivot: Tensor  # [3] mm
+    axis: Tensor  # [3] unit
+    reading: str
+    slides: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from neeco.capture.model import Camera, Instrument, InstrumentState, State, shar
 from neeco.errors import NeecoError
 from neeco.files import HALVES, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
-from neeco.scene.deformations.base import Deformation
+from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Learned, Recorded
 from neeco.scene.method import Stored
-from neeco.scene.methods import method_class, method_settings
+from neeco.scene.method_registry import method_class, method_settings
 from neeco.scene.scene import Scene
 from neeco.settings import plain
 

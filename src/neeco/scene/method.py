@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from torch import Tensor
 
-from neeco.capture.model import Capture, Instrument
+from neeco.capture.model import Capture, Frame, Instrument
 from neeco.raster.native import torch_threads
 from neeco.scene.drawable import Learned, Recorded
-from neeco.scene.training_session import RunLength, Session
+from neeco.scene.training_session import Report, RunLength, Session
 from neeco.scene.training_views import TrainingViews
 
 # Plain 3DGS: no part of the paper's dynamic training adjustment acts.
@@ -43,7 +43,8 @@ class Stored:
 
 
 class Method:
-    """A method is one class in one file under `scene/`, found there by its name, `method`; nothing else names it.
+    """A method is one class in one file or folder under `methods/`, or an entry point of another package in the group
+    `neeco.methods`, found by its name, `method`; nothing else names it.
 
     `Settings` is a frozen dataclass of its own settings (`--set deformation.NAME=VALUE`), each with a type and a
     default; its docstring describes them. `training_defaults` are fields of the training config that differ from the
@@ -60,6 +61,19 @@ class Method:
     learns_tissues: ClassVar[bool] = False  # several in one scene: it moves no tissue, so each Gaussian is of one
     has_gaussians: ClassVar[bool] = True  # False: nothing to rasterise, pose or densify; a drawing takes seconds
     large_operations: ClassVar[bool] = False  # torch's own operations are large enough to gain from several threads
+
+    @classmethod
+    def moves_stated_links(cls, settings: Any) -> bool:
+        """Whether links move as an instrument's stated kinematics say, where it has any."""
+        return False
+
+    @classmethod
+    def learned_joints(
+        cls, instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], settings: Any, report: Report
+    ) -> tuple[str, ...]:
+        """Those of `joints`, which may move parts of an instrument without stated links, that are learned; `report`
+        what is left out or doubtful."""
+        return joints
 
     @classmethod
     def torch_threads(cls) -> AbstractContextManager[None]:

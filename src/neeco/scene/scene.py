@@ -18,10 +18,9 @@ from neeco.raster import rasterize
 from neeco.raster.devices import CachedPredicate
 from neeco.raster.rotations import rigid_from_vector
 from neeco.raster.types import Gaussians, Headlight, Rendering, Shadow
-from neeco.scene.articulation import Skeleton
 from neeco.scene.canonical import SH_COEFFICIENTS, TISSUE, CanonicalGaussians
-from neeco.scene.deformations.base import UNPERTURBED, Deformation, Deltas, Perturbation
-from neeco.scene.drawable import ArticulatedMotion, Drawable, Recorded
+from neeco.scene.deformation import UNPERTURBED, Deformation, Deltas, Perturbation
+from neeco.scene.drawable import ArticulatedMotion, Drawable, Recorded, Skeleton
 from neeco.scene.method import Stored
 from neeco.scene.visibility import VISIBILITY, measure_visibility, unobserved_share
 

@@ -16,10 +16,8 @@ from torch import Tensor
 
 from neeco.errors import NeecoError
 from neeco.raster.optimizer import Adam
-from neeco.scene.articulation import ArticulatedInstruments
 from neeco.scene.canonical import CanonicalGaussians
 from neeco.scene.drawable import Learned
-from neeco.scene.swept_volume import SweptVolume
 from neeco.scene.training_views import TrainingViews
 
 Report = Callable[[str], None]  # shows the user one line
@@ -130,29 +128,6 @@ class GaussianScene(Learned, Protocol):
     canonical: CanonicalGaussians
 
 
-@dataclass(frozen=True)
-class InstrumentSearch:
-    """Functions that find instruments and their joints in the training views, without masks, CAD or labels."""
-
-    # carve every instrument, add its Gaussians to the scene as a body of its own, and start its
-    # joints
-    find: Callable[[ArticulatedInstruments], None]
-    # bound the volume by what the carved instruments sweep
-    bound: Callable[[SweptVolume], None]
-    # carve every instrument: points [P, 3] mm on it, in its own frame, and its shaft's radius, mm
-    carve: Callable[[], Sequence[tuple[Tensor, float]]]
-    # find where each shaft ends and the wrist begins
-    place_wrists: Callable[[ArticulatedInstruments], None]
-    # find it again, and move a wrist where spinning the shaft behind it costs no more than before
-    replace_wrists: Callable[[ArticulatedInstruments], None]
-    # find lamps that explain the instruments' shadows, beside those found before
-    find_shadow: Callable[[], None]
-    # find how far each of the instruments' Gaussians counts as instrument, by the images' colours
-    weigh_labels: Callable[[], None]
-    # set each instrument's extent, prolong its shaft, and judge whether its joints were found
-    conclude: Callable[[ArticulatedInstruments], None]
-
-
 @dataclass
 class GaussianTraining(Session):
     """A training session as a deformation's hooks see it."""
@@ -162,7 +137,6 @@ class GaussianTraining(Session):
     report: Report
     batch_size: int  # frames per step
     timed: bool = field(default=True, init=False)  # `State.time` is in seconds
-    instruments: InstrumentSearch = field(init=False)
 
     def reached(self, iteration: int) -> bool:
         """Whether the last step came to `iteration` or past it."""

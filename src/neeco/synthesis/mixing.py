@@ -25,7 +25,7 @@ from neeco.raster.pinhole import project
 from neeco.raster.reference import SH_C0, brightened
 from neeco.raster.types import Camera, Gaussians
 from neeco.scene.canonical import CanonicalGaussians, join_bodies
-from neeco.scene.deformations.base import Deformation
+from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Recorded
 from neeco.scene.scene import Scene, one_tissue
 from neeco.scene.visibility import VISIBILITY

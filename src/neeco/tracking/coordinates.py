@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neeco.capture.model import Instrument, InstrumentState, State
 from neeco.errors import NeecoError
+from neeco.methods.kinematic.articulation import ArticulatedInstruments
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
 from neeco.scene import Scene
-from neeco.scene.articulation import ArticulatedInstruments
 
 DEG = math.pi / 180
 BELOW, ABOVE = 0.1, 0.5  # of a joint's recorded range: how far below and above it a joint is looked for

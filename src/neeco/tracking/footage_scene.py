@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from neeco.capture.model import Frame, evenly_spaced
+from neeco.methods.kinematic.shadow import find_shadow
 from neeco.raster.reference import SH_C0
 from neeco.scene import CanonicalGaussians, Recorded, Scene
 from neeco.scene.canonical import join_bodies
@@ -30,7 +31,6 @@ from neeco.tracking.fitting import Fit, Fitter, wide
 from neeco.tracking.footage_tissue import Report, passing
 from neeco.tracking.search import Search
 from neeco.training.config import method_defaults
-from neeco.training.instruments.shadow import find_shadow
 from neeco.training.session import new_session
 
 FRAMES = 8  # in which instruments are looked for

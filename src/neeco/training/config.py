@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import yaml
 
 from neeco.errors import NeecoError
-from neeco.scene.methods import DEFAULT, method_class, method_settings
+from neeco.scene.method_registry import DEFAULT, method_class, method_settings
 from neeco.scene.training_session import RunLength
 from neeco.settings import name_and_value, new_name, plain, structure, warn_renamed, with_fields
 from neeco.training.resolution import ResolutionConfig, size_factor
@@ -21,6 +21,7 @@ from neeco.training.schedule import Part, ScheduleConfig
 
 ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
 LOG_INTERVAL = 50
+REMOVED_GROUPS = ("search",)  # of settings that config.yaml of version 0.2 and older has; no longer settings
 TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
 
 
@@ -79,36 +80,6 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
-class SearchConfig:
-    """The search for instruments, their joints and their shadows in the training views."""
-
-    tissue_steps: int = 500  # of the short tissue-only fit whose residual is the evidence
-    long_tissue_steps: int = 1500  # of the one with density control, where the short one leaves too much
-    max_evidence: float = 0.25  # mean evidence that the short fit may leave
-    evidence_frames: int = 120  # training frames looked at, at most
-    evidence_floor: float = 0.04  # residual at which evidence begins (images in [0, 1])
-    evidence_range: float = 0.06  # residual above that at which it saturates
-    grid: int = 48  # voxels per side of the carving grid
-    fine_grid: int = 72  # of the one for thin instruments, tried where the first finds too few
-    pose_shifts: int = 4  # exchanges of poses among frames that evidence is compared with
-    motion_ratio: float = 1.5  # evidence under an instrument's own poses to that under exchanged ones, at least
-    seeds: int = 3000  # Gaussians per instrument at the start
-    hinge_angles: int = 36  # hinge directions tried over half a turn
-    hinge_depths: int = 10  # hinge places tried along the front half
-    max_pose_explained: float = 0.98  # share of a joint's variance that its instrument's pose may explain
-    min_joint_explained: float = 0.35  # share of the moving parts' error that a found joint explains, at least
-    border_frames: int = 40  # frames whose colours along the shaft are looked at
-    spin_frames: int = 16  # frames in which shafts are spun to test their symmetry
-    spin_angle: float = 0.5  # rad: small, so that visible sides stay in view
-    label_frames: int = 40  # frames whose colours tell instruments from what they do to the tissue beside them
-    lamp_frames: int = 12  # frames in which lamps are tried
-    lamp_directions: int = 8  # tried around the lens
-    min_lamp_agreement: float = 0.75  # share of the frames that the first lamps found improve, at least
-    min_further_agreement: float = 0.5  # of others beside them
-    min_lamp_explained: float = 0.005  # share of the squared error beside the instruments that each lamp explains
-
-
-@dataclass(frozen=True)
 class TrainConfig:
     """Settings of one run."""
 
@@ -137,7 +108,6 @@ class TrainConfig:
     joints: tuple[str, ...] | None = None  # joints that move parts; None: those that the pose does not already explain
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
-    search: SearchConfig = field(default_factory=SearchConfig)
     resolution: ResolutionConfig = field(default_factory=ResolutionConfig)
     log_interval: int = LOG_INTERVAL  # iterations averaged into one row of metrics.jsonl
     checkpoint_interval: int = 500  # iterations
@@ -181,7 +151,8 @@ def config_from_dict(values: Mapping[str, Any]) -> TrainConfig:
     if not isinstance(own := values.get("deformation") or {}, Mapping):
         raise NeecoError(f"deformation: {own!r} is not a group of fields")
     settings = method_settings(method, own)
-    config = structure(TrainConfig, {**values, "deformation": None}, owner="the training config")
+    others = {name: value for name, value in values.items() if name not in ("deformation", *REMOVED_GROUPS)}
+    config = structure(TrainConfig, others, owner="the training config")
     return with_fields(config, {"deformation": settings})
 
 
@@ -266,7 +237,7 @@ def check_ranges(config: TrainConfig) -> None:
     }
     for name in ("phase_1", "phase_2", "plain_density"):
         least_one[f"schedule.{name}.interval"] = getattr(schedule, name).interval
-    for group in ("density", "search", "resolution"):
+    for group in ("density", "resolution"):
         numbers = vars(getattr(config, group)).items()
         least_one |= {f"{group}.{name}": value for name, value in numbers if isinstance(value, int)}
     for name, value in least_one.items():

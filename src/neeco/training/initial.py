@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,22 +13,14 @@ from neeco.capture.model import Capture, Frame, Instrument, PointCloud
 from neeco.errors import NeecoError
 from neeco.scene.canonical import TISSUE, CanonicalGaussians, neighbour_spacing, seed_gaussians
 from neeco.scene.drawable import Learned, Recorded
-from neeco.scene.methods import make_deformation, method_class
+from neeco.scene.method_registry import make_deformation, method_class
 from neeco.scene.scene import Scene
-from neeco.scene.training_session import InstrumentSearch, Report, Session
+from neeco.scene.training_session import Report, Session
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig
-from neeco.training.instruments.discovery import bound_volume, carve_seeds, find_instruments
-from neeco.training.instruments.finish import conclude
-from neeco.training.instruments.hinge_search import MIN_READING_RANGE
-from neeco.training.instruments.label_shares import store_label_shares
-from neeco.training.instruments.shadow import find_shadow
-from neeco.training.instruments.wrist import place_wrists, replace_wrists
-from neeco.training.session import GaussianSession, new_session
+from neeco.training.session import new_session
 
-STATE_LINKS = (
-    "state its links (`kinematics`, from a ruler and a protractor, a dVRK tool file or a URDF: docs/capture.md)"
-)
+MAX_POSE_EXPLAINED = 0.98  # share of a joint's variance that its instrument's pose may explain
 
 
 def begin_session(
@@ -47,30 +37,10 @@ def begin_session(
     assert isinstance(scene, Scene)
     session = new_session(scene.to(views.device), views, config, report)
     session.timed = capture.timed
-    session.instruments = InstrumentSearch(
-        find=_searching(session, find_instruments),
-        carve=_searching(session, carve_seeds),
-        bound=_searching(session, bound_volume),
-        place_wrists=_searching(session, place_wrists),
-        replace_wrists=_searching(session, replace_wrists),
-        find_shadow=_searching(session, find_shadow, as_learned=True),
-        weigh_labels=partial(store_label_shares, session),  # in full: reduced pixels mix thin Gaussians with tissue
-        conclude=partial(conclude, session),
-    )
     if is_new:
         scene.deformation.begin(session)
     session.start()
     return session
-
-
-def _searching(session: GaussianSession, search: Callable[..., Any], as_learned: bool = False) -> Callable[..., Any]:
-    """`search` of this session, on images of the size that searches take, or `as_learned` so far."""
-
-    def run(*arguments: object) -> Any:
-        with session.searching(as_learned):
-            return search(session, *arguments)
-
-    return run
 
 
 def initial_scene(capture: Capture, frames: tuple[Frame, ...], config: TrainConfig, report: Report) -> Scene:
@@ -128,42 +98,22 @@ def _thinned_points(
 def _learned_instrument(
     instrument: Instrument, frames: tuple[Frame, ...], config: TrainConfig, report: Report
 ) -> Instrument:
-    """The instrument with the joints that are learned: those of stated kinematics, where the method takes such and no
-    `config.joints` are asked for, else those that may move something (`moving_joints`)."""
-    tree = instrument.kinematics
-    stated = getattr(config.deformation, "kinematics", False)
-    if tree is None or config.joints is not None or not stated:
-        joints = moving_joints(instrument, frames, config, report)
-        if stated and config.joints is None:
-            joints = hinge_joints(instrument, joints, frames, report)
-        return Instrument(instrument.name, {joint: instrument.joints[joint] for joint in joints})
-    if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
-        raise NeecoError(
-            f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
-            "recorded readings, or train with --set deformation.kinematics=false"
-        )
-    unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
-    joints = {reading: instrument.joints[reading] for reading in tree.readings}
-    return replace(instrument, joints=joints, unrecorded=unrecorded)
-
-
-def hinge_joints(
-    instrument: Instrument, joints: tuple[str, ...], frames: tuple[Frame, ...], report: Report
-) -> tuple[str, ...]:
-    """Those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic joints, and
-    of several that move, for which this is the wrong model."""
-    for joint in joints:
-        if instrument.slides(joint):
-            report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
-    turning = tuple(joint for joint in joints if not instrument.slides(joint))
-    states = [frame.state.instruments[instrument.name] for frame in frames]
-    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > MIN_READING_RANGE]
-    if len(used) > 1:
-        report(
-            f"warning: {instrument.name}: {', '.join(used)}: several joints and no kinematics; each is learned as a "
-            f"hinge across the shaft, which fits jaws but no wrist; {STATE_LINKS}"
-        )
-    return turning
+    """The instrument with the joints that are learned: `config.joints`; else those of its stated kinematics, where the
+    method moves such links; else those that may move something (`moving_joints`) and that the method can learn."""
+    method, tree = method_class(config.method), instrument.kinematics
+    if config.joints is None and tree is not None and method.moves_stated_links(config.deformation):
+        if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
+            raise NeecoError(
+                f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
+                "recorded readings, or train with --set deformation.kinematics=false"
+            )
+        unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
+        stated = {reading: instrument.joints[reading] for reading in tree.readings}
+        return replace(instrument, joints=stated, unrecorded=unrecorded)
+    joints = moving_joints(instrument, frames, config, report)
+    if config.joints is None:
+        joints = method.learned_joints(instrument, joints, frames, config.deformation, report)
+    return Instrument(instrument.name, {joint: instrument.joints[joint] for joint in joints})
 
 
 def moving_joints(
@@ -195,7 +145,7 @@ def moving_joints(
         spread = reading.var()
         fitted = design @ np.linalg.lstsq(design, reading, rcond=1e-6)[0]
         explained = 1 - (reading - fitted).var() / spread if spread > 1e-8 else 0.0
-        if explained > config.search.max_pose_explained:
+        if explained > MAX_POSE_EXPLAINED:
             report(f"{instrument.name}: joint {joint} follows from the pose; it moves no part of its own")
         else:
             moving.append(joint)

@@ -16,7 +16,7 @@ from torch import Tensor
 from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, State
 from neeco.raster.optimizer import adam_update
 from neeco.raster.rotations import rigid_from_vector, vector_from_rotation
-from neeco.scene.deformations.base import log_linear
+from neeco.scene.deformation import log_linear
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
 

@@ -19,7 +19,7 @@ from neeco.raster import Rendering, rasterize
 from neeco.raster.devices import constant, tf32_products
 from neeco.raster.losses import photometric_loss
 from neeco.raster.optimizer import Adam
-from neeco.scene.deformations.base import FINAL_RATE, Perturbation, floored_decay, log_linear
+from neeco.scene.deformation import FINAL_RATE, Perturbation, floored_decay, log_linear
 from neeco.scene.scene import Scene
 from neeco.scene.training_session import GaussianTraining, Report, StepResult, check_finite, members, numbers
 from neeco.scene.training_views import TrainingViews
@@ -321,6 +321,12 @@ class GaussianSession(GaussianTraining):
         scene.diagnostics["phase_2_forced"] = self.schedule.forced
         scene.deformation.finish(self)
         scene.visibility()
+
+
+def gaussian_session(training: GaussianTraining) -> GaussianSession:
+    """What a deformation's hooks are given, as the session that it is."""
+    assert isinstance(training, GaussianSession)
+    return training
 
 
 def new_session(

@@ -22,7 +22,7 @@ from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.files import is_vacant, own_folder, read_text, write_text
 from neeco.scene.io import pack_scene, save_scene
-from neeco.scene.methods import method_class, unmet_need
+from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
 from neeco.scene.training_views import TrainingViews, mean_pixels
 from neeco.training.config import TrainConfig

@@ -1,0 +1,325 @@
+"""Rigid links on joints, method `kinematic`.
+
+Tissue is static, or moves with the breath where that was found. Each instrument's Gaussians live in its own tracked
+frame and move rigidly with its pose; joints move links about axes that are learned from the images, with soft
+assignment of Gaussians to links.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Frame, Instrument, State
+from neeco.methods.breathing import RATES as BREATHING_RATES
+from neeco.methods.breathing import BreathingTissue
+from neeco.methods.carving.evidence import CarvingSettings
+from neeco.methods.kinematic.articulation import (
+    LABEL_SHARE,
+    LINK_LOGITS,
+    ArticulatedInstruments,
+    Articulation,
+    articulation_of,
+)
+from neeco.methods.kinematic.discovery import find_instruments
+from neeco.methods.kinematic.finish import conclude
+from neeco.methods.kinematic.hinge_search import hinge_joints
+from neeco.methods.kinematic.label_shares import store_label_shares
+from neeco.methods.kinematic.shadow import find_shadow
+from neeco.methods.kinematic.wrist import place_wrists, replace_wrists
+from neeco.raster.posing import ArticulatedBody, pose_bodies
+from neeco.raster.types import Camera, Rendering
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformation import (
+    UNPERTURBED,
+    Deformation,
+    Deltas,
+    Perturbation,
+    Posed,
+    floored_decay,
+    state_of,
+)
+from neeco.scene.drawable import ArticulatedMotion, Skeleton
+from neeco.scene.method import PLAIN_TRAINING
+from neeco.scene.training_session import GaussianTraining, Report
+from neeco.scene.visibility import extrapolate_tissue, outside_all_views
+from neeco.training.session import gaussian_session
+
+WRISTS_AT = 0.4  # of the run: the shape is there, and time is left to learn
+WRISTS_AGAIN_AT = (0.6, 0.8)  # of the run
+PRIOR_WEIGHT = 1e-5  # on what is learned of stated kinematics, in squared standard deviations
+
+
+@dataclass(frozen=True)
+class KinematicSettings:
+    """`shaft_roll`: probability of spinning the shaft (a surface of revolution) by a random angle, from iteration
+    `shaft_roll_start` on; `opacity_penalty`: on the instruments' mean opacity, a tenth of it from iteration
+    `opacity_penalty_stop` on; `label_sharpness`: weight of l (1 - l) on the drawn instrument label, after iteration
+    `label_sharpness_start`; `part_sharpness`: weight of how mixed Gaussians are of parts, after iteration
+    `hinge_start`, from which on hinges are learned, by rates that `rate_scale` multiplies; `refine_wrists`: whether
+    wrists are looked for again at 60 and 80 % of the run; `shadow`: whether the instruments' shadow on the tissue is
+    looked for and drawn (see `neeco.raster.shadow`), first at the iterations `shadow_at`; `extrapolate_tissue`: whether
+    tissue is extrapolated smoothly beyond what frames observed (see `neeco.scene.visibility`); `label_shares`: whether
+    Gaussians that model shadow or blur beside an instrument count less in its labels, by the images' colours;
+    `breathing`: whether a period is looked for with which the tissue moves, and its motion learned (see
+    `neeco.methods.breathing`); `kinematics`: whether joints move as the capture's kinematics state, where they do (else
+    as found from the images); `stated_axes`, `stated_readings`: whether the axes stated there, and offsets and gains of
+    the readings, are corrected; `carving`: of the search for instruments (see `CarvingSettings`)."""
+
+    renamed: ClassVar[Mapping[str, str]] = {"wrist_again": "refine_wrists", "rim": "extrapolate_tissue"}
+
+    shaft_roll: float = 0.5
+    shaft_roll_start: int = 600
+    opacity_penalty: float = 0.002
+    opacity_penalty_stop: int = 1500
+    label_sharpness: float = 0.02
+    label_sharpness_start: int = 1000
+    part_sharpness: float = 0.003
+    hinge_start: int = 600  # before, unformed Gaussians would drag the hinges off
+    rate_scale: float = 1.0
+    refine_wrists: bool = True
+    shadow: bool = True
+    shadow_at: tuple[int, ...] = (1000, 1500)  # instruments have shape, and no shadow is learned yet as a part of them
+    extrapolate_tissue: bool = True
+    label_shares: bool = True
+    breathing: bool = True
+    kinematics: bool = True
+    stated_axes: bool = True
+    stated_readings: bool = True
+    carving: CarvingSettings = field(default_factory=CarvingSettings)
+
+
+@dataclass(frozen=True)
+class Spin(Perturbation):
+    """`shaft_roll`: angle in rad by which everything behind the wrist is spun about the shaft (a surface of revolution
+    looks the same)."""
+
+    shaft_roll: float = 0.0
+
+
+class Kinematic(BreathingTissue, ArticulatedInstruments, Deformation):
+    """Bodies of the canonical set: 0 tissue (world frame), then one per instrument (instrument frame)."""
+
+    method = "kinematic"
+    Settings = KinematicSettings
+    separates_instruments = True
+    learns_tissues = True
+    training_defaults: ClassVar[Mapping[str, Any]] = {
+        **PLAIN_TRAINING,
+        "schedule.sh_interval": 500,
+        "schedule.plain_density.interval": 200,
+        "schedule.plain_density.opacity_reset": 0,
+        "schedule.plain_density.threshold": 2e-4,
+        "refine.latency": True,
+        "refine.frame_poses": True,
+        "refine.frame_joints": True,
+        "density_start": 400,
+        "resolution.full_size_at": 0.55,
+    }
+    extra_rates: ClassVar[Mapping[str, float]] = {LINK_LOGITS: 1e-2}
+
+    def __init__(self, instruments: tuple[Instrument, ...], settings: KinematicSettings | None = None) -> None:
+        super().__init__(instruments, settings)
+        self.may_breathe = self.settings.breathing
+        self.start_iteration = self.settings.hinge_start
+        self.articulate([articulation_of(instrument) for instrument in instruments])
+        self.label_names = tuple(
+            (instrument.name, part)
+            for instrument, articulation in zip(instruments, self.articulations, strict=True)
+            for part in articulation.part_names
+        )
+
+    @classmethod
+    def moves_stated_links(cls, settings: KinematicSettings) -> bool:
+        return settings.kinematics
+
+    @classmethod
+    def learned_joints(
+        cls,
+        instrument: Instrument,
+        joints: tuple[str, ...],
+        frames: Sequence[Frame],
+        settings: KinematicSettings,
+        report: Report,
+    ) -> tuple[str, ...]:
+        return hinge_joints(instrument, joints, frames, report) if settings.kinematics else joints
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        roll = perturbation.shaft_roll if isinstance(perturbation, Spin) else 0.0
+        bodies: list[ArticulatedBody | None] = [None]  # tissue does not turn
+        for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
+            given = state_of(instrument, state)
+            bodies.append(articulation.body(given.pose.to(canonical.means), given.joints, roll))
+        logits = self.placed_logits(canonical)
+        means = self.breathed(canonical.means, canonical.counts[0], state.time)
+        return Posed(*pose_bodies(means, canonical.quats, canonical.log_scales, logits, canonical.counts, bodies))
+
+    def label_channels(self, canonical: CanonicalGaussians) -> Tensor:
+        labels = canonical.means.new_zeros(len(canonical), len(self.label_names))
+        column = 0
+        for index, articulation in enumerate(self.articulations):
+            rows = canonical.body(index + 1)
+            parts = articulation.parts(canonical.means[rows], self.link_weights(canonical, index))
+            labels[rows, column : column + parts.shape[1]] = parts
+            column += parts.shape[1]
+        share = canonical.extras.get(LABEL_SHARE)
+        return labels if share is None else labels * share[:, None]
+
+    def deltas(self, canonical: CanonicalGaussians, state: State) -> Deltas:
+        """Change from canonical to posed; tissue does not change, so the thresholds of the paper's labels separate
+        exactly."""
+        deltas = super().deltas(canonical, state)
+        tissue = canonical.body(0)
+        for tensor in (deltas.means, deltas.quats, deltas.scales):
+            tensor[tissue] = 0
+        return deltas
+
+    def keypoints(self, state: State) -> dict[str, dict[str, Tensor]]:
+        found: dict[str, dict[str, Tensor]] = {}
+        for instrument, articulation in zip(self.instruments, self.articulations, strict=True):
+            given = state_of(instrument, state)
+            points = articulation.keypoints(given.joints)
+            pose = given.pose.to(points["shaft_far"])
+            found[instrument.name] = {name: pose[:3, :3] @ point + pose[:3, 3] for name, point in points.items()}
+        return found
+
+    def skeleton(self) -> Skeleton:
+        bones = [bone for articulation in self.articulations for bone in articulation.skeleton]
+        return tuple(dict.fromkeys(bones))
+
+    def motion(self, canonical: CanonicalGaussians) -> ArticulatedMotion:
+        log_scales = canonical.log_scales.clone()
+        axes, moved = [], []
+        for index, articulation in enumerate(self.articulations):
+            rows = canonical.body(index + 1)
+            weights = self.link_weights(canonical, index)
+            if articulation.jointed:
+                log_scales[rows] = torch.minimum(log_scales[rows], articulation.longest(weights).log())
+            own, amounts = articulation.motion(weights)
+            axes.append(tuple(own))
+            moved.append((rows, amounts))
+        most = max((len(own) for own in axes), default=0)
+        amounts = canonical.means.new_zeros(len(canonical), most, 2)
+        for rows, own_amounts in moved:
+            amounts[rows, : own_amounts.shape[1]] = own_amounts
+        return ArticulatedMotion(log_scales, amounts, tuple(axes))
+
+    @classmethod
+    def combined(cls, deformations: Sequence[Deformation]) -> Kinematic:
+        parts = [part for part in deformations if isinstance(part, Kinematic)]
+        instruments = tuple(instrument for part in parts for instrument in part.instruments)
+        made = cls(instruments, copy.deepcopy(parts[0].settings))
+        made.articulate([copy.deepcopy(articulation) for part in parts for articulation in part.articulations])
+        return made
+
+    def fit_extras(self, extras: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        logits, columns = extras[LINK_LOGITS], self.logit_count
+        logits = nn.functional.pad(logits, (0, max(0, columns - logits.shape[1])))[:, :columns]
+        return {LINK_LOGITS: logits, LABEL_SHARE: extras.get(LABEL_SHARE, logits.new_ones(len(logits)))}
+
+    def initial_extras(self, canonical: CanonicalGaussians) -> dict[str, Tensor]:
+        return {LINK_LOGITS: canonical.means.new_zeros(len(canonical), self.logit_count)}
+
+    def begin(self, training: GaussianTraining) -> None:
+        session = gaussian_session(training)
+        with session.searching():
+            find_instruments(session, self)
+
+    def perturb(
+        self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
+    ) -> Perturbation:
+        settings = self.settings
+        if settings.shaft_roll > 0 and iteration > settings.shaft_roll_start and rng.random() < settings.shaft_roll:
+            return Spin(perturbation.state_noise, float(rng.uniform(-math.pi, math.pi)))
+        return perturbation
+
+    def spin_perturbation(self, roll: float) -> Perturbation:
+        return Spin(shaft_roll=roll)
+
+    def prune_mask(self, canonical: CanonicalGaussians, cameras: Sequence[Camera]) -> Tensor | None:
+        """Tissue whose middle no frame sees: no image checks what it looks like."""
+        if not self.settings.extrapolate_tissue:
+            return None
+        tissue = canonical.body(0)
+        mask = torch.zeros(len(canonical), dtype=torch.bool, device=canonical.means.device)
+        mask[tissue] = outside_all_views(canonical.means[tissue].detach(), cameras)
+        return mask
+
+    def training_channels(self, canonical: CanonicalGaussians, iteration: int) -> Tensor | None:
+        """The whole instruments' label [N, 1]: parts share it out, so all of them together have 1."""
+        settings = self.settings
+        if not (settings.label_sharpness > 0 and iteration > settings.label_sharpness_start and self.label_names):
+            return None
+        return canonical.of_instruments.to(canonical.means.dtype)[:, None]
+
+    def regularisation(self, canonical: CanonicalGaussians, rendering: Rendering, iteration: int) -> Tensor | None:
+        """Sparse instruments with sharp labels and decided parts."""
+        settings, terms = self.settings, []
+        if settings.opacity_penalty > 0 and len(canonical.counts) > 1:
+            weight = settings.opacity_penalty * (1.0 if iteration < settings.opacity_penalty_stop else 0.1)
+            terms.append(weight * torch.sigmoid(canonical.opacity_logits[canonical.counts[0] :]).mean())
+        if settings.part_sharpness > 0 and iteration > self.start_iteration:
+            terms += [settings.part_sharpness * self._part_mixing(canonical, k) for k in range(len(self.instruments))]
+        priors = [articulation.prior() for articulation in self.articulations]
+        terms += [PRIOR_WEIGHT * prior for prior in priors if prior is not None]
+        if rendering.channels is not None and settings.label_sharpness > 0:
+            label = rendering.channels[..., 0]
+            terms.append(settings.label_sharpness * (label * (1 - label)).mean())
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def _part_mixing(self, canonical: CanonicalGaussians, index: int) -> Tensor:
+        """How mixed one instrument's Gaussians are of its links, and how far they are of links that their places speak
+        against, a scalar of at least 0."""
+        weights = self.link_weights(canonical, index)
+        rows = canonical.body(index + 1)
+        opacities = torch.sigmoid(canonical.opacity_logits[rows]).detach()
+        mixed = 1 - weights.square().sum(1)
+        misplaced = self.articulations[index].misplaced(canonical.means[rows].detach(), weights)
+        if misplaced is not None:
+            mixed = mixed + misplaced
+        return (opacities * mixed).sum() / opacities.sum().clamp_min(1e-6)
+
+    def between_steps(self, training: GaussianTraining, before: float) -> None:
+        session = gaussian_session(training)
+        passed = [mark for mark in (WRISTS_AT, *WRISTS_AGAIN_AT) if before < mark <= session.progress]
+        if self.settings.shadow and (passed or any(map(session.reached, self.settings.shadow_at))):
+            with session.searching(as_learned=True):
+                find_shadow(session)
+        if WRISTS_AT in passed:
+            with session.searching():
+                place_wrists(session, self)
+        elif passed and self.settings.refine_wrists:
+            with session.searching():
+                replace_wrists(session, self)
+
+    def finish(self, training: GaussianTraining) -> None:
+        session = gaussian_session(training)
+        scene = session.scene
+        if self.settings.label_shares and self.label_names:
+            store_label_shares(session)  # at full size: reduced pixels mix thin Gaussians with tissue
+        conclude(session, self)
+        if self.breathing is not None:
+            scene.diagnostics["breathing"] |= self.breathing.describe(scene.recorded.cameras)
+        if self.settings.extrapolate_tissue:
+            for index, recorded in enumerate(scene.recorded.by_tissue()):
+                scene.canonical = extrapolate_tissue(scene.canonical, recorded.cameras, index)
+
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        scale = self.settings.rate_scale * floored_decay(progress)
+        found = {}
+        for name, _ in self.named_parameters():
+            module, _, parameter = name.rpartition(".")
+            owner = self.get_submodule(module)
+            rates = owner.rates if isinstance(owner, Articulation) else BREATHING_RATES
+            fixed = (parameter.startswith("axis_") and not self.settings.stated_axes) or (
+                parameter.startswith("reading_") and not self.settings.stated_readings
+            )
+            found[name] = 0.0 if fixed else rates[parameter] * scale
+        return found

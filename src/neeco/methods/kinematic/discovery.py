@@ -1,0 +1,78 @@
+"""Find each instrument from training frames alone, and seed its Gaussians on its links."""
+
+from __future__ import annotations
+
+import torch
+
+from neeco.methods.breathing import BreathingTissue
+from neeco.methods.carving.shapes import carved_shape
+from neeco.methods.carving.tissue_fit import fit_tissue, tissue_evidence
+from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments
+from neeco.methods.kinematic.articulation.hinges import Hinges
+from neeco.methods.kinematic.articulation.stated import StatedLinks
+from neeco.methods.kinematic.breathing_search import find_breathing
+from neeco.methods.kinematic.hinge_search import start_hinges
+from neeco.methods.kinematic.link_seeds import along_links, readings_of, start_links
+from neeco.methods.kinematic.reading_doubts import doubt_readings
+from neeco.scene.canonical import join_bodies, seed_instrument
+from neeco.scene.scene import Scene
+from neeco.training.session import GaussianSession
+
+
+def find_instruments(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Add every instrument's body to the session's scene, whose canonical set holds the tissue alone, and start its
+    joints.
+
+    `articulated` is the scene's deformation. Raises NeecoError when an instrument leaves no evidence in its own frame:
+    its poses do not match the images.
+    """
+    scene, report = session.scene, session.report
+    if not scene.instruments:
+        return
+    report("looking for the instruments: fitting the tissue alone")
+    tissue = fit_tissue(scene, session.views, session.config)
+    if isinstance(articulated, BreathingTissue) and articulated.may_breathe and session.timed:
+        tissue = _learn_breathing(session, articulated, tissue)
+    evidence = tissue_evidence(scene, session.views, session.config, tissue)
+    generator = torch.Generator().manual_seed(session.config.seed)
+    bodies = [scene.canonical]
+    for index, instrument in enumerate(scene.instruments):
+        shape = carved_shape(session, evidence, instrument.name, generator)
+        articulation = articulated.articulations[index]
+        if isinstance(articulation, StatedLinks):
+            shape = along_links(session, articulation, evidence, instrument.name, shape, generator)
+        articulation.base.copy_(shape.instrument_from_shaft)
+        articulation.extent.copy_(torch.tensor([shape.near, shape.tip]))
+        articulation.radius.fill_(shape.radius)
+        columns = articulated.logit_count
+        if isinstance(articulation, StatedLinks):
+            seeds, logits = start_links(session, articulation, evidence, instrument.name, shape, columns, generator)
+            doubt_readings(session, articulation, evidence, instrument, readings_of(session, evidence, instrument.name))
+        else:
+            assert isinstance(articulation, Hinges)
+            seeds, logits = start_hinges(session, articulation, evidence, instrument.name, shape, columns, generator)
+        bodies.append(seed_instrument(seeds, shape.radius).with_extras(**{LINK_LOGITS: logits}))
+    scene.canonical = join_bodies(bodies)
+
+
+def _learn_breathing(session: GaussianSession, breathes: BreathingTissue, tissue: Scene) -> Scene:
+    """`tissue`, a fit of still tissue, or where that breathes one that was fitted anew with its breathing, with which
+    `breathes` begins then."""
+    scene, views, config = session.scene, session.views, session.config
+    if len(scene.recorded.tissues) > 1:
+        session.report("several tissues: none of them is taken to breathe")
+        return tissue
+    begun = find_breathing(tissue, views)
+    if begun is None:
+        return tissue
+    breathing, found = begun
+    session.report(f"the tissue breathes with a period of {found.period:.2f} s: fitting it again")
+    tissue = fit_tissue(scene, views, config, breathing=breathing)
+    deformation = tissue.deformation
+    assert isinstance(deformation, BreathingTissue)
+    assert deformation.breathing is not None
+    breathes.start_breathing(deformation.breathing)
+    scene.diagnostics["breathing"] = deformation.breathing.describe(scene.recorded.cameras) | {
+        "explained": round(found.explained, 3)
+    }
+    return tissue

@@ -1,0 +1,223 @@
+"""After learning: how long each instrument is, and whether its joints were found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neeco.capture.model import REFERENCE_PIXELS, InstrumentState, State, evenly_spaced
+from neeco.methods.kinematic.articulation import LINK_LOGITS, ArticulatedInstruments, Articulation
+from neeco.methods.kinematic.wrist import MIN_SOLID, SOLID_OPACITY, color_boundary, solid_extent, solid_gaussians
+from neeco.raster import rasterize
+from neeco.raster.pinhole import in_image
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.drawable import Recorded
+from neeco.scene.scene import Scene
+from neeco.scene.visibility import visible_pixels
+from neeco.training.session import GaussianSession
+
+MIN_VISIBLE_SHARE = 0.2  # of the pixels that a Gaussian takes up of its instrument rendered alone
+MIN_PIXELS_ALONE = 0.05  # px taken up there, in all frames together: below, its own instrument hides it
+OCCLUSION_FRAMES = 64  # looked at, evenly spaced
+WELL_SEEN = 0.08  # share of training frames that must see a position of the shaft for it to be copied
+END_IN_VIEW = 0.3  # share above which the instrument's rear end is its real end
+MIN_JOINT_EXPLAINED = 0.35  # share of the moving parts' error that a found joint explains, at least
+SLAB_RADII = 1.5  # length of the repeated slab, in shaft radii
+
+
+@torch.no_grad()
+def conclude(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Drop occluded Gaussians of instruments, set the extent of each, prolong its shaft and write the joints' verdicts
+    into `scene.diagnostics`.
+
+    Reports an instrument of which hardly anything was learned: its labels would stay empty without a message.
+    """
+    session.scene.recorded = session.refinement.found(session.scene.recorded, session.scene.instruments)
+    session.scene.canonical = settle_links(drop_occluded(session.scene), articulated)
+    verdicts: dict[str, Any] = {}
+    for index, instrument in enumerate(session.scene.instruments):
+        articulation = articulated.articulations[index]
+        boundary = color_boundary(session, articulated, index) if articulation.jointed else None
+        if boundary is not None:
+            articulation.wrist_start.fill_(boundary)
+        for reading in articulation.reading_names:
+            verdicts[f"{instrument.name}.{reading}"] = _verdict(session, articulated, index, reading)
+        scene = session.scene
+        count = int(solid_gaussians(scene.canonical, index).sum())
+        scene.diagnostics.setdefault("instruments", {}).setdefault(instrument.name, {})["solid_gaussians"] = count
+        if count < MIN_SOLID:
+            session.report(
+                f"warning: {instrument.name}: hardly anything was learned of it ({count} solid Gaussians), so its "
+                "labels will be empty; the images show it too little, or another that moves alike has its place"
+            )
+        articulation.extent.copy_(solid_extent(scene.canonical, index, articulation))
+        if articulation.jointed:
+            solid = solid_gaussians(scene.canonical, index)
+            points = scene.canonical.means[scene.canonical.body(index + 1)]
+            weights = articulated.link_weights(scene.canonical, index)
+            articulation.measure_tips(points[solid], weights[solid])
+        scene.canonical = extend_shaft(
+            scene.canonical, index + 1, instrument.name, articulation, scene.recorded, 1.5 * session.extent
+        )
+    session.scene.diagnostics["joints"] = verdicts
+    session.scene.diagnostics["latency_s"] = float(session.refinement.latency)
+    session.scene.diagnostics["registration"] = session.scene.registration.tolist()
+
+
+def settle_links(canonical: CanonicalGaussians, articulated: ArticulatedInstruments) -> CanonicalGaussians:
+    """The canonical Gaussians without links that their places rule out."""
+    logits = canonical.extras[LINK_LOGITS].clone()
+    for index, articulation in enumerate(articulated.articulations):
+        rows = canonical.body(index + 1)
+        logits[rows] = articulation.settled(canonical.means[rows], logits[rows])
+    return canonical.with_extras(**{LINK_LOGITS: logits})
+
+
+def _verdict(session: GaussianSession, articulated: ArticulatedInstruments, index: int, name: str) -> dict[str, Any]:
+    """Whether the joint of a reading was found: whether the reading explains the image of the moving parts, in the
+    training frames of its extremes.
+
+    `explained` = 1 - error(reading) / error(mean reading), over pixels that a moving part covers in either rendering.
+    """
+    scene = session.scene
+    articulation, instrument = articulated.articulations[index], scene.instruments[index]
+    readings = torch.tensor([state.instruments[instrument.name].joints[name] for state in scene.recorded.states])
+    ordered = readings.argsort()
+    extremes = torch.cat([ordered[:6], ordered[-10:]]).tolist()
+    moving = _moving_weight(scene.canonical, articulated, index, name)
+    given = middle = 0.0
+    for frame_index in extremes:
+        state, camera = session.corrected(frame_index)
+        target = session.views.target(frame_index)
+        renderings = [
+            rasterize(scene.at(variant), camera, channels=moving)
+            for variant in (state, _with_reading(state, instrument.name, name, float(readings.mean())))
+        ]
+        covered = torch.maximum(*(r.channels[..., 0] for r in renderings if r.channels is not None)) > 0.3
+        mask = session.views.mask(frame_index)
+        if mask is not None:
+            covered &= mask
+        errors = [float((r.color - target).abs().mean(-1)[covered].sum()) for r in renderings]
+        given, middle = given + errors[0], middle + errors[1]
+    explained = 1 - given / middle if middle > 0 else 0.0
+    explains = bool(explained > MIN_JOINT_EXPLAINED and math.isfinite(explained))
+    doubt = scene.diagnostics.get("doubted_readings", {}).get(f"{instrument.name}.{name}")
+    if doubt is not None:
+        verdict = f"NOT found: {doubt}"
+    elif explains:
+        verdict = f"found: the reading explains {explained:.0%} of the moving parts' error"
+    else:
+        verdict = (
+            f"NOT found: the reading explains only {explained:.0%} of the moving parts' error; "
+            "unseen joint angles will look wrong (record a wider joint range, or check the joint's log)"
+        )
+    return {
+        "found": explains and doubt is None,
+        "explained": round(explained, 4),
+        **articulation.describe(name),
+        "verdict": verdict,
+    }
+
+
+def _moving_weight(
+    canonical: CanonicalGaussians, articulated: ArticulatedInstruments, index: int, reading: str
+) -> Tensor:
+    """[N, 1] share of each Gaussian of instrument `index` that a reading moves."""
+    weight = canonical.means.new_zeros(len(canonical), 1)
+    weights = articulated.link_weights(canonical, index)
+    weight[canonical.body(index + 1), 0] = articulated.articulations[index].moved_by(reading, weights)
+    return weight
+
+
+def _with_reading(state: State, instrument: str, joint: str, reading: float) -> State:
+    given = state.instruments[instrument]
+    changed = InstrumentState(given.pose, {**given.joints, joint: reading})
+    return replace(state, instruments={**state.instruments, instrument: changed})
+
+
+def drop_occluded(scene: Scene) -> CanonicalGaussians:
+    """The canonical Gaussians without those of instruments that other bodies occlude in nearly every frame.
+
+    No image constrained them: they lie inside another instrument of the same arm, or in the tissue. Rendered alone,
+    they would widen the instrument.
+    """
+    canonical, recorded = scene.canonical, scene.recorded
+    instruments = [canonical.bodies == body for body in range(1, len(canonical.counts))]  # bool [N] each
+    visible, alone = (torch.zeros_like(canonical.opacity_logits) for _ in range(2))
+    for index in evenly_spaced(len(recorded.cameras), OCCLUSION_FRAMES):
+        camera = recorded.cameras[index].within(REFERENCE_PIXELS)
+        with torch.no_grad():
+            posed = scene.at(recorded.states[index])
+        visible += visible_pixels(posed, camera)
+        for own in instruments:
+            alone[own] += visible_pixels(posed.select(own), camera)
+    stays = (canonical.bodies == 0) | (alone < MIN_PIXELS_ALONE) | (visible >= MIN_VISIBLE_SHARE * alone)
+    counts = tuple(int(stays[canonical.body(body)].sum()) for body in range(len(canonical.counts)))
+    return canonical.map(lambda tensor: tensor[stays], counts)
+
+
+@torch.no_grad()
+def extend_shaft(
+    canonical: CanonicalGaussians, body: int, name: str, articulation: Articulation, recorded: Recorded, length: float
+) -> CanonicalGaussians:
+    """Canonical Gaussians with the shaft of instrument `body` (row group index) prolonged by about `length` mm;
+    unchanged when its real end is in view.
+
+    The camera sees a shaft only up to the image's border; in a new state more of it comes into view. A shaft is the
+    same all along, so the rearmost well-seen slab is repeated towards the rear.
+    """
+    rows = canonical.body(body)
+    along = articulation.along_shaft(canonical.means[rows])  # [M]
+    solid = torch.sigmoid(canonical.opacity_logits[rows]) > SOLID_OPACITY
+    if not articulation.jointed or int(solid.sum()) < 50:
+        return canonical
+    rear, front = float(along[solid].quantile(0.01)), float(articulation.wrist_start)
+    if not rear < front:
+        return canonical
+    device = canonical.means.device
+    positions = torch.linspace(rear, front, 40, device=device)
+    seen = shaft_coverage(positions, name, articulation, recorded)
+    if float(seen[0]) > END_IN_VIEW or not bool((seen >= WELL_SEEN).any()):
+        return canonical
+    start = float(positions[seen >= WELL_SEEN][0])
+    slab = SLAB_RADII * _median_radius(canonical, rows, articulation, solid)
+    copied = torch.nonzero((along >= start) & (along < start + slab))[:, 0]
+    if start + slab > front or len(copied) < 10:
+        return canonical
+    seen_part = torch.nonzero(along >= start)[:, 0]
+    repeats = math.ceil(length / slab)
+    index = torch.cat([seen_part, copied.repeat(repeats)]) + rows.start
+    shift = torch.zeros(len(index), device=device)
+    shift[len(seen_part) :] = -slab * torch.arange(1, repeats + 1, device=device).repeat_interleave(len(copied)).float()
+    whole = torch.arange(len(canonical), device=device)
+    whole = torch.cat([whole[: rows.start], index, whole[rows.stop :]])
+    counts = list(canonical.counts)
+    counts[body] = len(index)
+    extended = canonical.map(lambda tensor: tensor[whole].contiguous(), tuple(counts))
+    _, direction = articulation.shaft()
+    extended.means[extended.body(body)] += shift[:, None] * direction
+    return extended
+
+
+def shaft_coverage(positions: Tensor, name: str, articulation: Articulation, recorded: Recorded) -> Tensor:
+    """Share [Q] of the training frames whose image holds the shaft's axis at `positions` [Q] mm."""
+    origin, direction = articulation.shaft()
+    points = origin + positions[:, None] * direction  # [Q, 3]
+    counts = torch.zeros_like(positions)
+    for state, camera in zip(recorded.states, recorded.cameras, strict=True):
+        pose = state.instruments[name].pose.to(points)
+        counts += in_image(points @ pose[:3, :3].T + pose[:3, 3], camera)
+    return counts / max(1, len(recorded.states))
+
+
+def _median_radius(canonical: CanonicalGaussians, rows: slice, articulation: Articulation, solid: Tensor) -> float:
+    """Median distance mm of solid Gaussians behind the wrist from the axis."""
+    origin, direction = articulation.shaft()
+    arm = canonical.means[rows][solid] - origin
+    across = arm - (arm @ direction)[:, None] * direction
+    behind = (arm @ direction) < articulation.wrist_start
+    return float((across[behind] if bool(behind.any()) else across).norm(dim=1).median())

@@ -1,0 +1,210 @@
+"""The search for hinges across a shaft, by stick figures, and the seeds of what turns about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Frame, Instrument
+from neeco.methods.carving.evidence import CarvedShape, CarvingSettings, Evidence, camera_from_instrument, center_line
+from neeco.methods.kinematic.articulation.hinges import Hinges
+from neeco.scene.training_session import Report
+from neeco.training.session import GaussianSession
+
+BODY_LOGIT = 2.0  # initial link logit of seeds on the shaft's side of the hinge
+GAINS = ((0.5, -0.5), (1.0, 0.0))  # jaw angle per reading: two jaws share the opening, or one takes it all
+SMALL_GAIN = 0.3  # a smaller turn, which tolerates rough evidence
+MIN_READING_RANGE = 0.05  # rad: the hinge of a joint that moves less is not searched
+STICK_POINTS = 16
+STATE_LINKS = (
+    "state its links (`kinematics`, from a ruler and a protractor, a dVRK tool file or a URDF: docs/capture.md)"
+)
+HINGE_ANGLES = 36  # hinge directions tried over half a turn
+HINGE_DEPTHS = 10  # hinge places tried along the front half
+
+
+def hinge_joints(
+    instrument: Instrument, joints: tuple[str, ...], frames: Sequence[Frame], report: Report
+) -> tuple[str, ...]:
+    """Those of `joints` that are learned as hinges across the shaft: all revolute ones. Warn of prismatic joints, and
+    of several that move, for which this is the wrong model."""
+    for joint in joints:
+        if instrument.slides(joint):
+            report(f"warning: {instrument.name}: joint {joint} is prismatic and moves no part; {STATE_LINKS}")
+    turning = tuple(joint for joint in joints if not instrument.slides(joint))
+    states = [frame.state.instruments[instrument.name] for frame in frames]
+    used = [joint for joint in turning if np.ptp([state.joints[joint] for state in states]) > MIN_READING_RANGE]
+    if len(used) > 1:
+        report(
+            f"warning: {instrument.name}: {', '.join(used)}: several joints and no kinematics; each is learned as a "
+            f"hinge across the shaft, which fits jaws but no wrist; {STATE_LINKS}"
+        )
+    return turning
+
+
+def start_hinges(
+    session: GaussianSession,
+    hinges: Hinges,
+    evidence: Evidence,
+    name: str,
+    shape: CarvedShape,
+    columns: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Put each joint at the best hypothesis of the search; returns seeds [M, 3] mm, and their link logits
+    [M, columns]."""
+    find_hinges(session, hinges, evidence, name, shape)
+    seeds = shape.seeds.to(hinges.base.device)
+    logits = seed_logits(hinges, seeds, columns, generator)
+    return unbend_seeds(hinges, seeds, logits), logits
+
+
+def find_hinges(session: GaussianSession, hinges: Hinges, evidence: Evidence, name: str, shape: CarvedShape) -> None:
+    """Put each joint of `hinges`, whose shaft is in place, at the best hypothesis of the search."""
+    for index, joint in enumerate(hinges.reading_names):
+        found = search_hinge(evidence, name, joint, shape, session.config.deformation.carving)
+        if found is None:
+            session.report(f"{name}: joint {joint} hardly moves in the training frames; its hinge cannot be found")
+            continue
+        with torch.no_grad():
+            hinges.hinge_angle[index] = found.angle
+            hinges.hinge_depth[index] = found.depth
+            hinges.share[index] = 1.0 if found.gains[1] == 0 else 0.5
+            readings = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
+            hinges.middle[index] = sum(readings) / len(readings)
+            hinges.closed[index] = min(readings)
+            hinges.offsets[index] = (hinges.middle[index] - min(readings)) * hinges.gains[index]
+    if hinges.reading_names:
+        hinges.wrist_start.fill_(float(hinges.hinge_depth[0].detach()) - 5 * shape.radius)
+
+
+@torch.no_grad()
+def unbend_seeds(hinges: Hinges, seeds: Tensor, logits: Tensor) -> Tensor:
+    """Seeds [M, 3] mm, carved with the joints at their offsets, turned to the pose of zero offsets, to which the
+    hinges are set: there a change of hinge or gains moves nothing."""
+    weights = torch.softmax(logits[:, : hinges.link_count], -1)
+    middle = {name: float(hinges.middle[joint]) for joint, name in enumerate(hinges.reading_names)}
+    turned = hinges.bend(seeds, weights, middle)
+    hinges.offsets.zero_()
+    return turned
+
+
+def seed_logits(hinges: Hinges, seeds: Tensor, columns: int, generator: torch.Generator) -> Tensor:
+    """[M, columns] part logits: behind the first hinge the body, beyond it one of the moving parts at random."""
+    logits = 0.3 * torch.randn(len(seeds), columns, generator=generator).to(seeds)
+    if not hinges.reading_names:
+        return logits
+    with torch.no_grad():
+        along = hinges.along_shaft(seeds)
+        beyond = along > hinges.hinge_depth[0]
+        logits[:, 0] += torch.where(beyond, 0.0, BODY_LOGIT)
+        side = torch.randint(1, hinges.link_count, (len(seeds),), generator=generator).to(seeds.device)
+        lean = nn.functional.one_hot(side, columns) * (BODY_LOGIT / 2)
+        return logits + torch.where(beyond[:, None], lean, lean.new_zeros(()))
+
+
+@dataclass(frozen=True)
+class HingeScores:
+    """Scores of hinges at A angles (rad around the carved shaft), D depths (mm along it) and all GAINS."""
+
+    angles: list[float]
+    depths: list[float]
+    score: np.ndarray  # [D, GAINS, A] mean evidence on the turned sticks, in [0, 1]
+    over_rigid: np.ndarray  # [D, GAINS, A] score less that of unturned sticks, times the share of the length they cover
+
+    @property
+    def depth(self) -> float:
+        """Half way between the best by score and the best over rigid sticks, mm.
+
+        The first prefers pivots too far back (short turns stay on the body), the second pivots too far forward.
+        """
+        best = [np.unravel_index(score.argmax(), score.shape)[0] for score in (self.score, self.over_rigid)]
+        return (self.depths[best[0]] + self.depths[best[1]]) / 2
+
+    @property
+    def angle(self) -> float:
+        """Phase of the score's second harmonic over the hinge angle, rad in [0, pi): uses the whole landscape, not its
+        peak alone."""
+        best = self.score.max((0, 1)).tolist()
+        wave = sum(s * complex(math.cos(2 * a), math.sin(2 * a)) for a, s in zip(self.angles, best, strict=True))
+        return (math.atan2(wave.imag, wave.real) / 2) % math.pi
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Those of the best score."""
+        return GAINS[np.unravel_index(self.score.argmax(), self.score.shape)[1]]
+
+
+def search_hinge(
+    evidence: Evidence, name: str, joint: str, shape: CarvedShape, settings: CarvingSettings
+) -> HingeScores | None:
+    """Scores of all hinges on a grid, by a search over stick figures; None when the reading hardly varies.
+
+    A joint moves two parts symmetrically or one alone. Its parts are sticks: the instrument's centre line beyond the
+    pivot, turned about the hinge by the reading. The right hinge keeps both sticks on evidence in every frame, above
+    all where the reading is large, and leaves tissue visible between them.
+    """
+    recorded = [frame.state.instruments[name].joints[joint] for frame in evidence.frames]
+    readings = torch.tensor(recorded, dtype=torch.float32, device=evidence.device)
+    opening = readings - readings.min()
+    if float(opening.max()) < MIN_READING_RANGE:
+        return None
+    closed = evidence.subset(torch.nonzero(readings <= readings.quantile(0.35))[:, 0])
+    line = center_line(closed, name, shape, settings)
+    if len(line) < 2:
+        line = shape.center_line
+    camera_from_shaft = camera_from_instrument(evidence, name) @ shape.instrument_from_shaft  # [F, 4, 4]
+    angles = torch.arange(HINGE_ANGLES, device=evidence.device) * (math.pi / HINGE_ANGLES)
+    length = shape.tip - shape.near
+    depths = np.linspace(shape.near + 0.4 * length, shape.tip - 0.15 * length, HINGE_DEPTHS).tolist()
+    score, over_rigid = [], []
+    for depth in depths:
+        stick = _stick(line, depth, shape.tip)
+        scores = {
+            gain: _stick_scores(evidence, camera_from_shaft, stick, depth, angles, gain * opening, opening)
+            for gain in {0.0, SMALL_GAIN, -SMALL_GAIN, *GAINS[0], *GAINS[1]}
+        }
+        turned = torch.stack([(scores[first] + scores[second]) / 2 for first, second in GAINS])
+        score.append(torch.maximum(turned, (scores[SMALL_GAIN] + scores[-SMALL_GAIN]) / 2))
+        over_rigid.append((turned - scores[0.0]) * ((shape.tip - depth) / length))
+    return HingeScores(angles.tolist(), depths, *(torch.stack(s).cpu().numpy() for s in (score, over_rigid)))
+
+
+def _stick(line: Tensor, depth: float, tip: float) -> Tensor:
+    """[Q, 3] shaft-frame points of the centre line [Z, 3] from just beyond the pivot at `depth` to just before the
+    tip."""
+    known = line.cpu().numpy()
+    along = np.linspace(depth + 0.15 * (tip - depth), tip - 0.1 * (tip - depth), STICK_POINTS)
+    across = [np.interp(along, known[:, 0], known[:, k]) for k in (1, 2)]
+    return torch.from_numpy(np.stack([*across, along], -1)).to(line)
+
+
+def _stick_scores(
+    evidence: Evidence,
+    camera_from_shaft: Tensor,
+    stick: Tensor,
+    depth: float,
+    angles: Tensor,
+    turns: Tensor,
+    weight: Tensor,
+) -> Tensor:
+    """[A] mean evidence on `stick` [Q, 3] for hinges at `angles` [A], turned by `turns` [F] rad, frames weighted by
+    `weight` [F]."""
+    axis = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)[:, None, None]  # [A, 1, 1, 3]
+    arm = (stick - stick.new_tensor([0.0, 0.0, depth]))[None, None]  # [1, 1, Q, 3]
+    cosine, sine = turns.cos()[None, :, None, None], turns.sin()[None, :, None, None]
+    along = (arm * axis).sum(-1, keepdim=True) * axis
+    across = torch.linalg.cross(axis.expand(-1, 1, arm.shape[2], 3), arm.expand(len(angles), 1, -1, 3))
+    turned = arm * cosine + across * sine + along * (1 - cosine)  # [A, F, Q, 3]
+    turned[..., 2] += depth
+    flat = turned.permute(1, 0, 2, 3).reshape(len(turns), -1, 3)  # [F, A * Q, 3]
+    points = flat @ camera_from_shaft[:, :3, :3].transpose(1, 2) + camera_from_shaft[:, None, :3, 3]
+    hits, inside = evidence.look_up_camera(points)
+    weights = (inside * weight[:, None]).reshape(len(turns), len(angles), -1)
+    total = (hits.reshape(weights.shape) * weights).sum((0, 2))
+    return total / weights.sum((0, 2)).clamp_min(1e-6)

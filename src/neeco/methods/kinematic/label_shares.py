@@ -1,0 +1,139 @@
+"""Which of the instruments' Gaussians count as instrument: near edges some model what it does to the tissue beside it.
+
+A contact shadow between jaws and tissue, or the blur of an edge, moves with the instrument, so its Gaussians learn it
+too. The recorded images tell: such pixels have the tissue's colour in another shade, others one that the inside of
+the instruments has.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from neeco.methods.kinematic.articulation import LABEL_SHARE
+from neeco.raster import rasterize
+from neeco.scene.visibility import visible_pixels
+from neeco.training.session import GaussianSession
+
+LABEL_FRAMES = 40  # whose colours tell instruments from shadow and blur on the tissue
+BINS = 12  # of each colour in the histogram of the instruments' colours
+SMOOTHING = 0.7  # bins, standard deviation
+INSIDE = 0.9  # share of a pixel that is instrument, from which it may be inside one
+EDGE = 0.012  # of the images' shorter side: within it of pixels that are less, colours are asked (3 px of 256)
+SHADES = 0.5, 1.05  # of the drawn tissue that contact shadows and errors of the light leave; a dark shaft has less
+COLOR_ERROR = 0.02, 0.06  # standard deviation of a tissue pixel across its shades: constant, and times its brightness
+OTHER_DENSITY = 0.02  # of colours that neither explains
+MIN_SHADE_LENGTH = 0.05  # of the segment in colour space that shades lie on
+LOW, HIGH = 0.25, 0.35  # mean probability of its pixels at which a Gaussian's share is 0 and 1
+MIN_INSIDE = 0.9  # mean probability inside the instruments, below which colours do not tell them from the tissue
+MIN_PIXELS = 1e-3  # that frames show of a Gaussian; one with less counts as instrument
+THRESHOLD = 0.5  # of the labels then: half of a pixel
+
+
+@dataclass(frozen=True)
+class _View:
+    """One training frame with what the scene draws there: its P pixels in which there is anything of an instrument, all
+    that a frame of 1920x1080 can be kept of."""
+
+    index: int  # of the frame
+    pixels: np.ndarray  # [H, W] bool: which these are
+    image: np.ndarray  # [P, 3] as recorded
+    tissue: np.ndarray  # [P, 3] drawn without instruments
+    inside: np.ndarray  # [P] bool: surely instrument
+
+
+def store_label_shares(session: GaussianSession) -> None:
+    """Give every Gaussian of an instrument its share of label in [0, 1], as the scene's extra LABEL_SHARE, and the
+    scene its label threshold; neither where colours do not tell instruments from tissue."""
+    scene = session.scene
+    instrument = scene.canonical.of_instruments
+    frames = session.frames_along_poses(LABEL_FRAMES)
+    views = [_view(session, index) for index in frames]
+    colors = _color_density(views)
+    probable = [_probability(view, colors) for view in views]
+    known = np.concatenate([p[view.inside] for p, view in zip(probable, views, strict=True)])
+    inside = float(known.mean()) if len(known) else 0.0
+    scene.diagnostics["label_shares"] = {"inside": round(inside, 3)}
+    if inside < MIN_INSIDE:
+        return
+    probable = [np.where(view.inside, 1.0, p) for p, view in zip(probable, views, strict=True)]
+    share = _label_shares(session, views, probable)
+    scene.canonical = scene.canonical.with_extras(**{LABEL_SHARE: share})
+    scene.label_threshold = THRESHOLD
+    scene.diagnostics["label_shares"]["mean"] = round(float(share[instrument].mean()), 3)
+
+
+def _label_shares(session: GaussianSession, views: list[_View], probable: list[np.ndarray]) -> Tensor:
+    """[N] in [0, 1]: by the mean probability of the pixels that show a Gaussian; 1 for tissue and what no frame
+    shows."""
+    scene = session.scene
+    shown = torch.zeros_like(scene.canonical.opacity_logits)
+    as_instrument = torch.zeros_like(shown)
+    for view, probability in zip(views, probable, strict=True):
+        state, camera = session.corrected(view.index)
+        posed = scene.at(state)
+        mask = session.views.mask(view.index)
+        counted = shown.new_ones(view.pixels.shape) if mask is None else mask.to(shown)
+        likely = torch.zeros_like(counted)
+        likely[torch.from_numpy(view.pixels).to(shown.device)] = torch.from_numpy(probability).to(shown)
+        shown += visible_pixels(posed, camera, counted)
+        as_instrument += visible_pixels(posed, camera, likely * counted)
+    share = ((as_instrument / shown.clamp_min(MIN_PIXELS) - LOW) / (HIGH - LOW)).clamp(0, 1)
+    share[~scene.canonical.of_instruments | (shown < MIN_PIXELS)] = 1
+    return share
+
+
+@torch.no_grad()
+def _view(session: GaussianSession, index: int) -> _View:
+    scene = session.scene
+    state, camera = session.corrected(index)
+    instrument = scene.canonical.of_instruments
+    posed = scene.at(state)
+    channels = rasterize(posed, camera, channels=instrument.float()[:, None]).channels
+    assert channels is not None
+    share = channels[..., 0].cpu().numpy()
+    reach = 2 * max(1, math.ceil(EDGE * min(share.shape))) + 1
+    inside = cv2.erode((share > INSIDE).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    tissue = rasterize(posed.select(~instrument), camera).color.clamp(0, 1).cpu().numpy()
+    image, mask = session.views.target(index).cpu().numpy(), session.views.mask(index)
+    if mask is not None:
+        inside &= mask.cpu().numpy()
+    pixels = share > 0
+    return _View(index, pixels, image[pixels], tissue[pixels], inside[pixels])
+
+
+def _bins(colors: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Bins of colours [..., 3] in [0, 1], one array a channel."""
+    found = np.clip((colors * BINS).astype(int), 0, BINS - 1)
+    return found[..., 0], found[..., 1], found[..., 2]
+
+
+def _color_density(views: list[_View]) -> np.ndarray:
+    """[BINS, BINS, BINS] density of the colours inside the instruments, per unit of the colour cube."""
+    counts = np.zeros((BINS,) * 3)
+    for view in views:
+        np.add.at(counts, _bins(view.image[view.inside]), 1)
+    smooth = gaussian_filter(counts, SMOOTHING)
+    return smooth / max(smooth.sum(), 1e-9) * BINS**3
+
+
+def _probability(view: _View, colors: np.ndarray) -> np.ndarray:
+    """[P] in (0, 1) that a pixel shows an instrument and no tissue, both equally likely beforehand.
+
+    Tissue in an unknown shade: uniform along the segment of its colour's shades, normal across it.
+    """
+    squared = (view.tissue**2).sum(-1)
+    shade = np.clip((view.image * view.tissue).sum(-1) / np.maximum(squared, 1e-6), *SHADES)
+    across = ((view.image - shade[..., None] * view.tissue) ** 2).sum(-1)
+    variance = (COLOR_ERROR[0] + COLOR_ERROR[1] * shade * np.sqrt(squared)) ** 2
+    length = np.maximum((SHADES[1] - SHADES[0]) * np.sqrt(squared), MIN_SHADE_LENGTH)
+    tissue = np.exp(-across / (2 * variance)) / (2 * math.pi * variance * length)
+    instrument = colors[_bins(view.image)]
+    found: np.ndarray = (instrument + OTHER_DENSITY) / (instrument + tissue + 2 * OTHER_DENSITY)
+    return found

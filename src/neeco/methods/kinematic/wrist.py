@@ -1,0 +1,214 @@
+"""Where an instrument's shaft ends and its wrist begins: where the colour along it changes, or, on an instrument of one
+colour, where it stops being a surface of revolution."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from neeco.methods.kinematic.articulation import ArticulatedInstruments, Articulation
+from neeco.raster import rasterize
+from neeco.raster.pinhole import pixel_centers, unproject_world
+from neeco.raster.types import Camera
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformation import UNPERTURBED, Perturbation
+from neeco.training.session import GaussianSession
+
+BORDER_FRAMES = 40  # whose colours along the shaft are used
+SPIN_FRAMES = 16  # in which shafts are spun to test their symmetry
+SPIN_ANGLE = 0.5  # rad: small, so that visible sides stay in view
+WRIST_STEPS = 14  # wrist positions whose symmetry is tested
+MAX_COST_RATIO = 1.01  # of the error with a wrist found again to that before
+SYMMETRY_TOLERANCE = 0.25  # of the range of losses that spinning causes
+BINS_PER_RADIUS = 6  # of the colour profile along the shaft
+MIN_BODY_SHARE = 0.95  # of a pixel whose colour counts
+MIN_FACING = 0.6  # cosine between a ray and the shaft's normal, across the shaft: silhouettes are left out
+MIN_COLOR = 0.02  # added to colours before the logarithm
+MIN_PIXELS = 6  # on either side of a step, in one frame
+MIN_FRAME_SHARE = 0.2  # of the frames that show both sides of a step
+MIN_CLEARNESS = 8.0  # times the median of steps along the shaft
+SOLID_OPACITY = 0.3  # of a Gaussian that counts as part of the instrument
+RADIUS_SHARE = 0.9  # of the solid Gaussians lie within the shaft's radius
+MIN_SOLID = 10  # solid Gaussians, with fewer nothing is measured
+
+
+@torch.no_grad()
+def place_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Set every wrist to where it is found."""
+    for index in range(len(session.scene.instruments)):
+        articulation = articulated.articulations[index]
+        if articulation.jointed:
+            measure_radius(session.scene.canonical, index, articulation)
+            articulation.wrist_start.fill_(_boundary(session, articulated, index))
+
+
+@torch.no_grad()
+def replace_wrists(session: GaussianSession, articulated: ArticulatedInstruments) -> None:
+    """Find every wrist again, and move it unless spinning what then lies behind it costs more than before."""
+    for index in range(len(session.scene.instruments)):
+        articulation = articulated.articulations[index]
+        if not articulation.jointed:
+            continue
+        before, found = float(articulation.wrist_start), _boundary(session, articulated, index)
+        frames = session.frames_along_poses(SPIN_FRAMES)
+        costs = {place: _spun_error(session, articulated, index, place, frames) for place in (before, found)}
+        articulation.wrist_start.fill_(found if costs[found] <= MAX_COST_RATIO * costs[before] else before)
+
+
+def _boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
+    boundary = color_boundary(session, articulated, index)
+    return _symmetry_boundary(session, articulated, index) if boundary is None else boundary
+
+
+def _symmetry_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float:
+    """Position mm along the shaft up to which spinning what lies behind costs little."""
+    scene = session.scene
+    articulation = articulated.articulations[index]
+    before = float(articulation.wrist_start)
+    joint, rear = float(articulation.first_joint()), float(solid_extent(scene.canonical, index, articulation)[0])
+    starts = torch.linspace(rear + 0.3 * (joint - rear), joint, WRIST_STEPS)
+    frames = session.frames_along_poses(SPIN_FRAMES)
+    base = sum(_image_error(session, frame, UNPERTURBED) for frame in frames)
+    costs = [_spun_error(session, articulated, index, float(start), frames) - base for start in starts]
+    articulation.wrist_start.fill_(before)
+    limit = min(costs) + SYMMETRY_TOLERANCE * (max(costs) - min(costs))
+    return max(float(start) for start, cost in zip(starts, costs, strict=True) if cost <= limit)
+
+
+def _spun_error(
+    session: GaussianSession, articulated: ArticulatedInstruments, index: int, start: float, frames: list[int]
+) -> float:
+    """Summed error of the frames' images with what lies behind `start` spun a little, one way and the other in turn.
+    Leaves the wrist there."""
+    articulated.articulations[index].wrist_start.fill_(start)
+    return sum(
+        _image_error(session, frame, articulated.spin_perturbation(-SPIN_ANGLE if k % 2 else SPIN_ANGLE))
+        for k, frame in enumerate(frames)
+    )
+
+
+def _image_error(session: GaussianSession, index: int, perturbation: Perturbation) -> float:
+    state, camera = session.corrected(index)
+    rendering = rasterize(session.scene.at(state, perturbation), camera)
+    error = (rendering.color - session.views.target(index)).abs()
+    mask = session.views.mask(index)
+    return float(error.mean() if mask is None else error[mask].mean())
+
+
+def color_boundary(session: GaussianSession, articulated: ArticulatedInstruments, index: int) -> float | None:
+    """Position mm along the shaft where the recorded images' colour along it changes most; None without a clear
+    step."""
+    articulation = articulated.articulations[index]
+    radius = float(articulation.radius)
+    rear = float(solid_extent(session.scene.canonical, index, articulation)[0])
+    like, end = articulation.shaft_like(articulated.link_weights(session.scene.canonical, index))
+    count = int((float(end) - rear) / (radius / BINS_PER_RADIUS))
+    if not count > 2 * BINS_PER_RADIUS:
+        return None
+    edges = rear + torch.arange(count + 1, device=session.views.device) * (radius / BINS_PER_RADIUS)
+    frames = session.frames_along_poses(BORDER_FRAMES)
+    steps = torch.stack([_steps(*_profile(session, articulated, index, frame, edges, like)) for frame in frames])
+    seen = steps.isfinite().all(2).sum(0)  # [count + 1] frames
+    enough = seen >= MIN_FRAME_SHARE * len(steps)
+    if int(enough.sum()) < BINS_PER_RADIUS:
+        return None
+    mean = torch.nanmean(steps[:, enough], 0).abs()  # [candidates, 3]
+    clearness = (mean / mean.median(0).values.clamp_min(1e-4)).norm(dim=1)
+    inner = clearness[1:-1]  # a maximum at the last edge is where the jaws begin, not a border
+    inner = torch.where((inner >= clearness[:-2]) & (inner >= clearness[2:]), inner, 0.0)
+    best = int(inner.argmax())
+    return float(edges[enough][best + 1]) if inner[best] > MIN_CLEARNESS else None
+
+
+def _steps(profile: Tensor, pixels: Tensor) -> Tensor:
+    """[B + 1, 3] at every edge between bins: the mean over one radius after it minus that before it; nan where either
+    has too few pixels. profile [B, 3] sums of colour over pixels [B]."""
+    window = BINS_PER_RADIUS
+    total = torch.cat([profile.new_zeros(1, 3), profile.cumsum(0)])  # [B + 1, 3]
+    number = torch.cat([pixels.new_zeros(1), pixels.cumsum(0)])[:, None]
+    steps = torch.full_like(total, math.nan)
+    middle = slice(window, len(total) - window)
+    after, before = slice(2 * window, None), slice(0, len(total) - 2 * window)
+    counts = number[after] - number[middle], number[middle] - number[before]
+    means = (total[after] - total[middle]) / counts[0], (total[middle] - total[before]) / counts[1]
+    steps[middle] = torch.where(torch.minimum(*counts) >= MIN_PIXELS, means[0] - means[1], math.nan)
+    return steps
+
+
+def _profile(
+    session: GaussianSession,
+    articulated: ArticulatedInstruments,
+    index: int,
+    frame_index: int,
+    edges: Tensor,
+    like: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """A recorded image's colour along the shaft: sums [B, 3] over the pixels [B] of each bin, as log brightness and
+    two log ratios, to which the light's colour and distance add constants; where Gaussians are `like` [M] the shaft."""
+    scene = session.scene
+    state, camera = session.corrected(frame_index)
+    body = scene.canonical.means.new_zeros(len(scene.canonical), 1)
+    body[scene.canonical.body(index + 1), 0] = like
+    channels = rasterize(scene.at(state), camera, channels=body).channels
+    assert channels is not None
+    pose = scene.registered(state).instruments[scene.instruments[index].name].pose
+    along = _along_shaft(camera, pose.to(body), articulated.articulations[index])  # [H, W]
+    chosen = (channels[..., 0] > MIN_BODY_SHARE) & along.isfinite()
+    mask = session.views.mask(frame_index)
+    if mask is not None:
+        chosen &= mask
+    logs = (session.views.target(frame_index)[chosen] + MIN_COLOR).log()  # [P, 3]
+    colors = torch.stack([logs.mean(1), logs[:, 0] - logs[:, 1], logs[:, 2] - logs[:, 1]], 1)
+    bins = torch.bucketize(along[chosen], edges) - 1
+    binned = (bins >= 0) & (bins < len(edges) - 1)
+    sums, pixels = colors.new_zeros(len(edges) - 1, 3), colors.new_zeros(len(edges) - 1)
+    sums.index_add_(0, bins[binned], colors[binned])
+    pixels.index_add_(0, bins[binned], torch.ones_like(colors[binned, 0]))
+    return sums, pixels
+
+
+def _along_shaft(camera: Camera, pose: Tensor, articulation: Articulation) -> Tensor:
+    """[H, W] mm along the shaft where the rays of pixels meet its cylinder; nan where they miss or graze it.
+
+    The Gaussians are too imprecise for this: they lie in a cloud about the surface. pose [4, 4] world_from_instrument.
+    """
+    origin, direction = articulation.shaft()
+    rotation = pose[:3, :3]
+    centers = pixel_centers(camera.height, camera.width).to(pose)
+    eye = camera.world_from_camera.to(pose)[:3, 3]
+    rays = (unproject_world(centers, torch.ones_like(centers[..., 0]), camera) - eye) @ rotation  # [H, W, 3]
+    start = (eye - pose[:3, 3]) @ rotation - origin  # [3]
+    ray_along, start_along = rays @ direction, start @ direction
+    across, aside = rays - ray_along[..., None] * direction, start - start_along * direction
+    square, radius = across.square().sum(-1), articulation.radius
+    half = across @ aside
+    discriminant = half.square() - square * (aside.square().sum() - radius.square())
+    depth = (-half - discriminant.clamp_min(0).sqrt()) / square
+    meets = (discriminant > (MIN_FACING * radius).square() * square) & (depth > 0)
+    return torch.where(meets, start_along + depth * ray_along, math.nan)
+
+
+def solid_gaussians(canonical: CanonicalGaussians, index: int) -> Tensor:
+    """[M] bool: which Gaussians of instrument `index` are opaque enough to count."""
+    return torch.sigmoid(canonical.opacity_logits[canonical.body(index + 1)]) > SOLID_OPACITY
+
+
+def measure_radius(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> None:
+    """Set the shaft's radius to the quantile RADIUS_SHARE of the solid Gaussians' distances from its axis, well behind
+    the first joint; leave it where there are too few."""
+    points = canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)]
+    origin, direction = articulation.shaft()
+    along = articulation.along_shaft(points)
+    away = (points - origin - along[:, None] * direction)[along < articulation.first_joint() - 2 * articulation.radius]
+    if len(away) >= MIN_SOLID:
+        articulation.radius.copy_(away.norm(dim=1).quantile(RADIUS_SHARE))
+
+
+def solid_extent(canonical: CanonicalGaussians, index: int, articulation: Articulation) -> Tensor:
+    """[2] mm along the shaft between which the solid Gaussians lie."""
+    along = articulation.along_shaft(canonical.means[canonical.body(index + 1)][solid_gaussians(canonical, index)])
+    if len(along) < MIN_SOLID:
+        return articulation.extent.clone()
+    return torch.quantile(along, along.new_tensor([0.02, 0.985]))

@@ -1,0 +1,5 @@
+"""Nerfies (Park et al. 2021), method `nerfies`: a radiance field seen through a learned SE(3) warp."""
+
+from neeco.methods.nerfies.session import Nerfies
+
+__all__ = ["Nerfies"]

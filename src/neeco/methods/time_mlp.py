@@ -1,0 +1,175 @@
+"""A network over place and time (Yang et al. 2024, "Deformable 3D Gaussians"), method `deformable-3dgs`.
+
+(d_mu, d_r, d_s) = F(gamma(mu), gamma(t)): 8 layers of 256, the input given again after the fifth (layer 4, counted from
+0), gamma(x) = (x, sin 2^k x, cos 2^k x) with 10 octaves for both; means detached; rotation added to the unit quaternion
+and scale to the scale itself, that is after activation; normal noise on the time of training frames, falling from a
+tenth of the frame interval to none at half of the run. `synthetic` is the source's variant for D-NeRF: 6 octaves of
+time through a small network 13 -> 256 -> 30, and no noise.
+
+Departures from the source:
+- Its iterations, of 40,000, are shares of the run, which is shorter here: warm-up until 3,000, density control until
+  15,000, noise until 20,000, and the fall of the learning rate from 8e-4 to 1.6e-6.
+- The head starts at zero, so that the end of the warm-up changes nothing. The source starts it at random.
+- The points' half extent is the unit of the input and of the changes of mean and scale; it is about 1 in the source.
+- The absolute value is taken of negative scales; in the source, too, the covariance squares them.
+- The number of Gaussians is limited (`max_tissue_gaussians`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neeco.capture.model import Instrument, State
+from neeco.raster.devices import bfloat16_products, tf32_products
+from neeco.scene.canonical import CanonicalGaussians
+from neeco.scene.deformation import (
+    HALF_BY_DEFAULT,
+    UNPERTURBED,
+    LabelledByMotion,
+    Perturbation,
+    Posed,
+    RecordedTimes,
+    check_warm_up,
+    encode,
+    log_linear,
+    robust_bounds,
+)
+from neeco.scene.method import PLAIN_TRAINING
+
+DEPTH, SKIP = 8, 4  # layers; the one after which the input is given again
+
+
+def octaves(values: Tensor, count: int) -> Tensor:
+    """gamma: [..., D] to [..., D * (1 + 2 count)], (x, sin(2^k x), cos(2^k x)) for k < count."""
+    return torch.cat([values, encode(values, count, unit=1.0)], -1)
+
+
+@dataclass(frozen=True)
+class TimeMLPSettings:
+    """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
+    `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;
+    `time_noise` at the start, in frame intervals, falling to none at the share `time_noise_stop` of the training;
+    `rate` and `final_rate`: learning rates at its ends; `half`: layers multiply in bfloat16 on a CPU that has it, and a
+    run is started with it where AMX makes it pay."""
+
+    width: int = 256
+    L_mean: int = 10
+    L_time: int | None = None
+    synthetic: bool = False
+    warm_up: float = 0.075
+    time_noise: float = 0.1
+    time_noise_stop: float = 0.5
+    rate: float = 8e-4
+    final_rate: float = 1.6e-6
+    half: bool = False
+
+    def __post_init__(self) -> None:
+        check_warm_up(self.warm_up)
+
+
+@dataclass(frozen=True)
+class NoisyTime(Perturbation):
+    """`time_noise`: standard deviation added to the time, in mean intervals between training frames."""
+
+    time_noise: float = 0.0
+
+
+class TimeMLP(LabelledByMotion):
+    """A network of 8 layers over place and time."""
+
+    method = "deformable-3dgs"
+    Settings = TimeMLPSettings
+    training_defaults: ClassVar[Mapping[str, Any]] = {
+        **PLAIN_TRAINING,
+        **HALF_BY_DEFAULT,
+        "ssim_weight": 0.2,
+        "density_stop": 0.375,
+    }
+    needs_times = True
+    large_operations = True
+
+    mean_center: Tensor
+    mean_halfwidth: Tensor
+
+    def __init__(self, instruments: tuple[Instrument, ...], settings: TimeMLPSettings | None = None) -> None:
+        super().__init__(instruments, settings)
+        sizes: TimeMLPSettings = self.settings
+        width, self.warm_up = sizes.width, sizes.warm_up
+        self.L_time = (6 if sizes.synthetic else 10) if sizes.L_time is None else sizes.L_time
+        self.times = RecordedTimes()
+        self.register_buffer("mean_center", torch.zeros(3))
+        self.register_buffer("mean_halfwidth", torch.ones(()))
+        self.mean_inputs, time_inputs = 3 * (1 + 2 * sizes.L_mean), 1 + 2 * self.L_time
+        if sizes.synthetic:
+            self.time_net = nn.Sequential(nn.Linear(time_inputs, 256), nn.ReLU(), nn.Linear(256, 30))
+            time_inputs = 30
+        inputs = self.mean_inputs + time_inputs
+        fans = [inputs] + [width + inputs if index == SKIP + 1 else width for index in range(1, DEPTH)]
+        self.layers = nn.ModuleList(nn.Linear(fan, width) for fan in fans)
+        self.head = nn.Linear(width, 10)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def fit_ranges(self, states: list[State], means: Tensor) -> None:
+        """Time from 0 to 1 over the recording, mu from -1 to 1 over the points."""
+        self.times.fit(states)
+        self.mean_center, self.mean_halfwidth = robust_bounds(means)
+
+    def perturb(
+        self, perturbation: Perturbation, iteration: int, progress: float, rng: np.random.Generator
+    ) -> Perturbation:
+        left = max(0.0, 1 - progress / self.settings.time_noise_stop)
+        noise = 0.0 if self.settings.synthetic else self.settings.time_noise * left
+        return NoisyTime(perturbation.state_noise, noise) if noise else perturbation
+
+    def pose(self, canonical: CanonicalGaussians, state: State, perturbation: Perturbation = UNPERTURBED) -> Posed:
+        scales = canonical.log_scales.exp()
+        if self.warming_up:
+            return Posed(canonical.means, canonical.quats, scales)
+        positions = (canonical.means.detach() - self.mean_center) / self.mean_halfwidth
+        change = self.network(positions, self.encoded_time(state, perturbation))
+        means = canonical.means + self.mean_halfwidth * change[:, :3]
+        quats = nn.functional.normalize(canonical.quats, dim=-1) + change[:, 3:7]
+        return Posed(means, quats, (scales + self.mean_halfwidth * change[:, 7:]).abs())
+
+    def time_of(self, state: State, perturbation: Perturbation) -> Tensor:
+        """The time of `state`, a scalar, 0 and 1 at the ends of the recording; perturbed where training asks for it."""
+        time = self.times.share(state)
+        if not isinstance(perturbation, NoisyTime):
+            return time
+        return time + perturbation.time_noise * self.times.interval * torch.randn((), device=time.device)
+
+    def encoded_time(self, state: State, perturbation: Perturbation) -> Tensor:
+        """gamma(t) [E]; the compensation of the dynamic training adjustment is added to it."""
+        encoded = octaves(self.time_of(state, perturbation)[None], self.L_time)
+        if perturbation.state_noise > 0:
+            encoded = encoded + perturbation.state_noise * torch.randn_like(encoded)
+        return self.time_net(encoded) if self.settings.synthetic else encoded
+
+    def network(self, positions: Tensor, encoded_time: Tensor) -> Tensor:
+        """F: positions [N, 3] in [-1, 1] and gamma(t) [E] to [N, 10] (mean, quaternion, scale)."""
+        encoded = octaves(positions, self.settings.L_mean)
+        features = encoded
+        with tf32_products(positions.device):
+            for index, layer in enumerate(self.layers):
+                assert isinstance(layer, nn.Linear)
+                if index == SKIP + 1:
+                    features = torch.cat([encoded.to(features.dtype), features], 1)
+                weight: Tensor = layer.weight
+                bias: Tensor = layer.bias
+                if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
+                    timeless = features.shape[1]
+                    weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
+                with bfloat16_products(positions.device, self.settings.half):  # the time, one row, is not
+                    features = torch.relu(nn.functional.linear(features, weight, bias))
+        return self.head(features.float())
+
+    def learning_rates(self, progress: float) -> dict[str, float]:
+        rate = log_linear(self.settings.rate, self.settings.final_rate, progress)
+        return dict.fromkeys((name for name, _ in self.named_parameters()), rate)

@@ -1,1 +1,0 @@
-"""Nerfies (Park et al. 2021), method `nerfies`: a radiance field seen through a learned SE(3) warp."""

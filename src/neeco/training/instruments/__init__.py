@@ -1,1 +1,0 @@
-"""Finding instruments and their joints from training frames alone."""
