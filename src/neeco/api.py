@@ -116,8 +116,13 @@ class Run:
 
     @cached_property
     def capture(self) -> Capture:
-        """The capture that the run was trained on. Raises NeecoError when it has moved."""
-        return read_capture(self.config["capture"], self.config["transforms"])
+        """The capture that the run was trained on, joints that nobody recorded as training found them. Raises NeecoError
+        when it has moved."""
+        return self._run.capture()
+
+    @property
+    def _run(self) -> runs.Run:
+        return runs.Run(self.path, self.scene.learned, dict(self.config))
 
     def evaluate(
         self,
@@ -136,11 +141,10 @@ class Run:
 
             neeco.load("runs/sample").evaluate(["test"])["given"]["test"]["psnr"]
         """
-        run = runs.Run(self.path, self.scene.learned, dict(self.config))
         networks = find_lpips(None if lpips_weights is None else Path(lpips_weights))
         tell = progress or (lambda what, done, total: None)
         with self.scene.learned.torch_threads():
-            return evaluate_run(run, self.capture, splits, align=align, networks=networks, progress=tell)
+            return evaluate_run(self._run, self.capture, splits, align=align, networks=networks, progress=tell)
 
 
 def load(path: PathLike, device: str = "auto") -> Run:

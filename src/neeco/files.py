@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import secrets
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -31,29 +32,51 @@ HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a f
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file beside `path`, sync it to disk and rename it to `path`.
 
-    On any failure the temporary file is removed and `path` is left as it was.
-    Raises NeecoError naming `path` when the disk refuses.
+    The user's umask decides who may read and write it. On any failure the temporary file is removed, and `path` holds
+    what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
+    # keep the suffix: some writers choose the format by it
+    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # keep the suffix: some writers choose the format by it
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+        _make_folders(path.parent)
+        # not by `tempfile`, whose files are their owner's alone
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         raise NeecoError(f"{path}: cannot write here: {error.strerror or error}") from error
-    os.close(handle)
-    temporary = Path(name)
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
             os.fsync(stream.fileno())
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+        _sync_folder(path.parent)
     except OSError as error:
         raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def _make_folders(path: Path) -> None:
+    """Make folder `path` and those above it, as far as they are missing, so that they outlast a power cut."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in missing:
+        _sync_folder(folder.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Sync a folder's entries to disk, where the system can open folders: a rename lasts only then."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of a file system without such syncs
+            raise
+    finally:
+        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -65,7 +88,7 @@ def new_folder(path: Path) -> Iterator[None]:
     path = Path(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        _make_folders(path)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
@@ -121,7 +144,7 @@ def _locked(folder: Path, named: Path) -> Iterator[None]:
     lock = folder / LOCK
     while True:
         try:
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             raise NeecoError(f"{lock}: cannot write: {error.strerror or error}") from error
         try:
@@ -162,6 +185,13 @@ def write_json(path: Path, value: Any) -> None:
     """Write `value` as indented JSON, atomically. NaN and infinity are refused (ValueError): JSON has no such
     numbers."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def require_utf8(path: Path | str) -> None:
+    """Raise NeecoError when the name of `path`, or of a folder above it, is not in UTF-8: no file of text could say where
+    it lies."""
+    if HALVES.search(name := os.path.abspath(path)):
+        raise NeecoError(f"{os.fsencode(name)!r}: the name is not in UTF-8; rename the file or folder")
 
 
 def require_inside(file: Path, folder: Path) -> Path:

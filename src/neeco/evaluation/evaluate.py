@@ -96,7 +96,7 @@ def evaluate_run(
     found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
     unreadable frames.
     """
-    scene = run.scene
+    scene, capture = run.scene, run.completed(capture)
     splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")
@@ -173,7 +173,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
     recorded = _Recorded(image, mask, reference, unobserved, tissue, features)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
-        state, camera = scene.recorded.with_unrecorded(frame.state, scene.instruments), frame.camera
+        state, camera = frame.state, frame.camera
         if kind == "aligned":
             fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
             state, camera = fit.state, fit.camera

@@ -150,9 +150,14 @@ class TrainingJob:
             for key in (key for key in identity if values[key] != identity[key]):
                 raise NeecoError(f"{file}: {key}: is {values[key]}, not {identity[key]}; {differs}")
         try:
-            old, new = vars(stored_config(folder, stored)), vars(self.train_config)
+            begun = stored_config(folder, stored)
         except NeecoError as error:  # of another version
             raise NeecoError(f"{str(error).removesuffix('; train again')}; {differs}") from None
+        wanted = self.train_config
+        if begun.method == wanted.method:
+            kind = method_class(wanted.method)
+            wanted = replace(wanted, deformation=kind.resolved(wanted.deformation, begun.deformation))
+        old, new = vars(begun), vars(wanted)
         for field in (name for name in new if old[name] != new[name]):
             raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 

@@ -147,7 +147,8 @@ def track_footage(
             info = stored
             if tissue == "footage":
                 scene = gaussian_scene(load_run(output / RUN, scene.center.device).scene, "track")
-        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust)
+        registered = trained_on.registered or tissue == "footage"
+        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust, registered)
         if tissue == "footage" and not stored.get("complete"):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
@@ -320,8 +321,9 @@ def _write(
     frames: Sequence[Frame],
     records: Sequence[dict[str, Any]],
     min_trust: float,
+    registered: bool,
 ) -> int:
-    """Write the trusted frames as a capture; how many there are."""
+    """Write the trusted frames as a capture, whose states tell every joint; how many there are."""
     chosen = tuple(
         replace(frame, state=state_of(record))
         for frame, record in zip(frames, records, strict=True)
@@ -329,11 +331,10 @@ def _write(
     )
     if chosen:
         points = footage.points if footage.points.measured else trained_on.points
-        write_capture(
-            Capture(output, chosen, scene.instruments, points, timed=footage.timed, lens=footage.lens),
-            output,
-            overwrite=True,
-        )
+        instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
+        # whatever else is known of the footage (its lens, a scope that stands still) holds for what is kept of it
+        made = replace(footage, root=output, frames=chosen, instruments=instruments, points=points, registered=registered)
+        write_capture(made, output, overwrite=True)
     return len(chosen)
 
 

@@ -94,6 +94,7 @@ def train(
                 return output
     elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
+    config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
     capture = read_checked(capture_path, config.transforms) if capture is None else capture
     digest = fingerprint(capture)
     if resume:
