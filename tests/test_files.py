@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -63,6 +64,31 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
         left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
         assert left == {*whole, LOCK}
     assert not (tmp_path / LOCK).exists()
+
+
+@pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
+def test_the_umask_decides_who_may_read(tmp_path: Path, umask: int, file: int, folder: int) -> None:
+    path = tmp_path / "made" / "file.txt"
+    before = os.umask(umask)
+    try:
+        write_atomically(path, lambda temporary: temporary.write_text("x"))
+        assert os.umask(umask) == umask  # it is the process's own, which other threads share
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == file
+    assert stat.S_IMODE(path.parent.stat().st_mode) == folder
+
+
+def test_a_file_and_then_the_folders_that_name_it_are_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, synced = tmp_path / "made" / "file.txt", []
+
+    def sync(descriptor: int) -> None:
+        place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append((place.name, path.exists()) if place.is_dir() else ("file", path.exists()))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    write_atomically(path, lambda temporary: temporary.write_text("x"))
+    assert synced == [(tmp_path.name, False), ("file", False), ("made", True)]
 
 
 def test_a_link_out_of_a_folder_is_refused_and_one_within_it_is_not(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
+from neeco.capture import Camera, Capture, Problem, State, check_capture
 from neeco.capture.model import Instrument
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
@@ -116,8 +116,8 @@ class Run:
 
     @cached_property
     def capture(self) -> Capture:
-        """The capture that the run was trained on, joints that nobody recorded as training found them. Raises NeecoError
-        when it has moved."""
+        """The capture that the run was trained on; joints that nobody recorded are as training found them. Raises
+        NeecoError when it has moved."""
         return self._run.capture()
 
     @property

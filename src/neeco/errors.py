@@ -36,7 +36,7 @@ def memory_failure(error: BaseException) -> str | None:
         cause = cause.__cause__ or cause.__context__
     if cause is None:
         return None
-    asked = re.search(r"allocate ([\d.]+) (\w+)", str(cause))
+    asked = re.search(r"allocate (\d+(?:\.\d+)?)\.? (\w+)", str(cause))
     numbers = [f"{_size(asked[1], asked[2])} more were asked for"] if asked else []
     numbers += [f"this process may use {_size(str(limit), 'bytes')}"] if (limit := _memory_limit()) else []
     details = f" ({', '.join(numbers)})" if numbers else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import math
 import os
 import re
 import secrets
@@ -83,9 +84,11 @@ def _sync_folder(folder: Path) -> None:
 def new_folder(path: Path) -> Iterator[None]:
     """Make folder `path` and those above it, as far as they are missing, and make sure that files can be written there.
 
-    When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses.
+    When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses, and
+    for a path that is not in UTF-8.
     """
     path = Path(path)
+    require_utf8(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         _make_folders(path)
@@ -187,9 +190,20 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def finite(value: Any) -> Any:
+    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
 def require_utf8(path: Path | str) -> None:
-    """Raise NeecoError when the name of `path`, or of a folder above it, is not in UTF-8: no file of text could say where
-    it lies."""
+    """Raise NeecoError when the name of `path`, or of a folder above it, is not in UTF-8: files of text could not say
+    where it lies."""
     if HALVES.search(name := os.path.abspath(path)):
         raise NeecoError(f"{os.fsencode(name)!r}: the name is not in UTF-8; rename the file or folder")
 

@@ -23,8 +23,10 @@ from neeco.experiments.machine import peak_memory_mb, reset_peak_memory, threads
 from neeco.experiments.study import check_workers, run_jobs
 from neeco.experiments.training_job import UNLIMITED, Budget, HeldOutFrames
 from neeco.raster.native import set_threads
+from neeco.settings import with_fields
 from neeco.training import train as train_module
 from neeco.training.config import training_config
+from neeco.training.run import write_config
 from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
@@ -70,6 +72,15 @@ def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
     assert make_job().run() == first
+
+
+def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
+    job = make_job(config=training_config("neeco", {}))
+    for half in (True, False):  # one of them is not what this processor would decide
+        write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
+        job.check()
+    with pytest.raises(NeecoError, match="deformation: this run has"):
+        make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
 
 
 def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +166,7 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
 
     with monkeypatch.context() as patched:
         patched.setattr(GaussianSession, "step", killed)
-        assert "MemoryError" in run_jobs([cut])[0]["error"]
+        assert "memory: too little" in run_jobs([cut])[0]["error"]
     assert without_times(cut.run()) == without_times(expected)
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
 

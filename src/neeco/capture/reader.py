@@ -17,6 +17,7 @@ from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share
 from neeco.capture.points import PointCloud, points_in_view
 from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
+from neeco.files import require_utf8
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
@@ -99,8 +100,10 @@ def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -
 def parse_capture(
     path: Path | str, report: ProblemReport, transforms: str = "transforms.json", background: float = 1.0
 ) -> Parsed:
-    """Read as much of a capture as can be read; what is wrong with it goes to `report`."""
+    """Read as much of a capture as can be read; what is wrong with it goes to `report`. Raises NeecoError for a path
+    that is not in UTF-8."""
     path = Path(path)
+    require_utf8(path)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
     if not os.path.isdir(path):

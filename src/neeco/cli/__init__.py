@@ -167,7 +167,7 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
-    for word in (*words, os.getcwd()):
+    for word in (os.getcwd(), *words):
         require_utf8(word)
     from neeco.raster.devices import readable_failures
     from neeco.raster.native import keep_freed_memory

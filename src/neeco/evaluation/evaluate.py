@@ -22,7 +22,6 @@ from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
 from neeco.evaluation.mask_metrics import (
     PartTally,
     dice,
-    finite,
     iou,
     mean_of,
     pairs_of,
@@ -30,7 +29,7 @@ from neeco.evaluation.mask_metrics import (
     precision,
     to_truth_ids,
 )
-from neeco.files import write_json
+from neeco.files import finite, write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise

@@ -23,7 +23,7 @@ from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
 from neeco.experiments.study import JobProgress, Result
-from neeco.files import read_json, read_text, require_like, write_json, write_text
+from neeco.files import finite, read_json, read_text, require_like, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_class
@@ -343,7 +343,8 @@ class TrainingRecorder:
         for split, value in self.held_out.score(scene).items():
             row = {key: self.totals[key] for key in ("iteration", "seconds", "processor_seconds")}
             self.rows.append(row | {"progress": round(progress, 4), "split": split, "psnr": value})
-        write_text(self.folder / CURVE_FILE, "".join(json.dumps(row) + "\n" for row in self.rows))
+        lines = [json.dumps(row, allow_nan=False) + "\n" for row in finite(self.rows)]
+        write_text(self.folder / CURVE_FILE, "".join(lines))
         self.save()
 
     def save(self) -> None:

@@ -133,7 +133,7 @@ class Settings(ImageSettings):
     min_component: float = 0.01
     """Drop components of an instrument's mask smaller than this share of its largest."""
     tissue_check: bool = True
-    """Refuse states whose instrument enters the tissue, as far as the view shows it."""
+    """States whose instrument enters the tissue, as far as the view shows it, are refused, unless --no-tissue-check."""
     tissue_tolerance_mm: float | None = None
     """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
     min_share: float = 0.005

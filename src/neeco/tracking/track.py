@@ -333,7 +333,7 @@ def _write(
         points = footage.points if footage.points.measured else trained_on.points
         instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
         # whatever else is known of the footage (its lens, a scope that stands still) holds for what is kept of it
-        made = replace(footage, root=output, frames=chosen, instruments=instruments, points=points, registered=registered)
+        made = replace(footage, frames=chosen, instruments=instruments, points=points, registered=registered)
         write_capture(made, output, overwrite=True)
     return len(chosen)
 

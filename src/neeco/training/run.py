@@ -19,7 +19,7 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, write_text
+from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, require_utf8, write_text
 from neeco.scene.drawable import Learned
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.training_session import Session, StepResult, members
@@ -74,6 +74,7 @@ def open_run(path: Path, device: torch.device | None = None) -> Iterator[Run]:
 def read_config(path: Path) -> dict[str, Any]:
     """config.yaml of run folder `path`, checked."""
     path = Path(path)
+    require_utf8(path)
     file = path / "config.yaml"
     if not path.is_dir():
         raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
@@ -146,7 +147,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         "seconds": session.seconds,
         "window": [[step.loss, step.psnr] for step in session.window],
     }
-    metadata = {"neeco": json.dumps(header | fields)}
+    metadata = {"neeco": json.dumps(header | fields, allow_nan=False)}
     save_tensors(
         {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
     )

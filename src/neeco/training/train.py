@@ -287,7 +287,7 @@ class _Log:
         entry = {key: value for key, value in vars(self.last).items() if key != "note"}
         try:
             with self.path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(entry) + "\n")
+                stream.write(json.dumps(entry, allow_nan=False) + "\n")
         except OSError as error:
             raise NeecoError(f"{self.path}: cannot write: {error.strerror or error}") from error
         if self.progress:

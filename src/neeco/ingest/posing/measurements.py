@@ -72,7 +72,7 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
             "seen": found.seen,
         }
         tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in stored.items()}
-    joints = json.dumps({name: found.joints for name, found in measured.items()})
+    joints = json.dumps({name: found.joints for name, found in measured.items()}, allow_nan=False)
     notes = {"format": FORMAT, "frames": _frames(capture), "joints": joints}
     write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
 

@@ -175,7 +175,7 @@ def write_imagefolder(root: Path, records: Sequence[Record], instruments: Sequen
                 "name": [label["name"] for label in seen],
             },
         }
-        lines.setdefault(split, []).append(json.dumps(line))
+        lines.setdefault(split, []).append(json.dumps(line, allow_nan=False))
     for split, of_split in lines.items():
         write_text(root / IMAGEFOLDER / split / "metadata.jsonl", "".join(f"{line}\n" for line in of_split))
 
