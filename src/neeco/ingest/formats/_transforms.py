@@ -9,17 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA, PoseColumns
+from neeco.ingest.columns import PoseColumns
 from neeco.ingest.formats import Table
 from neeco.ingest.formats._bagsurvey import Survey
+from neeco.ingest.frames import meaning_of, of_dvrk
 from neeco.ingest.interpolate import poses_at
 from neeco.ingest.logs import NORM_TOLERANCE, read_pose_log
 
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 
 
-def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
-    """Poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves."""
+def chained(survey: Survey, stream: str, images: set[str]) -> Table:
+    """Poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves. images: frames of the
+    bag's images."""
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     known = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
@@ -49,7 +51,7 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
     return Table(
         survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
-        frame=CAMERA if frame in cameras else None, stated_in=frame,
+        stated_in=frame, meaning=meaning_of(frame, images, dvrk=of_dvrk(child)),
     )  # fmt: skip
 
 

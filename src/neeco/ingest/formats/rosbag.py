@@ -16,7 +16,6 @@ import numpy as np
 
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -28,6 +27,7 @@ from neeco.ingest.formats import (
     VideoSource,
     choose_stream,
 )
+from neeco.ingest.frames import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 
 if TYPE_CHECKING:
     from neeco.ingest.formats._bagsurvey import Joints, Samples, Survey
@@ -74,7 +74,7 @@ class RosBag(RecordingFormat):
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
             from neeco.ingest.formats._transforms import chained
 
-            return chained(survey, stream, _camera_frames(survey))
+            return chained(survey, stream, _image_frames(survey))
         chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
@@ -86,8 +86,8 @@ class RosBag(RecordingFormat):
             listed = ", ".join(sorted(names)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
         stated_in = next(iter(names), None) or None
-        frame = CAMERA if stated_in in _camera_frames(survey) else None
-        return replace(_table(survey, chosen, poses, POSE_HEADER, poses.table()), frame=frame, stated_in=stated_in)
+        table = _table(survey, chosen, poses, POSE_HEADER, poses.table())
+        return replace(table, stated_in=stated_in, meaning=_meaning(survey, chosen))
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.formats._rosimages import open_topic
@@ -140,7 +140,7 @@ class RosBag(RecordingFormat):
         return Stream(name, IMAGES if usable else OTHER, kind, len(log.received), rate)
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
-        log, cameras = survey.poses[name], _camera_frames(survey)
+        log, meaning = survey.poses[name], _meaning(survey, name)
         frames, dvrk = log.frames, {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
         if dvrk:
             offered = name in dvrk
@@ -150,16 +150,18 @@ class RosBag(RecordingFormat):
             offered = not _WANTED.search(name)
         frame = ", ".join(sorted(frames)) or "no named frame"
         title = f"{log.type} in {frame}{', static' if log.static else ''}"
-        hints = [f"poses are stated in {frame}{', the frame of the camera' if frames <= cameras else ''}"]
+        hints = [*(meaning.hints or (f"poses are stated in {frame}",))]
         if name in dvrk and _body(name) == DVRK_CAMERA:
-            of_arms = {base for topic in dvrk - {name} for base in survey.poses[topic].frames}
-            if of_arms - frames - cameras:  # these would not register them
+            bases = [topic for topic in dvrk - {name} if _meaning(survey, topic).frame not in CAMERA_FRAMES]
+            of_arms = {base for topic in bases for base in survey.poses[topic].frames}
+            if of_arms - frames:  # these would not register them
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
             hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
         rate = _rate(survey.seconds(log.stamps, log.received))
         kind = OTHER if log.static else POSES
-        return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints))
+        asks = meaning.asks
+        return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints), asks=asks)
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
         log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
@@ -207,9 +209,15 @@ def _rate(seconds: np.ndarray) -> float | None:
     return (len(seconds) - 1) / length if length > 0 else None
 
 
-def _camera_frames(survey: Survey) -> set[str]:
+def _image_frames(survey: Survey) -> set[str]:
     """Frames of the images' cameras."""
-    return ({DVRK_CAMERA} | {name for log in survey.images.values() for name in log.frames}) - {""}
+    return {name for log in survey.images.values() for name in log.frames} - {""}
+
+
+def _meaning(survey: Survey, name: str) -> NamedFrame:
+    """What the frame of a stream's poses is."""
+    frames = survey.poses[name].frames
+    return meaning_of(next(iter(frames), ""), _image_frames(survey), dvrk=of_dvrk(name))
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
