@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from neeco.capture.conventions import CONVENTIONS, DVRK_ECM, OPENCV, ROS_BODY, AxisConvention
+from neeco.capture.documents import printable
 from neeco.ingest.columns import BASE, CAMERA
 
 CAMERA_FRAMES: dict[str, AxisConvention] = {CAMERA: OPENCV, **CONVENTIONS}  # what `frame` in recording.yaml may say
@@ -65,6 +66,7 @@ def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -
     """What a frame's own name says. images: frames that the images of the same file are stated in; dvrk: are the poses
     a dVRK's?"""
     plain, own = name.strip("/").lower(), {image.strip("/").lower() for image in images}
+    name = printable(name).strip("'")
     last = plain.rpartition("/")[2]
     camera = (CAMERA, DVRK_ECM.name) if dvrk or _ECM.search(plain) else (CAMERA,)
     if plain in own:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.columns import PoseColumns
+from neeco.ingest.columns import BASE, PoseColumns
 from neeco.ingest.formats import Table
 from neeco.ingest.formats._bagsurvey import Survey
 from neeco.ingest.frames import meaning_of, of_dvrk
@@ -68,7 +68,9 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
             pose[:3, 3] = 1000 * values[:3]
             poses = np.tile(pose, (len(seconds), 1, 1))
         else:
-            poses, _ = poses_at(read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}")), seconds, 0.0)
+            # as it stands, whatever its parent's axes: those of the last frame alone matter
+            log_of_edge = read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}", frame=BASE))
+            poses, _ = poses_at(log_of_edge, seconds, 0.0)
         total = poses @ total
     return total
 
