@@ -132,8 +132,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T, 3] and quaternions [T, 4] wxyz stated in a camera's frame (`frames.CAMERA_FRAMES`), in OpenCV's
-    axes."""
-    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3]
+    axes; what is stated in a base stays."""
+    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
     if np.array_equal(turn, np.eye(3)):
         return positions, quats
     turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
