@@ -26,7 +26,9 @@ _SIDES = "left|right|rgb|colou?r|stereo|mono|front|head"
 _CAMERA = re.compile(rf"(.*/)?(({_SIDES})_?)*({_WORDS})(_?({_SIDES}|\d+))*(_(link|frame|body))?")
 _DVRK = re.compile(r"(^|[/_.\-:\s])(psm\d?|ecm|dvrk|mtm[lr])([/_.\-:\s]|$)", re.IGNORECASE)
 # a frame in the name of a column, feature or file: `pose_in_ecm`, `camera_frame`
-_NAMED_IN = r"(?:^|[_.\-/])(?:(?:in|wrt)[_.\-/](?:the[_.\-/])?({0})|({0})[_.\-/]?frame)(?:[_.\-/]|$)"
+_NAMED_IN = (
+    r"(?:^|[_.\-/])(?:(?:in|wrt|relative_to)[_.\-/](?:(?:the|left|right)[_.\-/])*({0})|({0})[_.\-/]?frame)(?:[_.\-/]|$)"
+)
 _CAMERA_IN = re.compile(_NAMED_IN.format("camera|cam|ecm|endoscope"), re.IGNORECASE)
 _BASE_IN = re.compile(_NAMED_IN.format(r"(?:robot[_.\-/]?)?base"), re.IGNORECASE)
 

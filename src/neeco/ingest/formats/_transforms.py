@@ -55,6 +55,22 @@ def chained(survey: Survey, stream: str, images: set[str]) -> Table:
     )  # fmt: skip
 
 
+def fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
+    """[4, 4] mm frame_from_child where static transforms join the two; None elsewhere."""
+    try:
+        ups, downs = (_to_root(survey, str(survey.path), name) for name in (child, frame))
+        while ups and downs and ups[-1] == downs[-1]:
+            ups.pop()
+            downs.pop()
+        ends = [_parent(survey, "", edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
+    except NeecoError:
+        return None
+    if ends[0] != ends[1] or not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
+        return None
+    once = np.zeros(1)
+    return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
+
+
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
     """[N, 4, 4] mm: pose of the first edge's child in the last one's parent; NaN where any is not known."""
     total = np.tile(np.eye(4), (len(seconds), 1, 1))

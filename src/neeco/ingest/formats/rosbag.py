@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.ingest.columns import CAMERA
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+MM_PER_M = 1000.0
 LATE = 1.0  # s between stamps and receipt that tell of another clock
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
@@ -86,8 +89,13 @@ class RosBag(RecordingFormat):
             listed = ", ".join(sorted(names)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
         stated_in = next(iter(names), None) or None
-        table = _table(survey, chosen, poses, POSE_HEADER, poses.table())
-        return replace(table, stated_in=stated_in, meaning=_meaning(survey, chosen))
+        values, meaning, fixed = poses.table(), _meaning(survey, chosen), _camera_from_stated(survey, chosen)
+        if fixed is not None:
+            known = np.linalg.norm(values[:, 3:], axis=1) > 0
+            turn = Rotation.from_matrix(fixed[:3, :3])
+            values[:, :3] = turn.apply(values[:, :3]) + fixed[:3, 3] / MM_PER_M
+            values[known, 3:] = (turn * Rotation.from_quat(values[known, 3:])).as_quat()
+        return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.formats._rosimages import open_topic
@@ -216,8 +224,25 @@ def _image_frames(survey: Survey) -> set[str]:
 
 def _meaning(survey: Survey, name: str) -> NamedFrame:
     """What the frame of a stream's poses is."""
-    frames = survey.poses[name].frames
-    return meaning_of(next(iter(frames), ""), _image_frames(survey), dvrk=of_dvrk(name))
+    frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
+    if _camera_from_stated(survey, name) is None:
+        return meaning_of(frame, images, dvrk=of_dvrk(name))
+    return NamedFrame(
+        CAMERA, f"{frame}, and turned by static transforms of the bag to {next(iter(images))}, the images'"
+    )
+
+
+def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
+    """[4, 4] mm from the frame of a stream's poses to the images' own, where the first's axes are not certain by its
+    name but static transforms tell them; else None."""
+    from neeco.ingest.formats._transforms import fixed_transform
+
+    frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
+    if len(survey.poses[name].frames) != 1 or len(images) != 1 or frame in images:
+        return None
+    own = next(iter(images))
+    certain = meaning_of(frame, images, dvrk=of_dvrk(name)).frame is not None
+    return None if certain or meaning_of(own, images).frame is None else fixed_transform(survey, frame, own)
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:
