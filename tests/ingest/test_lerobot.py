@@ -181,7 +181,9 @@ def test_the_convention_of_angles_is_not_guessed(tmp_path):
 
 
 def test_the_frame_of_poses_is_not_guessed(nameless):
-    with pytest.raises(NeecoError, match=r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base"):
+    with pytest.raises(
+        NeecoError, match=r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base"
+    ):
         read_pose_log(pose_columns(nameless, frame=None))
 
 

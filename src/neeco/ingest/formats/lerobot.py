@@ -36,7 +36,7 @@ from neeco.ingest.formats import (
     VideoSource,
     choose_stream,
 )
-from neeco.ingest.frames import NamedFrame, meaning_in, of_dvrk, unsaid
+from neeco.ingest.frames import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 
 if TYPE_CHECKING:
     from neeco.ingest.formats._lerobotfiles import DataSet, Episode, Feature
@@ -181,7 +181,8 @@ class LeRobot(RecordingFormat):
             return [plain]
         bodies = pose_bodies(feature.names)
         found = []
-        for body, columns in bodies.items():
+        for name, columns in bodies.items():
+            body = without_frame(name)
             rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
             own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
             joints = tuple((_joint_name(column, body), column) for column in own)
