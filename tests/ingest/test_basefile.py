@@ -63,7 +63,7 @@ def test_a_registration_of_the_dvrk_is_in_metres_and_one_in_its_own_axes_is_turn
 def test_a_registration_to_the_ecm_must_say_in_which_axes(tmp_path):
     path = tmp_path / "psm1.json"
     path.write_text(json.dumps({"base-frame": FRAME | {"reference-frame": "/ECM"}}))
-    with pytest.raises(NeecoError, match=r"reference-frame: is '/ECM', and nothing says whether .* or OpenCV's"):
+    with pytest.raises(NeecoError, match=r"reference-frame'\]: is '/ECM', and nothing says whether .* or OpenCV's"):
         read_dvrk_registration(path)
 
 
