@@ -67,6 +67,16 @@ def test_a_registration_to_the_ecm_must_say_in_which_axes(tmp_path):
         read_dvrk_registration(path)
 
 
+def test_a_trackers_frame_has_no_cameras_axes(tmp_path):
+    (tmp_path / "video.mp4").touch()
+    (tmp_path / "psm.csv").touch()
+    document = {"video": "video.mp4", "instruments": [{"name": "psm1", "poses": "psm.csv"}]}
+    document["world_from_base"] = {"transform": MILLIMETRES, "axes": "ecm"}
+    (tmp_path / "recording.yaml").write_text(json.dumps(document))
+    with pytest.raises(NeecoError, match=r"world_from_base\.axes: a tracker's frame has none"):
+        read_recording(tmp_path / "recording.yaml")
+
+
 def test_a_transform_may_lead_to_the_camera_in_other_axes(tmp_path):
     base = _recording(tmp_path, {"transform": MILLIMETRES, "axes": "ecm"})[0].base
     assert np.array_equal(base.matrix, np.diag([-1, -1, 1, 1]) @ MILLIMETRES)

@@ -135,6 +135,15 @@ def test_columns_that_count_frames_or_name_images_are_no_frame_of_poses(tmp_path
     assert read_pose_log(PoseColumns(path)).frame == BASE
 
 
+def test_poses_of_several_frames_in_one_table_are_refused_and_left_out_of_a_template(tmp_path):
+    path = table(tmp_path / "a.csv", "", SEEN, "PSM1_base")
+    path.write_text(path.read_text().replace("PSM1_base", "ECM", 1))
+    with pytest.raises(NeecoError, match=r"frame_id: poses are stated in several frames \(ECM, PSM1_base\)"):
+        read_pose_log(PoseColumns(path))
+    (tmp_path / "video.mp4").touch()
+    assert "#   a.csv: frame_id: poses are stated in several frames" in write_template(tmp_path)
+
+
 def test_camera_means_opencvs_axes_and_is_refused_where_the_file_names_others(tmp_path):
     path = table(tmp_path / "psm1_in_ecm.csv", "", ECM)
     with pytest.raises(NeecoError, match=r"frame: camera means OpenCV's axes .* write frame: ecm\), or frame: opencv"):

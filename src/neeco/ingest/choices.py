@@ -15,6 +15,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.columns import (
+    BASE,
     EULER,
     QUATERNION_WXYZ,
     QUATERNION_XYZW,
@@ -23,8 +24,8 @@ from neeco.ingest.columns import (
     recognise_pose,
 )
 from neeco.ingest.formats import POSES, Stream, format_of, numbers, read_table
-from neeco.ingest.frames import CAMERA_FRAMES
-from neeco.ingest.logs import in_opencv, to_quaternions
+from neeco.ingest.frames import CAMERA_FRAMES, NamedFrame
+from neeco.ingest.logs import in_opencv, to_quaternions, with_named_frame
 
 UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
 CONVENTIONS = ("XYZ", "ZYX", "xyz", "zyx")  # of three angles, as scipy names them
@@ -147,12 +148,10 @@ def _open(source: Path, stream: Stream) -> list[OpenPoses]:
         readings.append(Reading(f"{title}{' in deg' if degrees else ''}", quats))
     if good.sum() < 2:
         return []
-    times, title = (
-        numbers(table, table.header[:1])[0][good, 0],
-        f"{stream.name}{f', {stream.body}' if stream.body else ''}",
-    )
-    choices = () if table.meaning is None else table.meaning.choices
-    frames = [table.frame] if table.frame else [frame for frame in choices if frame in CAMERA_FRAMES]
+    times = numbers(table, table.header[:1])[0][good, 0]
+    title = f"{stream.name}{f', {stream.body}' if stream.body else ''}"
+    meaning = with_named_frame(table, position).meaning or NamedFrame(BASE)
+    frames = [meaning.frame] if meaning.frame else [frame for frame in meaning.choices if frame in CAMERA_FRAMES]
     return [
         OpenPoses(
             title, times, in_opencv(frame, places[good], readings[0].quats[good])[0],

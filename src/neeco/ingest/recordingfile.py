@@ -273,6 +273,8 @@ def _base(section: Section, poses: PoseColumns | None) -> StatedBase | None:
         if section.place:
             raise section.error(given[0], "its poses are in the camera's frame already; leave out one of the two")
         return None
+    if given[0] == WORLD_KEY and isinstance(value := section.value[WORLD_KEY], dict) and "axes" in value:
+        raise section.error(f"{WORLD_KEY}.axes", "a tracker's frame has none of a camera's; leave it out")
     base = parse_base(section.node.child(given[0]), section.file.parent)
     return replace(base, to_world=given[0] == WORLD_KEY)
 

@@ -215,6 +215,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     name = log.file
     try:
         table = read_table(file)
+        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
         found.others.append(" ".join(str(error).replace(str(file), name).split()))
         return
@@ -228,7 +229,6 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
-        meaning = with_named_frame(table, pose.position or ()).meaning
         if meaning is not None:
             log = replace(log, hints=meaning.hints, asks=meaning.asks)
         found.poses.append((log, pose))

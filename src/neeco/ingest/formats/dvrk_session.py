@@ -275,7 +275,8 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
     body = match[1] if match else None
     if kind == POSES:
-        meaning = meaning_of(_stated_in(table) or "", dvrk=True)
+        stated_in = _frames(table)
+        meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
         hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
         return Stream(
             topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
@@ -315,19 +316,18 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
     rows = np.column_stack([times - start, values])
     found = Table(path, header, rows, table.lines, stream=stream.name, notes=tuple(notes))
-    if stream.kind != POSES:
+    frames = _frames(table)
+    if stream.kind != POSES or not frames:
         return found
-    stated_in = _stated_in(table)
-    return replace(found, stated_in=stated_in, meaning=meaning_of(stated_in or "", dvrk=True))
-
-
-def _stated_in(table: Table) -> str | None:
-    """The frame that a topic's poses are stated in. Raises NeecoError for several."""
-    if "header.frame_id" not in table.header:
-        return None
-    index = table.header.index("header.frame_id")
-    names = {row[index].lstrip("/") for row in table.rows if len(row) > index}
-    if len(names) > 1:
-        listed = ", ".join(sorted(names)[:4])
+    if len(frames) > 1:
+        listed = ", ".join(frames[:4])
         raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
-    return next(iter(names), None)
+    return replace(found, stated_in=frames[0], meaning=meaning_of(frames[0], dvrk=True))
+
+
+def _frames(table: Table) -> list[str]:
+    """Names of the frames that a topic's poses are stated in."""
+    if "header.frame_id" not in table.header:
+        return []
+    index = table.header.index("header.frame_id")
+    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})

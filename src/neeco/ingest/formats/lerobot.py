@@ -181,8 +181,8 @@ class LeRobot(RecordingFormat):
             return [plain]
         bodies = pose_bodies(feature.names)
         found = []
-        for name, columns in bodies.items():
-            body = without_frame(name)
+        for prefix, columns in bodies.items():
+            body = without_frame(prefix)
             rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
             own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
             joints = tuple((_joint_name(column, body), column) for column in own)

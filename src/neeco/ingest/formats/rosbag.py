@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA
+from neeco.ingest.columns import BASE, CAMERA
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -158,7 +158,7 @@ class RosBag(RecordingFormat):
             offered = not _WANTED.search(name)
         frame = ", ".join(sorted(frames)) or "no named frame"
         title = f"{log.type} in {frame}{', static' if log.static else ''}"
-        hints = [*(meaning.hints or (f"poses are stated in {frame}",))]
+        hints = list(meaning.hints or (f"poses are stated in {frame}",))
         if name in dvrk and _body(name) == DVRK_CAMERA:
             bases = [topic for topic in dvrk - {name} if _meaning(survey, topic).frame not in CAMERA_FRAMES]
             of_arms = {base for topic in bases for base in survey.poses[topic].frames}
@@ -168,8 +168,9 @@ class RosBag(RecordingFormat):
             hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
         rate = _rate(survey.seconds(log.stamps, log.received))
         kind = OTHER if log.static else POSES
-        asks = meaning.asks
-        return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints), asks=asks)
+        return Stream(
+            name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints), asks=meaning.asks
+        )
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
         log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
@@ -218,13 +219,17 @@ def _rate(seconds: np.ndarray) -> float | None:
 
 
 def _image_frames(survey: Survey) -> set[str]:
-    """Frames of the images' cameras."""
-    return {name for log in survey.images.values() for name in log.frames} - {""}
+    """Frames of the first camera's images: another's, as a stereo scope's right one, has its own place."""
+    first = min(survey.images, key=_camera_order, default=None)
+    return set() if first is None else survey.images[first].frames - {""}
 
 
 def _meaning(survey: Survey, name: str) -> NamedFrame:
-    """What the frame of a stream's poses is."""
-    frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
+    """What the frame of a stream's poses is; of several, which are refused when read, nothing."""
+    frames, images = survey.poses[name].frames, _image_frames(survey)
+    if len(frames) != 1:
+        return NamedFrame(BASE)
+    frame = next(iter(frames))
     if _camera_from_stated(survey, name) is None:
         return meaning_of(frame, images, dvrk=of_dvrk(name))
     return NamedFrame(

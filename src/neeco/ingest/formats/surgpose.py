@@ -7,7 +7,7 @@ each arm's own base frame, a few mm and degrees off the camera's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from neeco.capture.documents import as_float, printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_text
-from neeco.ingest.columns import BASE
 from neeco.ingest.formats import (
     HUGE,
     IMAGES,
@@ -32,7 +31,6 @@ from neeco.ingest.formats import (
     VideoSource,
     choose_stream,
 )
-from neeco.ingest.frames import NamedFrame
 from neeco.ingest.stereofile import read_stereo
 from neeco.ingest.video import open_images, open_video
 
@@ -93,10 +91,8 @@ class SurgPose(RecordingFormat):
             frames, values = arms.joints[chosen.name.removesuffix(JOINTS_BEHIND)]
             header = ("t_s", *JOINT_NAMES[: values.shape[1]])
         rows = np.column_stack([frames / FRAMES_PER_SECOND, values])
-        table = Table(path, header, rows, frames, stream=chosen.name, record="frame")
-        if chosen.kind != POSES:
-            return table
-        return replace(table, stated_in=f"{chosen.name}_base", meaning=NamedFrame(BASE))
+        stated_in = f"{chosen.name}_base" if chosen.kind == POSES else None
+        return Table(path, header, rows, frames, stream=chosen.name, record="frame", stated_in=stated_in)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
