@@ -159,7 +159,7 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
     (session / "endoscope_20260117_153206.json").write_text(json.dumps(sidecar), encoding="utf-8")
     log = read_pose_log(PoseColumns(session, stream="/PSM1/measured_cp"))
     np.testing.assert_allclose(log.times, TICKS, atol=1e-6)
-    np.testing.assert_allclose(log.positions, world.positions(TICKS), atol=1e-9)
+    np.testing.assert_allclose(log.positions, world.positions(TICKS) * [-1, -1, 1], atol=1e-9)  # ECM: x left, y up
     assert log.frame == CAMERA
 
 

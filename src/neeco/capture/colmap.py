@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neeco.capture.conventions import COLMAP
 from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.transforms import TEST_EVERY
@@ -134,7 +135,7 @@ def _world_from_camera(image: _Image) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ translation
-    return pose
+    return COLMAP.camera_to_opencv(pose)
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.capture.conventions import LLFF
 from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
@@ -114,9 +115,8 @@ def _load(root: Path) -> np.ndarray:
 
 def _row(values: np.ndarray, place: Node) -> _Row | None:
     matrix = values[:15].reshape(3, 5)
-    down, right, back, origin = (matrix[:, column] for column in range(4))
     with np.errstate(invalid="ignore"):
-        pose = np.stack([right, down, -back, origin], axis=1)
+        pose = LLFF.camera_to_opencv(matrix[:, :4])
     rigid = replace(place, value=pose.tolist()).rigid()
     height, width, focal = (float(value) for value in matrix[:, 4])
     sized = 1 <= height < 65_536 and 1 <= width < 65_536 and height % 1 == 0 and width % 1 == 0

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from neeco.capture.conventions import OPENGL
 from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.lens import Lens
@@ -25,7 +26,6 @@ from neeco.raster.types import Camera
 
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
 STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
-_OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
 
     The only place where the two conventions meet.
     """
-    return world_from_camera * _OPENGL_FROM_OPENCV
+    return world_from_camera * np.diag(OPENGL.opencv_from_own)  # exact, and its own inverse
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,9 @@ from neeco.ingest.columns import (
 )
 from neeco.ingest.formats import IMAGES as IMAGE_STREAMS
 from neeco.ingest.formats import POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.frames import without_frame
 from neeco.ingest.lens import read_lens
+from neeco.ingest.logs import with_named_frame
 from neeco.ingest.ndi import tool_columns, tool_names
 from neeco.ingest.video import IMAGES
 
@@ -57,6 +59,10 @@ class _Log:
     @property
     def stem(self) -> str:
         """What it may be called."""
+        return without_frame(self._name)
+
+    @property
+    def _name(self) -> str:
         if self.body is not None:
             return self.body
         if self.tool is not None:
@@ -209,6 +215,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     name = log.file
     try:
         table = read_table(file)
+        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
         found.others.append(" ".join(str(error).replace(str(file), name).split()))
         return
@@ -222,6 +229,8 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
+        if meaning is not None:
+            log = replace(log, hints=meaning.hints, asks=meaning.asks)
         found.poses.append((log, pose))
     elif value and when.time:
         found.joints.append((log, when, value, None))

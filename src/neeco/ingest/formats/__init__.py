@@ -22,6 +22,7 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.ingest.frames import NamedFrame
 from neeco.registry import named_classes
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
@@ -35,9 +36,9 @@ DELIMITED = (".csv", ".tsv", ".txt")
 class Table:
     """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
-    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
-    stated in, CAMERA or BASE, where the file says it, stated_in: by the file's own name; notes: what reading it changed
-    or left out, in words; asks_frame: must the recording say the frame where the file does not?"""
+    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in: the
+    file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
+    notes: what reading it changed or left out, in words."""
 
     path: Path
     header: tuple[str, ...]
@@ -46,10 +47,14 @@ class Table:
     decimal_comma: bool = False
     stream: str | None = None
     record: str = "line"
-    frame: str | None = None
     stated_in: str | None = None
+    meaning: NamedFrame | None = None
     notes: tuple[str, ...] = ()
-    asks_frame: bool = False
+
+    @property
+    def frame(self) -> str | None:
+        """What poses are stated in, BASE or a camera's frame (`frames.CAMERA_FRAMES`), where the file says it."""
+        return None if self.meaning is None else self.meaning.frame
 
     @property
     def where(self) -> str:

@@ -18,7 +18,6 @@ from neeco.capture.documents import printable
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
 from neeco.files import read_json
-from neeco.ingest.columns import CAMERA
 from neeco.ingest.formats import (
     IMAGES,
     POSES,
@@ -31,7 +30,8 @@ from neeco.ingest.formats import (
     numbers,
 )
 from neeco.ingest.formats.delimited import DelimitedText
-from neeco.ingest.formats.rosbag import DVRK_CAMERA, POSE_HEADER, RosBag
+from neeco.ingest.formats.rosbag import POSE_HEADER, RosBag
+from neeco.ingest.frames import meaning_of
 from neeco.ingest.video import open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
@@ -275,8 +275,13 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
     body = match[1] if match else None
     if kind == POSES:
+        stated_in = _frames(table)
+        meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
         hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
-        return Stream(topic, POSES, "poses", len(table.rows), None, match is not None, body, None, hints)
+        return Stream(
+            topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
+            asks=meaning.asks,
+        )  # fmt: skip
     names = _joint_names(table, columns)
     wrist = [(known, _joint_column(name)) for known in _WRIST for name in names if name.endswith(known)]
     if "/jaw/" in topic and len(names) == 1:
@@ -301,19 +306,8 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     if set(when) <= set(table.header):
         stamps = numbers(table, when)[0] @ [1.0, 1e-9]
         times = np.where(stamps == 0, times, stamps)
-    frame = stated_in = None
     if stream.kind == POSES:
         header: tuple[str, ...] = POSE_HEADER
-        if "header.frame_id" in table.header:
-            index = table.header.index("header.frame_id")
-            names = {row[index].lstrip("/") for row in table.rows if len(row) > index}
-            if len(names) > 1:
-                listed = ", ".join(sorted(names)[:4])
-                raise NeecoError(
-                    f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame"
-                )
-            stated_in = next(iter(names), None)
-            frame = CAMERA if stated_in == DVRK_CAMERA else None
     else:
         header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
         if len(set(header)) < len(header):
@@ -321,6 +315,19 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     values, _, bad = numbers(table, columns)
     notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
     rows = np.column_stack([times - start, values])
-    return Table(
-        path, header, rows, table.lines, stream=stream.name, frame=frame, stated_in=stated_in, notes=tuple(notes)
-    )
+    found = Table(path, header, rows, table.lines, stream=stream.name, notes=tuple(notes))
+    frames = _frames(table)
+    if stream.kind != POSES or not frames:
+        return found
+    if len(frames) > 1:
+        listed = ", ".join(frames[:4])
+        raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
+    return replace(found, stated_in=frames[0], meaning=meaning_of(frames[0], dvrk=True))
+
+
+def _frames(table: Table) -> list[str]:
+    """Names of the frames that a topic's poses are stated in."""
+    if "header.frame_id" not in table.header:
+        return []
+    index = table.header.index("header.frame_id")
+    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})
