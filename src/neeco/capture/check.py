@@ -7,7 +7,6 @@ Here are checks of splits, times, image and mask files and instrument states; `c
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -21,19 +20,27 @@ import torch
 
 from neeco.capture.check_geometry import check_geometry
 from neeco.capture.check_motion import check_motion
-from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
+from neeco.capture.documents import (
+    Node,
+    Parsed,
+    Problem,
+    ProblemReport,
+    condensed,
+    errors_only,
+    key_name,
+    printable,
+)
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
-from neeco.capture.statefile import passes_limits
 from neeco.errors import NeecoError
+from neeco.plausible import Fault, joint_fault, limits_fault, passes_limits
 from neeco.raster.types import Camera
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 STILL_CAMERAS = 2  # of a scope that stands still
 ROLL_UNKNOWN_DEG = 45.0  # standard deviation from which a roll is as good as not known
-FULL_TURN = 2 * math.pi
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
 
@@ -96,7 +103,7 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         if motion and not errors_only(report.problems):
             for part in parsed.by_tissue():
                 check_motion(part)
-    return Checked(report.problems, _summary(parsed), capture)
+    return Checked(condensed(report.problems), _summary(parsed), capture)
 
 
 def _summary(parsed: Parsed) -> CaptureSummary:
@@ -276,10 +283,9 @@ def _check_states(parsed: Parsed) -> None:
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     limits = instrument.joints[joint]
     is_length = instrument.slides(joint)
-    if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
-        message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
-        parsed.header("instruments").error(message, "give radians")
-    largest: tuple[float, Node] | None = None
+    if limits is not None and (fault := limits_fault(limits, is_length)) is not None:
+        parsed.header("instruments").error(f"limits of joint {printable(joint)} are {fault[0]}", fault[1])
+    worst: tuple[float, Fault, Node] | None = None
     for state_place, state in parsed.states_of(instrument.name):
         place = state_place.child("joints").child(joint)
         if joint in instrument.unrecorded:
@@ -290,15 +296,13 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
         if joint not in state.joints:
             place.error("is missing", "give its value in every frame, or drop the frame")
             continue
-        value = state.joints[joint]
-        if limits is not None and passes_limits(value, limits):
-            message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
-            place.error(message, "repair the reading (radians?) or the limits")
-        if largest is None or abs(value) > abs(largest[0]):
-            largest = value, place
-    if largest is not None and limits is None and not is_length and abs(largest[0]) > FULL_TURN:
-        message = f"reaches {largest[0]:g} rad, more than a full turn: degrees?"
-        largest[1].error(message, "give radians; state the joint's limits in the header if it does turn that far")
+        fault = joint_fault(state.joints[joint], limits, is_length)
+        if fault is not None and limits is not None:
+            place.error(*fault)
+        elif fault is not None and (worst is None or abs(state.joints[joint]) > worst[0]):
+            worst = abs(state.joints[joint]), fault, place
+    if worst is not None:  # without limits the largest value tells
+        worst[2].error(*worst[1])
 
 
 def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTree) -> None:

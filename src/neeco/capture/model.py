@@ -20,6 +20,7 @@ from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
+from neeco.plausible import Fault, joint_fault
 from neeco.raster.rotations import as_pose
 from neeco.raster.types import Camera
 
@@ -106,13 +107,23 @@ class Instrument:
     """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
     or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
     `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
-    they stand half way between these until they are found. `from_video`: its poses were found in the images."""
+    they stand half way between these until they are found. `from_video`: its poses were found in the images.
+    `left_out`: recorded joints that a learned scene does not use."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
     unrecorded: tuple[str, ...] = ()
     from_video: FromVideo | None = None
+    left_out: tuple[str, ...] = ()
+
+    def joint_fault(self, joint: str, value: float) -> Fault | None:
+        """What is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right."""
+        if joint in self.left_out:
+            return None
+        if joint not in self.joints:
+            return "is no joint of it", f"{self.name} has {', '.join(self.joints) or 'none'}"
+        return joint_fault(value, self.joints[joint], self.slides(joint))
 
     def halfway(self, joint: str) -> float:
         """The middle of a joint's limits; 0 where none are stated."""
