@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
+from neeco.capture.check_masks import Hidden, masks_fault, measure_hidden, sample_points
 from neeco.capture.check_motion import check_motion
 from neeco.capture.documents import (
     Node,
@@ -191,12 +192,17 @@ class _Decoded:
     uniform: bool  # one colour
     image_error: str
     mask_error: str
+    hidden: Hidden | None  # by the mask; None: there is no usable one
 
 
 def _check_images(parsed: Parsed) -> None:
     """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
+    clouds = {tissue.name: sample_points(tissue.points) for tissue in parsed.tissues}
+    shared = sample_points(parsed.points)
+    points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
+    cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        decoded = list(pool.map(_decode, parsed.frames))
+        decoded = list(pool.map(_decode, parsed.frames, cameras, points))
     # the reader may have reported an image whose size it wanted to know
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
@@ -213,11 +219,15 @@ def _check_images(parsed: Parsed) -> None:
     if without and len(without) < len(parsed.frames):
         message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
         without[0].child("mask_path").warning(message, "its whole image counts in the loss")
+    if (fault := masks_fault([found.hidden for found in decoded if found.hidden is not None])) is not None:
+        parsed.header("frames[*].mask_path").warning(*fault)
 
 
-def _decode(frame: Frame) -> _Decoded:
-    """Decode a frame's image and mask. Errors name the file within the message, without its folder."""
+def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded:
+    """Decode a frame's image and mask. Errors name the file within the message, without its folder. camera, points
+    [P, 3] mm: what the mask hides of these is measured."""
     digest, uniform, image_error, mask_error = None, False, "", ""
+    image, hidden = None, None
     try:
         image = frame.load_image()
         digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
@@ -228,9 +238,11 @@ def _decode(frame: Frame) -> _Decoded:
         mask = frame.load_mask()
         if mask is not None and not torch.any(mask):
             mask_error = "ignores every pixel (black is ignored); invert it, write 255 instead of 1, or drop the frame"
+        elif mask is not None and image is not None:
+            hidden = measure_hidden(image, mask, camera, points)
     except NeecoError as error:
         mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
-    return _Decoded(digest, uniform, image_error, mask_error)
+    return _Decoded(digest, uniform, image_error, mask_error, hidden)
 
 
 def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
