@@ -260,7 +260,7 @@ def test_colmap_models_are_read(folder, tmp_path, binary):
 @pytest.mark.parametrize("binary", [True, False])
 def test_distorted_or_damaged_colmap_models_are_refused(folder, tmp_path, binary):
     write_colmap(folder, tmp_path, binary, "OPENCV", (-0.1, 0.0, 0.0, 0.001))
-    with pytest.raises(NeecoError, match="OPENCV: the images are distorted .*: neeco ingest"):
+    with pytest.raises(NeecoError, match=r"OPENCV: the images are distorted .*: neeco ingest"):
         read_capture(tmp_path)
     for path in (tmp_path / "sparse/0").iterdir():
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 3])

@@ -12,10 +12,9 @@ from neeco.capture.documents import Node, as_float, printable
 from neeco.errors import NeecoError
 
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-FIELD_OF_VIEW = "FOV"  # Devernay and Faugeras 2001
 POLYNOMIAL = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-MODELS = (*POLYNOMIAL, *FISHEYE, FIELD_OF_VIEW)
-NAMES = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "omega")
+MODELS = (*POLYNOMIAL, *FISHEYE)
+NAMES = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTS = ("distortion_params", "distortion_coefficients", "distortion")  # keys of bare lists of coefficients
 NOT_READ = ("ftheta_p0", "ftheta_p1", "latlong", "orthographic")  # instant-ngp's keys of lenses that are none of MODELS
 # order of a bare list of coefficients, by its length: six are nerfstudio's, the rest OpenCV's
@@ -92,16 +91,11 @@ def opencv_distortion(
     the principal point. Other models than OpenCV's are fitted. Raises NeecoError ("what is wrong; what to do").
     """
     given = {name: coefficients.get(name, 0.0) for name in NAMES}
-    k1, k2, k3, k4, k5, k6, p1, p2, omega = given.values()
+    k1, k2, k3, k4, k5, k6, p1, p2 = given.values()
     if model in FISHEYE:
-        if any((k5, k6, p1, p2, omega)):
+        if any((k5, k6, p1, p2)):
             raise NeecoError("a fisheye lens has coefficients k1 to k4 alone; calibrate again")
         return fit_rational(lambda angle: angle * _polynomial(angle**2, (k1, k2, k3, k4)), intrinsics, size)
-    if model == FIELD_OF_VIEW:
-        if not omega:
-            return ()
-        spread = 2 * math.tan(omega / 2)
-        return fit_rational(lambda angle: np.arctan(np.tan(angle) * spread) / omega, intrinsics, size)
     if k4 and not (k5 or k6 or model == "FULL_OPENCV"):  # nerfstudio's, of the radius to the eighth power
         radial = fit_rational(lambda a: np.tan(a) * _polynomial(np.tan(a) ** 2, (k1, k2, k3, k4)), intrinsics, size)
         return (*radial[:2], p1, p2, *radial[4:])
