@@ -40,6 +40,17 @@ def focal_fault(fx: float, fy: float, width: float, height: float) -> Fault | No
     return None
 
 
+def camera_fault(fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float) -> Fault | None:
+    """Of a camera's numbers, px and mm; its image may be cut out of a larger one, or enlarged."""
+    if (fault := size_fault(width, height)) is not None:
+        return fault
+    if not all(math.isfinite(number) and number > 0 for number in (fx, fy, near)):
+        return f"fx, fy, near: {fx:g} px, {fy:g} px, {near:g} mm are not all positive and finite", "correct them"
+    if not all(math.isfinite(number) for number in (cx, cy)):
+        return f"cx, cy: {cx:g} and {cy:g} px are not finite", "correct them"
+    return None
+
+
 def center_fault(cx: float, cy: float, width: float, height: float) -> Fault | None:
     """Of a principal point in px on an image of width x height px."""
     if 0 < cx < width and 0 < cy < height:  # NaN compares false
@@ -59,16 +70,18 @@ def passes_limits(value: float, limits: tuple[float, float] | None) -> bool:
     return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
 
 
-def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool) -> Fault | None:
-    """Of a joint's value, rad, or of a joint that slides mm."""
+def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, slack: float = 0.0) -> Fault | None:
+    """Of a joint's value, rad, or of a joint that slides mm. slack: share of its range by which it may exceed that."""
     unit = "mm" if slides else "rad"
     if not math.isfinite(value):
         return f"is {value:g}, not a finite number", f"give it in {unit}"
     if limits is not None:
+        room = slack * (limits[1] - limits[0]) if slack else 0.0
+        limits = limits[0] - room, limits[1] + room
         message = f"is {value:g} {unit}, outside its limits {limits[0]:g} .. {limits[1]:g}"
         remedy = "repair the reading or the limits" if slides else "repair the reading (radians?) or the limits"
         return (message, remedy) if passes_limits(value, limits) else None
-    if abs(value) > (LONGEST_SLIDE if slides else FULL_TURN):
+    if abs(value) > (LONGEST_SLIDE if slides else FULL_TURN) * (1 + slack):
         if slides:
             return f"is {value:g} mm, farther than any instrument slides", "give mm, or state the joint's limits"
         remedy = "give radians; state the joint's limits in the header if it does turn that far"

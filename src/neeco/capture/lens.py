@@ -14,7 +14,6 @@ from neeco.errors import NeecoError
 from neeco.plausible import center_fault, focal_fault
 from neeco.raster.types import Camera
 
-COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 BORDER = ("cx", "cy", "radius")

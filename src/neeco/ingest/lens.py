@@ -15,10 +15,11 @@ from scipy import ndimage
 
 from neeco.capture.distortion import opencv_distortion, stated_distortion
 from neeco.capture.documents import Node, RaisingReport, as_float, printable
-from neeco.capture.lens import COEFFICIENTS, Border, Lens
+from neeco.capture.lens import Border, Lens
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
 from neeco.plausible import size_fault
+from neeco.raster.types import COEFFICIENTS
 
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D", "d")
