@@ -15,10 +15,13 @@ from typing import Any, Literal, overload
 
 from neeco.capture import Camera, Capture, Problem, State, check_capture
 from neeco.capture.model import Instrument
+from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
 from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
+from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
+from neeco.raster.rotations import rigid_fault
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training import run as runs
@@ -88,8 +91,9 @@ class Scene:
         state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene. camera:
         intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward). Poses may be
         numpy arrays or tensors. The result's tensors are on the CPU; no gradient reaches the scene (for that, use
-        `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint, and with `labels` where
-        the method learns none.
+        `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint or has one that is not
+        in the scene, for poses that are not rigid, joints beyond their limits (without stated ones: far out of the
+        recorded range), focal lengths that fit no lens, and with `labels` where the method learns none.
 
             run = neeco.load("runs/sample")
             drawn = run.scene.draw(state, camera)
@@ -98,8 +102,15 @@ class Scene:
             drawn.boxes, drawn.keypoints                  # float32 [I, 4] px; float32 [I, K, 3]
             run.scene.draw(state, camera.resized(1280, 1024))  # the same, larger
         """
+        state.check(self._limited)
+        if (fault := _view_fault(camera)) is not None:
+            raise NeecoError(f"camera: {fault[0]}; {fault[1]}")
         with self.learned.torch_threads():
             return draw_labelled(self.learned, state, camera, labels)
+
+    @cached_property
+    def _limited(self) -> tuple[Instrument, ...]:
+        return self.learned.recorded.with_limits(self.instruments)
 
     def __repr__(self) -> str:
         names = ", ".join(instrument.name for instrument in self.instruments) or "no instruments"
@@ -145,6 +156,15 @@ class Run:
         tell = progress or (lambda what, done, total: None)
         with self.scene.learned.torch_threads():
             return evaluate_run(self._run, self.capture, splits, align=align, networks=networks, progress=tell)
+
+
+def _view_fault(camera: Camera) -> Fault | None:
+    """What is wrong with a camera that is to see a scene, and what to do."""
+    for pose in (camera.world_from_camera, camera.world_from_lamps):
+        fault = None if pose is None else rigid_fault(pose.detach().cpu().double().numpy())
+        if fault is not None:
+            return fault
+    return focal_fault(camera.fx, camera.fy, camera.width, camera.height)
 
 
 def load(path: PathLike, device: str = "auto") -> Run:

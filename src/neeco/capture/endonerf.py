@@ -20,6 +20,7 @@ from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.points import random_points
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
+from neeco.plausible import focal_fault, size_fault
 from neeco.raster.types import Camera
 
 POSES_FILE = "poses_bounds.npy"
@@ -119,9 +120,8 @@ def _row(values: np.ndarray, place: Node) -> _Row | None:
         pose = LLFF.camera_to_opencv(matrix[:, :4])
     rigid = replace(place, value=pose.tolist()).rigid()
     height, width, focal = (float(value) for value in matrix[:, 4])
-    sized = 1 <= height < 65_536 and 1 <= width < 65_536 and height % 1 == 0 and width % 1 == 0
-    if not (sized and np.isfinite(focal) and focal > 0):
-        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}"
+    if (fault := size_fault(width, height) or focal_fault(focal, focal, width, height)) is not None:
+        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}: {fault[0]}"
         place.error(message, "write whole pixels and a positive focal length in the fifth column")
         return None
     if rigid is None:

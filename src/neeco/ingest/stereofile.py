@@ -12,11 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
-from neeco.capture.lens import COEFFICIENTS, Lens
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
 from neeco.files import read_json, read_text, require_file
 from neeco.ingest.lens import checked_lens, first_of, image_size, matrix_numbers, opencv_lens, read_opencv_yaml
 from neeco.raster.rotations import rotation_error
+from neeco.raster.types import COEFFICIENTS
 
 # names of the left and right camera matrix, and of their distortion
 MATRICES = (

@@ -18,6 +18,7 @@ from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentSt
 from neeco.raster.types import Rendering
 from neeco.scene.articulation import JointMotion
 
+FAR_OUT = 2.0  # times the recorded range beyond it, no joint without stated limits goes
 BESIDE = 4  # training frames beside one of which a joint is not known
 
 
@@ -110,6 +111,18 @@ class Recorded:
     def _poses(self) -> dict[str, RecordedStates]:
         """The recorded poses of every instrument."""
         return {name: RecordedStates(self.states, [name], joints=False) for name in self.states[0].instruments}
+
+    def with_limits(self, instruments: Sequence[Instrument]) -> tuple[Instrument, ...]:
+        """The instruments, joints without stated limits limited to FAR_OUT times the recorded range beyond it."""
+        limited = []
+        for item in instruments:
+            joints = dict(item.joints)
+            for joint in (name for name, limits in joints.items() if limits is None and self.states):
+                values = [float(state.instruments[item.name].joints[joint]) for state in self.states]
+                room = FAR_OUT * (max(values) - min(values))
+                joints[joint] = (min(values) - room, max(values) + room) if room else None
+            limited.append(replace(item, joints=joints))
+        return tuple(limited)
 
     def as_learned(self, camera: Camera) -> Camera:
         """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs

@@ -198,7 +198,8 @@ def _described(instrument: Instrument) -> dict[str, Any]:
     described: dict[str, Any] = {"name": instrument.name, "joints": finite(dict(instrument.joints))}
     tree = instrument.kinematics
     described |= {} if tree is None else {"kinematics": tree.to_json()}
-    return described | ({"unrecorded": list(instrument.unrecorded)} if instrument.unrecorded else {})
+    described |= {"unrecorded": list(instrument.unrecorded)} if instrument.unrecorded else {}
+    return described | ({"left_out": list(instrument.left_out)} if instrument.left_out else {})
 
 
 def _instrument(entry: dict[str, Any]) -> Instrument:
@@ -209,7 +210,7 @@ def _instrument(entry: dict[str, Any]) -> Instrument:
     unrecorded = tuple(entry.get("unrecorded", ()))
     if not set(unrecorded) <= set(joints):
         raise ValueError("its unrecorded joints are no joints of it")
-    return Instrument(entry["name"], joints, tree, unrecorded)
+    return Instrument(entry["name"], joints, tree, unrecorded, left_out=tuple(entry.get("left_out", ())))
 
 
 def _number(value: Any) -> float:

@@ -71,7 +71,8 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
     first = scene.recorded.cameras[0]
     views = []
-    for k, line in enumerate(read_states(states_file(str(path)), scene.instruments, scene.recorded.tissues)):
+    instruments = scene.recorded.with_limits(scene.instruments)
+    for k, line in enumerate(read_states(states_file(str(path)), instruments, scene.recorded.tissues)):
         camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
         views.append(View(f"{k:06d}", line.state, camera))
     return views

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from neeco.errors import NeecoError
 from neeco.settings import warn_renamed
@@ -153,6 +153,15 @@ class Settings(ImageSettings):
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
         super().check()
+        for option, number in (("count", self.count), ("seed", self.seed), ("max-attempts", self.max_attempts)):
+            if not math.isfinite(number) or number != int(number):
+                raise NeecoError(f"--{option}: {number} is not a whole number; give one")
+        if self.views not in get_args(Views):
+            raise NeecoError(f"--views: {self.views!r} is none; give one of {', '.join(get_args(Views))}")
+        if not 0 <= self.margin < math.inf:
+            raise NeecoError(f"--margin: {self.margin} is not a share of the recorded range; give 0 or more")
+        if not 0 <= self.min_share <= 1:
+            raise NeecoError(f"--min-share: {self.min_share} is not a share; give 0 to 1")
         if self.count < 1:
             raise NeecoError(f"--count: {self.count} images is nothing to make; give at least 1")
         if self.seed < 0:

@@ -142,10 +142,8 @@ def _learned_instrument(
     `config.joints` are asked for, else those that may move something (`moving_joints`)."""
     tree = instrument.kinematics
     if tree is None or config.joints is not None or not getattr(config.deformation, "kinematics", False):
-        return Instrument(
-            instrument.name,
-            {joint: instrument.joints[joint] for joint in moving_joints(instrument, frames, config, report)},
-        )
+        joints = {joint: instrument.joints[joint] for joint in moving_joints(instrument, frames, config, report)}
+        return Instrument(instrument.name, joints, left_out=tuple(sorted(set(instrument.joints) - set(joints))))
     if missing := [reading for reading in tree.readings if reading not in instrument.joints]:
         raise NeecoError(
             f"instruments: {instrument.name}: its kinematics take {missing[0]!r}, which is no joint of it; name "
@@ -153,7 +151,8 @@ def _learned_instrument(
         )
     unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
     joints = {reading: instrument.joints[reading] for reading in tree.readings}
-    return replace(instrument, joints=joints, unrecorded=unrecorded)
+    left_out = tuple(sorted(set(instrument.joints) - set(joints)))
+    return replace(instrument, joints=joints, unrecorded=unrecorded, left_out=left_out)
 
 
 def moving_joints(
