@@ -14,6 +14,7 @@ import numpy as np
 
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
+from neeco.files import require_content, visible_entries
 from neeco.ingest.columns import recognise_time, scale_of
 from neeco.ingest.formats import VideoSource, numbers, read_table
 
@@ -32,6 +33,7 @@ def open_video(path: Path, fps: float | None = None, part: tuple[float, float] |
     those that can be, with their own times (`fps`: overrides them). What is damaged is left out and noted; raises
     NeecoError when nothing can be read."""
     path = Path(path)
+    require_content(path)
     if not path.is_file():
         raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
     scan = _Scan(path, part=part).run()
@@ -48,7 +50,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
     folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
-    files = sorted((file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=_natural_order)
+    files = sorted((file for file in visible_entries(folder) if file.suffix.lower() in IMAGES), key=_natural_order)
     if len(files) < MIN_IMAGES:
         raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
     if times is not None:

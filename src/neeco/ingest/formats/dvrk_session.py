@@ -17,7 +17,7 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
-from neeco.files import read_json
+from neeco.files import read_json, visible_entries
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.formats import (
     IMAGES,
@@ -76,7 +76,7 @@ class DvrkSession(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, found = _films(path), []
-        if not films and any(path.glob("*.mp4")):
+        if not films and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
@@ -209,7 +209,7 @@ def _list(document: Any, name: str) -> list[Any]:
 
 def _stamped_files(path: Path) -> dict[str, _Film]:
     found: dict[str, list[tuple[float, Path]]] = {}
-    for file in path.iterdir():
+    for file in visible_entries(path):
         if match := _STAMPED.fullmatch(file.name):
             found.setdefault(match["name"], []).append((float(match["time"]), file))
     films = {}
@@ -239,8 +239,7 @@ def _bag(path: Path) -> Path | None:
 
 def _tables_in(path: Path) -> list[Path]:
     """CSV files of an extract: of this folder, else of the session's first."""
-    here = sorted(path.glob("*.csv"))
-    return here or sorted((path / EXTRACTED / "full_session").glob("*.csv"))
+    return visible_entries(path, "*.csv") or visible_entries(path / EXTRACTED / "full_session", "*.csv")
 
 
 def _topics(path: Path) -> dict[str, Path]:

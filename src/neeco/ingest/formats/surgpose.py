@@ -18,7 +18,7 @@ import yaml
 from neeco.capture.documents import as_float, printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
+from neeco.files import parse_yaml, read_text, visible_entries
 from neeco.ingest.formats import (
     HUGE,
     IMAGES,
@@ -107,7 +107,7 @@ class SurgPose(RecordingFormat):
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        calibrations = sorted(path.glob("*.ini"))
+        calibrations = visible_entries(path, "*.ini")
         if len(calibrations) != 1:
             return None
         left, right, _ = read_stereo(calibrations[0])
