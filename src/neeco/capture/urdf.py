@@ -36,9 +36,6 @@ def read_urdf(
     """
     path, names = Path(path), dict(readings or {})
     robot = _parse(path)
-    for what, given in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
-        if twice := next((name for name in given if given.count(name) > 1), None):
-            raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
     if not robot.links:
         raise NeecoError(f"{path}: defines no link; give the robot's URDF")
     children: dict[str, list[Any]] = {}
@@ -60,6 +57,9 @@ def read_urdf(
     first = tops[0] if root is None else root
     assert first is not None
     reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
+    for what, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
+        if twice := next((name for name in defined if defined.count(name) > 1), None):
+            raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
     moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
     for given in names:
         if given not in moving:
