@@ -6,7 +6,7 @@ most of the rows unusable) is refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,8 @@ class PoseLog:
 
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
     first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
-    are stated in, CAMERA or BASE; stated_in: what the file calls it, None where it does not, or the recording says.
+    are stated in, CAMERA or BASE; stated_in: what the file calls it, None where it does not, or the recording says;
+    image_hz: as in `Table`.
     """
 
     path: Path
@@ -50,6 +51,7 @@ class PoseLog:
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
     stated_in: str | None = None
+    image_hz: float | None = None
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -62,6 +64,7 @@ class ReadingLog:
     values: np.ndarray
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
+    image_hz: float | None = None
 
 
 class Rows:
@@ -118,7 +121,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     gaps, gap_notes = _gaps(table, times)
     notes, frame = (*rows.notes(), *gap_notes), source.frame or table.frame or named.BASE
     stated_in = table.stated_in if source.frame is None else None
-    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame, stated_in)
+    log = PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame, stated_in)
+    return replace(log, image_hz=table.image_hz)
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -143,7 +147,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         rows.drop_wrong(impossible, reason)
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))
+    notes = (*rows.notes(), *clamped, *gap_notes)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
 
 
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
+MAX_UNLIKE = 0.1  # share by which a video may be longer or shorter than the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
 
 
@@ -37,7 +38,8 @@ class Table:
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
     (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
     stated in, CAMERA or BASE, where the file says it, stated_in: by the file's own name; notes: what reading it changed
-    or left out, in words; asks_frame: must the recording say the frame where the file does not?"""
+    or left out, in words; asks_frame: must the recording say the frame where the file does not? image_hz: images a
+    second of the video, where every row is the state of one of its images; None: rows have times of their own."""
 
     path: Path
     header: tuple[str, ...]
@@ -50,6 +52,7 @@ class Table:
     stated_in: str | None = None
     notes: tuple[str, ...] = ()
     asks_frame: bool = False
+    image_hz: float | None = None
 
     @property
     def where(self) -> str:
@@ -196,6 +199,29 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
         kind = f"{found.type}, not {' or '.join(kinds)}"
         raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
     return found
+
+
+def compare_counts(
+    file: Path, images: int, rows: int, noun: str, unlike: float = 0.0, remedy: str = "give the whole video of this log"
+) -> tuple[str, ...]:
+    """A note where images and the rows of a log that belong to them one by one are not equally many.
+
+    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, beside one. Raises
+    NeecoError, with the remedy, when they differ by more.
+    """
+    found = f"has {images} images for {rows} {noun}"
+    if abs(images - rows) > unlike * rows + 1:
+        raise NeecoError(f"{file}: {found}; they do not belong together: {remedy}")
+    return () if images == rows else (f"{file.name}: {found}; both are taken to begin together",)
+
+
+def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
+    """`compare_counts` of states that are one for every image of a video of `image_hz` images a second, whatever rate
+    it has now."""
+    shown = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
+    is_rate = shown != rows and abs(len(video.times) - rows) <= 1
+    remedy = f"as it has {len(video.times)}, say `fps: {image_hz:g}` of it" if is_rate else "give the video of this log"
+    return compare_counts(file, shown, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
 
 
 def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:

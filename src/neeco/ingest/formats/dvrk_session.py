@@ -28,6 +28,7 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_counts,
     numbers,
 )
 from neeco.ingest.formats.delimited import DelimitedText
@@ -122,10 +123,7 @@ class DvrkSession(RecordingFormat):
             return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
         video = open_video(film.files[0])
         count = len(video.times)
-        if abs(count - len(times)) > UNLIKE * len(times) + 1:
-            raise NeecoError(f"{film.files[0]}: has {count} frames, and times of {len(times)}; give the whole video")
-        if count != len(times):
-            notes.append(f"{name}: {count} frames and {len(times)} times; the last ones are left out")
+        notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
         usable = np.flatnonzero(keep[:count])
         width, height = video.size
         size = (width if film.half is None else width // 2, height)

@@ -58,7 +58,7 @@ class JigsawsKinematics(RecordingFormat):
         values = _numbers(path)
         first = COLUMNS * ARMS.index(arm)
         rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, [first + index for index in USED]]])
-        return Table(path, HEADER, rows, np.arange(1, len(rows) + 1), stream=arm, frame=BASE)
+        return Table(path, HEADER, rows, np.arange(1, len(rows) + 1), stream=arm, frame=BASE, image_hz=RATE_HZ)
 
 
 def _numbers(path: Path) -> np.ndarray:
