@@ -12,7 +12,7 @@ import importlib.util
 import sys
 from abc import ABC
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import ClassVar
@@ -97,13 +97,14 @@ class Stream:
 
 @dataclass(frozen=True)
 class VideoSource:
-    """Frames with their times. size: (width, height) px; notes: what could not be read, in words; times [N] s,
-    increasing, of a video from its first frame."""
+    """Frames with their times. size: (width, height) px, as stored; notes: what could not be read, in words; times [N]
+    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
 
     path: Path
     size: tuple[int, int]
     notes: tuple[str, ...]
     times: np.ndarray
+    pixel_aspect: float = field(default=1.0, kw_only=True)
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""

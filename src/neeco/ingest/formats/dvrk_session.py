@@ -128,8 +128,9 @@ class DvrkSession(RecordingFormat):
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
         return _Timed(
-            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half
-        )
+            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,10 @@ class LeRobot(RecordingFormat):
         remedy = "download the data set again, or name another episode"
         notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
-        return _Episode(video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames)
+        return _Episode(
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = None if stream is None else _NAME.fullmatch(stream)
