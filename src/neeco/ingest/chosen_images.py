@@ -17,11 +17,12 @@ from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.episodes import Episodes
 from neeco.ingest.formats import VideoSource
-from neeco.ingest.frame_selection import choose_frames, frame_features
+from neeco.ingest.frame_selection import choose_frames, describe_ranges, frame_features, frozen_frames
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.recording import MIN_FRAMES
 from neeco.ingest.sfm import StageProgress
 
+MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state tells that it is wrong
 ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
 
 
@@ -145,6 +146,14 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
 
     features = frame_features(images())
     states, usable = data.coverage_states()
+    known = states.any()  # else the clocks are found later, by frames that are not frozen
+    frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
+    if len(frozen) >= (1 if known else MIN_REPEATED):
+        why = (
+            "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
+        )
+        share = f"{len(frozen)} of {count} frames ({len(frozen) / count:.0%}: {describe_ranges(frozen)})"
+        data.note(f"{data.video.path.name}: {share} repeat the picture before them {why}")
     limit = recording.frames or settings.max_frames
     selected, dropped = choose_frames(features, usable, states, limit, settings.min_sharpness)
     if recording.frames is None and count > limit:
