@@ -28,6 +28,21 @@ TEMPORARY = ".unfinished-"  # begins the names of files and folders that are sti
 LOCK = ".neeco.lock"
 MOST_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
+HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
+_XML = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
+_LFS = "is a Git LFS pointer, not the file; run `git lfs pull`"
+_ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
+_MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
+_PAGE = "is a web page, not the file; download the file again (does it need a login?)"
+_ANSWER = "is a server's error message, not the file; download the file again"
+_PLACEHOLDERS = (
+    (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
+    (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
+    (rb"\0\x05\x16[\0\x07]\0", _MAC),
+    (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
+    (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
+)  # what clones and downloads leave in a file's place: how it begins, and what to do
+PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -222,9 +237,38 @@ def require_inside(file: Path, folder: Path) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Raise NeecoError when `path` is there but is no file: a folder, or a pipe or device whose reading may not end."""
+    """Raise NeecoError when `path` is there but is no file (a folder, or a pipe or device whose reading may not end),
+    or holds a `placeholder`."""
     if path.exists() and not path.is_file():
         raise NeecoError(f"{path}: is not a file; expected {expected}")
+    require_content(path)
+
+
+def require_content(path: Path) -> None:
+    """Raise NeecoError for a file that holds a `placeholder`: for those that a library opens."""
+    if problem := placeholder(path):
+        raise NeecoError(f"{path}: {problem}")
+
+
+def placeholder(path: Path) -> str | None:
+    """What a clone or a download left in a file's place (a Git LFS or git-annex pointer, a web page), and what to do;
+    None for content, and where there is no file to read."""
+    try:
+        if path.is_symlink() and not path.exists():
+            return _ANNEX if "annex/objects/" in os.readlink(path).replace("\\", "/") else None
+        if not path.is_file():
+            return None
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
+    except (OSError, ValueError):
+        return None  # the reader says why
+    return next((problem for start, problem in PLACEHOLDERS if start.match(head)), None)
+
+
+def visible_entries(folder: Path, pattern: str = "*") -> list[Path]:
+    """What a folder holds under `pattern`, sorted, without hidden entries such as the `._left.png` that macOS writes
+    next to `left.png`."""
+    return sorted(entry for entry in folder.glob(pattern) if not entry.name.startswith("."))
 
 
 def read_bytes(path: Path, expected: str, missing: str = "no such file") -> bytes:

@@ -166,7 +166,7 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": [{"cpu_ts": BEGIN + i} for i in range(12)]}, "has 30 frames, and times of 12"),
+        ({"frames": [{"cpu_ts": BEGIN + i} for i in range(12)]}, "has 30 images for 12 times"),
         ({"frames": 7}, "frames: expected a cpu_ts"),
         ({"frames": [{"cpu_ts": "x"}] * 30}, "frames: expected a cpu_ts"),
         ({"estimated_latency": "long"}, "estimated_latency: 'long' is none in s"),

@@ -16,6 +16,7 @@ from neeco.capture.lens import Lens
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
+from neeco.files import placeholder
 from neeco.raster.rotations import rigid_fault
 
 MANY_ALIKE = 3  # problems like another one, from which they are counted instead of listed
@@ -328,6 +329,8 @@ def inside(root: Path, folder: Path, text: str) -> Path:
         outside = not path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError, ValueError):
         raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
+    if path.is_symlink() and (problem := placeholder(path)):
+        raise NeecoError(f"{printable(text)} {problem}")
     if outside:
         raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
     return path

@@ -20,6 +20,7 @@ from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.points import random_points
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
+from neeco.files import placeholder, visible_entries
 from neeco.plausible import focal_fault, size_fault
 from neeco.raster.types import Camera
 
@@ -87,7 +88,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
     if not (root / folder).is_dir():
         return []
     paths = []
-    for path in sorted((root / folder).iterdir()):
+    for path in visible_entries(root / folder):
         if path.suffix not in EXTENSIONS:
             continue
         try:
@@ -101,6 +102,8 @@ def _load(root: Path) -> np.ndarray:
     """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
     remedy = "write an array of N x 17 numbers with numpy.save"
     path = inside(root, root, POSES_FILE)
+    if problem := placeholder(path):
+        raise NeecoError(problem)
     try:
         # mapped, so that a wrong header cannot make us allocate more than the file holds
         with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote

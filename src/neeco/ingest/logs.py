@@ -44,7 +44,7 @@ class PoseLog:
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
     first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
     are stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
-    recording says.
+    recording says; image_hz: as in `Table`.
     """
 
     path: Path
@@ -56,6 +56,7 @@ class PoseLog:
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
     stated_in: str | None = None
+    image_hz: float | None = None
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -68,6 +69,7 @@ class ReadingLog:
     values: np.ndarray
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
+    image_hz: float | None = None
 
 
 class Rows:
@@ -127,7 +129,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
         frame = named.CAMERA
         if source.frame is None and table.meaning is not None:
             notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
-    return PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
+    log = PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
+    return replace(log, image_hz=table.image_hz)
 
 
 def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -206,7 +209,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         rows.drop_wrong(impossible, reason)
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))
+    notes = (*rows.notes(), *clamped, *gap_notes)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
 
 
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from neeco.capture.kinematicsfile import kinematics_of
 from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.errors import NeecoError
-from neeco.files import HALVES, finite, require_like, write_atomically
+from neeco.files import HALVES, finite, require_content, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
 from neeco.scene.deformations.base import Deformation
 from neeco.scene.drawable import Learned, Recorded
@@ -67,6 +67,7 @@ def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Pat
 def load_scene(path: Path) -> Learned:
     """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
     path = Path(path)
+    require_content(path)
     if not path.is_file():
         raise NeecoError(f"{path}: no such scene; has training finished?")
     try:

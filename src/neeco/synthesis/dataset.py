@@ -106,7 +106,7 @@ def synthesize(
     settings.check()
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if workers > 1 and cluster.address():
+    if cluster.address():
         cluster.require_ray()
     output = Path(output)
     runs = (run, *instrument_runs)
@@ -155,7 +155,7 @@ def _draw_all(
     generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
 ) -> Iterator[Record]:
     """The records of the missing images, as they are drawn."""
-    if workers > 1 and cluster.address():
+    if cluster.address():
         return draw_on_cluster(spec, output, missing, workers)
     if workers > 1:
         return draw_in_processes(spec, output, missing, workers, max(1, threads() // workers))

@@ -17,7 +17,7 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
-from neeco.files import read_json
+from neeco.files import read_json, visible_entries
 from neeco.ingest.formats import (
     IMAGES,
     POSES,
@@ -27,6 +27,7 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_counts,
     numbers,
 )
 from neeco.ingest.formats.delimited import DelimitedText
@@ -76,7 +77,7 @@ class DvrkSession(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, found = _films(path), []
-        if not films and any(path.glob("*.mp4")):
+        if not films and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
@@ -122,16 +123,14 @@ class DvrkSession(RecordingFormat):
             return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
         video = open_video(film.files[0])
         count = len(video.times)
-        if abs(count - len(times)) > UNLIKE * len(times) + 1:
-            raise NeecoError(f"{film.files[0]}: has {count} frames, and times of {len(times)}; give the whole video")
-        if count != len(times):
-            notes.append(f"{name}: {count} frames and {len(times)} times; the last ones are left out")
+        notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
         usable = np.flatnonzero(keep[:count])
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
         return _Timed(
-            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half
-        )
+            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -209,7 +208,7 @@ def _list(document: Any, name: str) -> list[Any]:
 
 def _stamped_files(path: Path) -> dict[str, _Film]:
     found: dict[str, list[tuple[float, Path]]] = {}
-    for file in path.iterdir():
+    for file in visible_entries(path):
         if match := _STAMPED.fullmatch(file.name):
             found.setdefault(match["name"], []).append((float(match["time"]), file))
     films = {}
@@ -239,8 +238,7 @@ def _bag(path: Path) -> Path | None:
 
 def _tables_in(path: Path) -> list[Path]:
     """CSV files of an extract: of this folder, else of the session's first."""
-    here = sorted(path.glob("*.csv"))
-    return here or sorted((path / EXTRACTED / "full_session").glob("*.csv"))
+    return visible_entries(path, "*.csv") or visible_entries(path / EXTRACTED / "full_session", "*.csv")
 
 
 def _topics(path: Path) -> dict[str, Path]:

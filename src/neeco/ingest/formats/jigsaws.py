@@ -59,7 +59,8 @@ class JigsawsKinematics(RecordingFormat):
         values = _numbers(path)
         first = COLUMNS * ARMS.index(arm)
         rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, [first + index for index in USED]]])
-        return Table(path, HEADER, rows, np.arange(1, len(rows) + 1), stream=arm, meaning=NamedFrame(BASE))
+        lines = np.arange(1, len(rows) + 1)
+        return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
 
 
 def _numbers(path: Path) -> np.ndarray:

@@ -35,6 +35,7 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_counts,
 )
 from neeco.ingest.frames import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 
@@ -104,19 +105,18 @@ class LeRobot(RecordingFormat):
         film = episode.films[key]
         part = None if film.start is None or film.end is None else (film.start, film.end)
         video = open_video(film.file, part=part)
-        where = f"{film.file}: episode {episode.number}"
         numbers = _frame_numbers(video)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         usable = numbers < len(times)
-        if numbers[-1] >= len(times) + (len(times) > 1) or (len(numbers) < len(times) - 1 and not damaged):
-            raise NeecoError(
-                f"{where}: has {numbers[-1] + 1} images for {len(times)} states; they do not belong together: download "
-                "the data set again, or name another episode"
-            )
-        if len(numbers) != len(times) and not damaged:
-            notes = (*notes, f"{film.file.name}: has {len(numbers)} images for {len(times)} states; the last is unused")
+        last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
+        shown = max(last, len(times)) if damaged else max(last, len(numbers)) if last > len(times) else len(numbers)
+        remedy = "download the data set again, or name another episode"
+        notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
-        return _Episode(video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames)
+        return _Episode(
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = None if stream is None else _NAME.fullmatch(stream)

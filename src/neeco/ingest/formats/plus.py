@@ -12,6 +12,7 @@ import numpy as np
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
+from neeco.files import require_content
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -122,6 +123,7 @@ class PlusSequence(RecordingFormat):
 
 def _sequence_of(path: Path) -> FrameSequence:
     path = Path(path)
+    require_content(path)
     try:
         state = path.stat()
     except OSError as error:
