@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,8 @@ from neeco.raster.pinhole import project
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 
-FORMATS = ("webdataset", "bop", "imagefolder")
+FORMATS = ("webdataset", "bop", "imagefolder", "coco", "yolo")
+READ_BACK = Path(__file__).parents[2] / "benchmarks" / "read_back.py"
 COUNT = 6
 
 
@@ -38,6 +41,24 @@ def made(runs: list[FakeRun], tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pixels(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         return np.array(image)
+
+
+def test_every_format_is_read_back_as_it_was_written(made: Path, tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("read_back", READ_BACK)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    lines, good = script.read_back(made)
+    assert good, lines
+    assert sum("not installed" not in line for line in lines) >= 4
+
+    damaged = shutil.copytree(made, tmp_path / "damaged")
+    for file, old, new in (("coco/parts.json", '"id": 2', '"id": 3'), ("yolo/labels/train/000000.txt", " 0.", " 1.")):
+        (damaged / file).write_text((damaged / file).read_text().replace(old, new))
+    lines, good = script.read_back(damaged)
+    assert not good
+    assert [line.split()[:2] for line in lines if "WRONG" in line] == [["coco", "pycocotools"], ["yolo", "its"]]
 
 
 def test_webdataset_reads_its_shards(made: Path) -> None:
@@ -163,7 +184,7 @@ def test_a_format_can_be_added_later(made: Path, runs: list[FakeRun], tmp_path: 
     synthesize(runs[0], output, settings, ("coco",), instrument_runs=runs[1:])  # type: ignore[arg-type]
     again = synthesize(runs[0], output, settings, FORMATS, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
     assert again.made_now == 0
-    assert json.loads((output / "dataset.json").read_text())["formats"] == [*FORMATS, "coco"]
+    assert json.loads((output / "dataset.json").read_text())["formats"] == list(FORMATS)
     for name in FORMATS:
         files = [path.relative_to(made) for path in (made / name).rglob("*") if path.is_file()]
         assert files
