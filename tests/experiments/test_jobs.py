@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -70,6 +71,15 @@ def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
     assert make_job().run() == first
+
+
+def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
+    job = make_job()
+    job.run()
+    config = job.folder / "config.yaml"
+    config.write_text(re.sub("capture_sha256: .*", "capture_sha256: of another capture", config.read_text()))
+    with pytest.raises(NeecoError, match=f"{job.capture} has changed since this run was begun"):
+        job.run()
 
 
 def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
