@@ -182,11 +182,11 @@ def load(path: PathLike, device: str = "auto") -> Run:
 def train(
     capture: PathLike,
     output: PathLike,
-    method: str = "kinematic",
+    method: str | None = None,
     *,
     iterations: int | None = None,
     minutes: float | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     device: str = "auto",
     resume: bool = False,
     progress: Callable[[ProgressRow], None] | None = None,
@@ -194,9 +194,10 @@ def train(
 ) -> Run:
     """Learn a scene from the training frames of the capture in folder `capture`; writes the run folder `output`.
 
-    method: kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames that
-    are learned from; minutes: stop in time with a finished run. The same seed gives the same scene on the same machine,
-    unless `minutes` is given. resume: continue an interrupted run in `output`, under its own settings. progress: is
+    method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
+    that are learned from; minutes: stop in time with a finished run. The same seed (None: 0) gives the same scene on
+    the same machine, unless `minutes` is given. resume: continue an interrupted run in `output`, under its own
+    settings, which what is given here must not contradict. progress: is
     called with every row of metrics (iteration, loss, psnr, num_gaussians, progress in [0, 1], note). settings: any
     field of the training config, with two underscores for a dot (`deformation__shadow=False`); `neeco train --help`
     lists them.
@@ -208,7 +209,8 @@ def train(
     """
     given = {"iterations": iterations, "minutes": minutes, "seed": seed}
     texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in settings.items()}
-    config = training_config(method, given, [f"{name.replace('__', '.')}={text}" for name, text in texts.items()])
+    assignments = [f"{name.replace('__', '.')}={text}" for name, text in texts.items()]
+    config = training_config(method, given, assignments, runs.begun_config(Path(output)) if resume else None)
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 

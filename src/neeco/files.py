@@ -11,7 +11,7 @@ import re
 import secrets
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -338,6 +338,35 @@ def _unfolded(value: Any, known: dict[int, int]) -> int:
         inner = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
     return known[id(value)]
+
+
+def read_begun(output: Path, name: str, resume: bool, work: str) -> dict[str, Any] | None:
+    """What file `name` in folder `output` says of the `work` (a noun) begun there; None where the folder is vacant.
+
+    Raises NeecoError where `output` may not be written to: it is a file, is not empty (without `resume`), or holds
+    something else.
+    """
+    file = output / name
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give a folder")
+    if is_vacant(output):
+        return None
+    if not resume:
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue {work} begun there")
+    if not file.exists():
+        raise NeecoError(f"{output}: not empty and no {name} in it; --resume continues only {work} begun by neeco")
+    begun = read_json(require_inside(file, output))
+    if not isinstance(begun, dict):
+        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
+    return begun
+
+
+def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]]) -> None:
+    """Raise NeecoError for the first field (name, value begun with, value now) of work to be continued, which `place`
+    describes, that is not as it was."""
+    for name, begun, now in pairs:
+        if begun != now:
+            raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; use a new folder")
 
 
 def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:

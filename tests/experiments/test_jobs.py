@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -83,6 +84,15 @@ def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
         job.check()
     with pytest.raises(NeecoError, match="deformation: this run has"):
         make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
+
+
+def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
+    job = make_job()
+    job.run()
+    config = job.folder / "config.yaml"
+    config.write_text(re.sub("capture_sha256: .*", "capture_sha256: of another capture", config.read_text()))
+    with pytest.raises(NeecoError, match=f"{job.capture} has changed since this run was begun"):
+        job.run()
 
 
 def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,6 +172,7 @@ def recordings_of(args: Ingest) -> list[Recording]:
 def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> int:
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
+    from neeco.cli._output import require_ending
     from neeco.errors import NeecoError
     from neeco.files import finite
     from neeco.ingest.pipeline import ingest
@@ -180,6 +181,7 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
     from neeco.report.rerun_log import require_rerun, write_rrd
 
     if rrd is not None:
+        require_ending("--rrd", rrd, ".rrd")
         require_rerun()
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())

@@ -18,6 +18,7 @@ from torch import Tensor
 from neeco.capture import Capture, read_capture
 from neeco.capture.check import read_checked
 from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
@@ -28,7 +29,7 @@ from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.methods import method_class
 from neeco.training.config import TrainConfig
-from neeco.training.run import open_run, read_config, stored_config
+from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
 
 if TYPE_CHECKING:
@@ -178,6 +179,7 @@ class TrainingJob:
         splits = held_out_splits(capture, self.splits)
         networks, device = find_lpips(self.lpips_weights), device_of(self.device)
         if file.exists():
+            require_same_capture(self.folder, capture.root, fingerprint(capture))
             stored = read_result(file)
             if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == sorted(networks):
                 return stored

@@ -20,6 +20,7 @@ SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside
 RENAMED_SAMPLERS = {"inside": "interpolate", "beyond": "extrapolate"}
 
 MAX_PIXELS = 2**26  # of an image
+JPEG_QUALITY = 95  # of 100, where none is asked for
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
@@ -75,7 +76,7 @@ class ImageSettings(SizeSettings):
     """Draw with the recording's own distortion and round border, labels too; else undistorted."""
     image_format: ImageFormat = "png"
     """Of the images; labels and depth are PNG always."""
-    quality: int = 95
+    quality: int = JPEG_QUALITY
     """Of JPEG images, 1 to 100."""
 
     def check(self) -> None:
@@ -83,6 +84,8 @@ class ImageSettings(SizeSettings):
         super().check()
         if not 1 <= self.quality <= 100:
             raise NeecoError(f"--quality: {self.quality} is none of JPEG; give 1 to 100")
+        if self.image_format == "png" and self.quality != JPEG_QUALITY:
+            raise NeecoError("--quality: is of JPEG images, and PNG would be written; give --image-format jpg, too")
 
     @property
     def jpeg_quality(self) -> int | None:

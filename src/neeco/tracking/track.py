@@ -24,7 +24,7 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
+from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import gaussian_scene, one_tissue
@@ -356,20 +356,10 @@ def _first_state(footage: Capture, frame: Frame, scene: Scene) -> State:
 
 def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     """Raises NeecoError when `output` may not be written to."""
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give a folder")
-    if is_vacant(output) or {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
+    if output.is_dir() and {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
         return
-    if not resume:
-        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
-    file = output / INFO
-    if not file.exists():
-        raise NeecoError(
-            f"{output}: not empty and no {INFO} in it; --resume goes on only with footage that was tracked"
-        )
-    begun = read_json(require_inside(file, output))
-    if not isinstance(begun, dict):
-        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
-    for key in ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust"):
-        if begun.get(key) != info[key]:
-            raise NeecoError(f"{file}: {key}: begun with {begun.get(key)!r}, now {info[key]!r}; use a new folder")
+    begun = read_begun(output, INFO, resume, "tracked footage")
+    if begun is None:
+        return
+    keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust")
+    require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))

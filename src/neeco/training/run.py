@@ -111,6 +111,11 @@ def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
         )
 
 
+def begun_config(path: Path) -> TrainConfig | None:
+    """The settings of the run that was begun in `path`, finished or not; None where none was. Raises NeecoError."""
+    return stored_config(path, read_config(path)) if (path / "config.yaml").exists() else None
+
+
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
     """The settings that the run in `path` was started with, of what `read_config` read there. Raises NeecoError for a
     field that is unknown or does not fit, or a number that nothing is trained with."""

@@ -80,7 +80,8 @@ By neeco {version}, of a scene with SHA-256 `{scene}`:
     {command}
 """
 FORMATS = {
-    "coco": "- `coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`",
+    "coco": "- `coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`; each split in "
+    "`coco/annotations/`, images in `coco/images/`",
     "yolo": "- `yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`",
     "webdataset": "- `webdataset/{train,val}-*.tar`",
     "bop": "- `bop/{train,val}/`, for 6-DoF pose",
