@@ -92,7 +92,7 @@ def make_views(scene: Scene, capture: Capture, split: str) -> list[View]:
         reference = load_reference(capture, frame)
         if reference is None:
             continue
-        state = scene.recorded.with_unrecorded(frame.state, scene.instruments)
+        state = frame.state
         deltas = scene.deltas(state)
         centred = Deltas(*(getattr(deltas, kind) - getattr(mean, kind) for kind in DELTAS))
         moved = {name: KnownDeltas(scene.instruments, d) for name, d in zip(ORIGINS, (deltas, centred), strict=True)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -11,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from neeco.capture.images import open_image
+from neeco.capture.points import read_ply
+from neeco.capture.urdf import read_urdf
 from neeco.errors import NeecoError
 from neeco.files import (
     LOCK,
@@ -19,11 +23,18 @@ from neeco.files import (
     is_vacant,
     own_folder,
     parse_yaml,
+    placeholder,
     read_json,
     require_inside,
     require_like,
+    visible_entries,
     write_atomically,
 )
+from neeco.ingest.formats import read_table
+from neeco.ingest.formats.plus import PlusSequence
+from neeco.ingest.lens import read_lens
+from neeco.ingest.video import open_video
+from neeco.scene.io import load_scene
 
 HOLD = """\
 import sys, time
@@ -63,6 +74,31 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
         left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
         assert left == {*whole, LOCK}
     assert not (tmp_path / LOCK).exists()
+
+
+@pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
+def test_the_umask_decides_who_may_read(tmp_path: Path, umask: int, file: int, folder: int) -> None:
+    path = tmp_path / "made" / "file.txt"
+    before = os.umask(umask)
+    try:
+        write_atomically(path, lambda temporary: temporary.write_text("x"))
+        assert os.umask(umask) == umask  # it is the process's own, which other threads share
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == file
+    assert stat.S_IMODE(path.parent.stat().st_mode) == folder
+
+
+def test_a_file_and_then_the_folders_that_name_it_are_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, synced = tmp_path / "made" / "file.txt", []
+
+    def sync(descriptor: int) -> None:
+        place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append((place.name, path.exists()) if place.is_dir() else ("file", path.exists()))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    write_atomically(path, lambda temporary: temporary.write_text("x"))
+    assert synced == [(tmp_path.name, False), ("file", False), ("made", True)]
 
 
 def test_a_link_out_of_a_folder_is_refused_and_one_within_it_is_not(tmp_path: Path) -> None:
@@ -182,3 +218,60 @@ def test_what_is_built_otherwise_is_told_by_its_place(change: dict[str, object],
     assert require_like(GOOD, LIKE, "f", "mend it") is GOOD
     with pytest.raises(NeecoError, match=told):
         require_like(GOOD | change, LIKE, "f", "mend it")
+
+
+LFS = "version https://git-lfs.github.com/spec/v1\noid sha256:0123456789abcdef\nsize 990\n"
+ANNEX = "/annex/objects/SHA256E-s990--0123456789abcdef.mp4\n"
+LOGIN = "\ufeff<!-- saved -->\n<!DOCTYPE html>\n<html><title>Sign in</title></html>"
+DENIED = '<?xml version="1.0" encoding="UTF-8"?>\n<Error><Code>AccessDenied</Code></Error>'
+READERS = {  # of files that neeco opens itself and of those that a library opens, by ending
+    ".json": read_json,
+    ".csv": read_table,
+    ".yaml": read_lens,
+    ".urdf": read_urdf,
+    ".ply": read_ply,
+    ".png": open_image,
+    ".mp4": open_video,
+    ".mha": PlusSequence().streams,
+    ".safetensors": load_scene,
+}
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_what_a_clone_or_a_download_left_in_place_of_a_file_is_named_by_every_reader(
+    ending: str, tmp_path: Path
+) -> None:
+    file = tmp_path / f"file{ending}"
+    for content, message in (
+        (LFS, "file.*: is a Git LFS pointer, not the file; run `git lfs pull`$"),
+        (ANNEX, "file.*: is a git-annex pointer, not the file; run `git annex get`$"),
+        (LOGIN, "file.*: is a web page, not the file; download"),
+        (DENIED, "file.*: is a server's error message, not the file; download"),
+        ("\0\x05\x16\x07\0\x02\0\0Mac OS X", "file.*: is macOS metadata"),
+    ):
+        file.write_text(content, encoding="utf-8")
+        with pytest.raises(NeecoError, match=message):
+            READERS[ending](file)
+    file.unlink()
+    file.symlink_to("../.git/annex/objects/Xq/1/SHA256E-s990/SHA256E-s990")
+    with pytest.raises(NeecoError, match="is a git-annex pointer"):
+        READERS[ending](file)
+
+
+def test_files_that_only_mention_a_pointer_are_content(tmp_path: Path) -> None:
+    for content in (
+        f"# {LFS}",
+        "404: Not Found, and more",
+        "<robot><!-- <html> --></robot>",
+        "",
+        "t_s,x\n/annex/objects",
+    ):
+        (tmp_path / "file").write_text(content)
+        assert placeholder(tmp_path / "file") is None
+    assert placeholder(tmp_path) is placeholder(tmp_path / "missing") is None
+
+
+def test_hidden_files_are_no_part_of_a_folder(tmp_path: Path) -> None:
+    for name in ("b.png", "a.png", "._a.png", ".DS_Store"):
+        (tmp_path / name).touch()
+    assert [entry.name for entry in visible_entries(tmp_path)] == ["a.png", "b.png"]

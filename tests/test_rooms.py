@@ -24,7 +24,7 @@ ROOMS = (  # from the top down; rooms of one line do not know each other
     ("capture",),
     ("raster",),
     ("cluster", "files", "registry", "settings"),
-    ("errors",),
+    ("errors", "plausible"),
 )
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
 OUTSIDE = ("__init__", "__main__", "_native")  # the package's version, its start (the command line's), the C++ kernels

@@ -56,7 +56,7 @@ def write_data_sets(folder: Path, clocks_s: Mapping[str, float]) -> None:
         path = folder / "lerobot" / version
         episodes = [shown(count) for count in lengths]
         LeRobotWriter(path / "set", version, episodes, rate, film.size, {STATE: [names]}).write()
-        text = write_template(path / "set").replace("# frame: camera   # or base:", "frame: base   #")
+        text = write_template(path / "set").replace("# frame: camera   # or base", "frame: base   #")
         given = recording.intrinsics
         if isinstance(given, Path):
             shutil.copy(given, path / given.name)

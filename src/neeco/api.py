@@ -13,12 +13,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from neeco.capture import Camera, Capture, Problem, State, check_capture, read_capture
+from neeco.capture import Camera, Capture, Problem, State, check_capture
 from neeco.capture.model import Instrument
+from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run
 from neeco.evaluation.image_metrics import find_lpips
 from neeco.labels.annotation import LabelledImage, RGBDImage, draw_labelled
+from neeco.plausible import Fault, focal_fault
 from neeco.raster.devices import device_of
+from neeco.raster.rotations import rigid_fault
 from neeco.scene.drawable import Learned
 from neeco.scene.io import load_scene
 from neeco.training import run as runs
@@ -88,8 +91,9 @@ class Scene:
         state: poses world_from_instrument [4, 4] in mm and joints in rad, of every instrument of the scene. camera:
         intrinsics in px and world_from_camera [4, 4] in mm, OpenCV axes (x right, y down, z forward). Poses may be
         numpy arrays or tensors. The result's tensors are on the CPU; no gradient reaches the scene (for that, use
-        `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint, and with `labels` where
-        the method learns none.
+        `scene.learned.render`). Raises NeecoError where the state lacks an instrument or joint or has one that is not
+        in the scene, for poses that are not rigid, joints beyond their limits (without stated ones: far out of the
+        recorded range), focal lengths that fit no lens, and with `labels` where the method learns none.
 
             run = neeco.load("runs/sample")
             drawn = run.scene.draw(state, camera)
@@ -98,8 +102,15 @@ class Scene:
             drawn.boxes, drawn.keypoints                  # float32 [I, 4] px; float32 [I, K, 3]
             run.scene.draw(state, camera.resized(1280, 1024))  # the same, larger
         """
+        state.check(self._limited)
+        if (fault := _view_fault(camera)) is not None:
+            raise NeecoError(f"camera: {fault[0]}; {fault[1]}")
         with self.learned.torch_threads():
             return draw_labelled(self.learned, state, camera, labels)
+
+    @cached_property
+    def _limited(self) -> tuple[Instrument, ...]:
+        return self.learned.recorded.with_limits(self.instruments)
 
     def __repr__(self) -> str:
         names = ", ".join(instrument.name for instrument in self.instruments) or "no instruments"
@@ -116,8 +127,13 @@ class Run:
 
     @cached_property
     def capture(self) -> Capture:
-        """The capture that the run was trained on. Raises NeecoError when it has moved."""
-        return read_capture(self.config["capture"], self.config["transforms"])
+        """The capture that the run was trained on; joints that nobody recorded are as training found them. Raises
+        NeecoError when it has moved."""
+        return self._run.capture()
+
+    @property
+    def _run(self) -> runs.Run:
+        return runs.Run(self.path, self.scene.learned, dict(self.config))
 
     def evaluate(
         self,
@@ -136,11 +152,19 @@ class Run:
 
             neeco.load("runs/sample").evaluate(["test"])["given"]["test"]["psnr"]
         """
-        run = runs.Run(self.path, self.scene.learned, dict(self.config))
         networks = find_lpips(None if lpips_weights is None else Path(lpips_weights))
         tell = progress or (lambda what, done, total: None)
         with self.scene.learned.torch_threads():
-            return evaluate_run(run, self.capture, splits, align=align, networks=networks, progress=tell)
+            return evaluate_run(self._run, self.capture, splits, align=align, networks=networks, progress=tell)
+
+
+def _view_fault(camera: Camera) -> Fault | None:
+    """What is wrong with a camera that is to see a scene, and what to do."""
+    for pose in (camera.world_from_camera, camera.world_from_lamps):
+        fault = None if pose is None else rigid_fault(pose.detach().cpu().double().numpy())
+        if fault is not None:
+            return fault
+    return focal_fault(camera.fx, camera.fy, camera.width, camera.height)
 
 
 def load(path: PathLike, device: str = "auto") -> Run:
@@ -158,11 +182,11 @@ def load(path: PathLike, device: str = "auto") -> Run:
 def train(
     capture: PathLike,
     output: PathLike,
-    method: str = "kinematic",
+    method: str | None = None,
     *,
     iterations: int | None = None,
     minutes: float | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     device: str = "auto",
     resume: bool = False,
     progress: Callable[[ProgressRow], None] | None = None,
@@ -170,9 +194,10 @@ def train(
 ) -> Run:
     """Learn a scene from the training frames of the capture in folder `capture`; writes the run folder `output`.
 
-    method: kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames that
-    are learned from; minutes: stop in time with a finished run. The same seed gives the same scene on the same machine,
-    unless `minutes` is given. resume: continue an interrupted run in `output`, under its own settings. progress: is
+    method: kinematic (None), neeco (the paper), 3dgs, deformable-3dgs, 4dgs, nerfies, or METHOD+dta. iterations: frames
+    that are learned from; minutes: stop in time with a finished run. The same seed (None: 0) gives the same scene on
+    the same machine, unless `minutes` is given. resume: continue an interrupted run in `output`, under its own
+    settings, which what is given here must not contradict. progress: is
     called with every row of metrics (iteration, loss, psnr, num_gaussians, progress in [0, 1], note). settings: any
     field of the training config, with two underscores for a dot (`deformation__shadow=False`); `neeco train --help`
     lists them.
@@ -184,7 +209,8 @@ def train(
     """
     given = {"iterations": iterations, "minutes": minutes, "seed": seed}
     texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in settings.items()}
-    config = training_config(method, given, [f"{name.replace('__', '.')}={text}" for name, text in texts.items()])
+    assignments = [f"{name.replace('__', '.')}={text}" for name, text in texts.items()]
+    config = training_config(method, given, assignments, runs.begun_config(Path(output)) if resume else None)
     path = train_run(Path(capture), Path(output), config, device=device_of(device), resume=resume, progress=progress)
     return load(path, device)
 

@@ -1,6 +1,18 @@
-"""The one exception that users see."""
+"""The one exception that users see, and what is said of one that any library may raise: too little memory."""
 
 from __future__ import annotations
+
+import errno
+import os
+import re
+
+# what libraries without a MemoryError of their own say: PyTorch, safetensors, OpenCV, the dynamic linker, threads
+MEMORY_MESSAGES = re.compile(
+    "can(?:no|')t allocate memory|not enough memory|insufficient memory|out of memory error|bad_alloc|"
+    "failed to map segment|can't start new thread",
+    re.IGNORECASE,
+)
+TOO_LITTLE = "memory: too little"  # begins every line of `memory_failure`
 
 
 class NeecoError(Exception):
@@ -12,3 +24,51 @@ class NeecoError(Exception):
         except neeco.NeecoError as error:
             print(error)
     """
+
+
+def memory_failure(error: BaseException) -> str | None:
+    """Say in one line that the computer's memory was too small, by how much, and what to do; None where neither `error`
+    nor any error that it was raised for is of that kind."""
+    if isinstance(error, NeecoError) and str(error).startswith(TOO_LITTLE):
+        return str(error)
+    cause: BaseException | None = error
+    while cause is not None and not _is_memory_failure(cause):
+        cause = cause.__cause__ or cause.__context__
+    if cause is None:
+        return None
+    asked = re.search(r"allocate (\d+(?:\.\d+)?)\.? (\w+)", str(cause))
+    numbers = [f"{_size(asked[1], asked[2])} more were asked for"] if asked else []
+    numbers += [f"this process may use {_size(str(limit), 'bytes')}"] if (limit := _memory_limit()) else []
+    details = f" ({', '.join(numbers)})" if numbers else ""
+    return (
+        f"{TOO_LITTLE}{details}: close other programs or raise the limit (ulimit -v), take smaller images "
+        "(--scale 0.5), fewer Gaussians (--max-tissue-gaussians), fewer --workers, or a machine with more"
+    )
+
+
+def _is_memory_failure(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    return not isinstance(error, NeecoError) and bool(MEMORY_MESSAGES.search(str(error)))
+
+
+def _memory_limit() -> int | None:
+    """Bytes that this process may use: the limit that was set for it, else the machine's memory; None: not known."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    limits = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min([memory, *(limit for limit in limits if limit != resource.RLIM_INFINITY)])
+
+
+def _size(number: str, unit: str) -> str:
+    """A size in memory; bytes in the largest binary unit of which there is one."""
+    if unit != "bytes":
+        return f"{number} {unit}"
+    value, units = float(number), ["bytes", "KiB", "MiB", "GiB", "TiB"]
+    while value >= 1024 and len(units) > 1:
+        value /= 1024
+        del units[0]
+    return f"{value:.3g} {units[0]}"

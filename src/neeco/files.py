@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import math
 import os
 import re
+import secrets
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,29 +28,44 @@ TEMPORARY = ".unfinished-"  # begins the names of files and folders that are sti
 LOCK = ".neeco.lock"
 MOST_VALUES = 1_000_000  # in a YAML file, aliases written out
 HALVES = re.compile("[\ud800-\udfff]")  # of characters: JSON may hold them, a file of text cannot
+HEAD_BYTES = 1024  # read of a file to recognise what was stored in its place; Git LFS pointers are shorter
+_XML = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*"
+_LFS = "is a Git LFS pointer, not the file; run `git lfs pull`"
+_ANNEX = "is a git-annex pointer, not the file; run `git annex get`"
+_MAC = "is macOS metadata (AppleDouble), not the file; give the file without `._`"
+_PAGE = "is a web page, not the file; download the file again (does it need a login?)"
+_ANSWER = "is a server's error message, not the file; download the file again"
+_PLACEHOLDERS = (
+    (rb"version https://(?:git-lfs|hawser)\.github\.com/spec/", _LFS),
+    (rb"[./\\][\w./\\-]*annex[/\\]objects[/\\]\S+\s*\Z", _ANNEX),
+    (rb"\0\x05\x16[\0\x07]\0", _MAC),
+    (_XML + rb"<(?:!doctype\s+html|html[\s>])", _PAGE),
+    (_XML + rb"<Error>\s*<Code>|(?:404: Not Found|Entry not found|Access to \S+ \S+ is restricted\b.*)\s*\Z", _ANSWER),
+)  # what clones and downloads leave in a file's place: how it begins, and what to do
+PLACEHOLDERS = [(re.compile(start, re.DOTALL | re.IGNORECASE), problem) for start, problem in _PLACEHOLDERS]
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write(temporary_path)` produce a file beside `path`, sync it to disk and rename it to `path`.
 
-    On any failure the temporary file is removed and `path` is left as it was.
-    Raises NeecoError naming `path` when the disk refuses.
+    The user's umask decides who may read and write it. On any failure the temporary file is removed, and `path` holds
+    what it did, or all of the new content. Raises NeecoError naming `path` when the disk refuses.
     """
     path = Path(path)
+    # keep the suffix: some writers choose the format by it
+    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # keep the suffix: some writers choose the format by it
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+        _make_folders(path.parent)
+        # not by `tempfile`, whose files are their owner's alone
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         raise NeecoError(f"{path}: cannot write here: {error.strerror or error}") from error
-    os.close(handle)
-    temporary = Path(name)
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
             os.fsync(stream.fileno())
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+        _sync_folder(path.parent)
     except OSError as error:
         raise NeecoError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
@@ -56,16 +73,40 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             temporary.unlink()
 
 
+def _make_folders(path: Path) -> None:
+    """Make folder `path` and those above it, as far as they are missing, so that they outlast a power cut."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in missing:
+        _sync_folder(folder.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Sync a folder's entries to disk, where the system can open folders: a rename lasts only then."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of a file system without such syncs
+            raise
+    finally:
+        os.close(handle)
+
+
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
     """Make folder `path` and those above it, as far as they are missing, and make sure that files can be written there.
 
-    When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses.
+    When the block fails, folders made here that are still empty go again. Raises NeecoError when the disk refuses, and
+    for a path that is not in UTF-8.
     """
     path = Path(path)
+    require_utf8(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        _make_folders(path)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
@@ -121,7 +162,7 @@ def _locked(folder: Path, named: Path) -> Iterator[None]:
     lock = folder / LOCK
     while True:
         try:
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             raise NeecoError(f"{lock}: cannot write: {error.strerror or error}") from error
         try:
@@ -164,6 +205,24 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def finite(value: Any) -> Any:
+    """The same structure with NaN and infinity as None: JSON has no such numbers."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def require_utf8(path: Path | str) -> None:
+    """Raise NeecoError when the name of `path`, or of a folder above it, is not in UTF-8: files of text could not say
+    where it lies."""
+    if HALVES.search(name := os.path.abspath(path)):
+        raise NeecoError(f"{os.fsencode(name)!r}: the name is not in UTF-8; rename the file or folder")
+
+
 def require_inside(file: Path, folder: Path) -> Path:
     """`file`, whose path goes through `folder`. Raises NeecoError when a link on the way leads out of that, or in a
     circle."""
@@ -178,9 +237,38 @@ def require_inside(file: Path, folder: Path) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Raise NeecoError when `path` is there but is no file: a folder, or a pipe or device whose reading may not end."""
+    """Raise NeecoError when `path` is there but is no file (a folder, or a pipe or device whose reading may not end),
+    or holds a `placeholder`."""
     if path.exists() and not path.is_file():
         raise NeecoError(f"{path}: is not a file; expected {expected}")
+    require_content(path)
+
+
+def require_content(path: Path) -> None:
+    """Raise NeecoError for a file that holds a `placeholder`: for those that a library opens."""
+    if problem := placeholder(path):
+        raise NeecoError(f"{path}: {problem}")
+
+
+def placeholder(path: Path) -> str | None:
+    """What a clone or a download left in a file's place (a Git LFS or git-annex pointer, a web page), and what to do;
+    None for content, and where there is no file to read."""
+    try:
+        if path.is_symlink() and not path.exists():
+            return _ANNEX if "annex/objects/" in os.readlink(path).replace("\\", "/") else None
+        if not path.is_file():
+            return None
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
+    except (OSError, ValueError):
+        return None  # the reader says why
+    return next((problem for start, problem in PLACEHOLDERS if start.match(head)), None)
+
+
+def visible_entries(folder: Path, pattern: str = "*") -> list[Path]:
+    """What a folder holds under `pattern`, sorted, without hidden entries such as the `._left.png` that macOS writes
+    next to `left.png`."""
+    return sorted(entry for entry in folder.glob(pattern) if not entry.name.startswith("."))
 
 
 def read_bytes(path: Path, expected: str, missing: str = "no such file") -> bytes:
@@ -250,6 +338,35 @@ def _unfolded(value: Any, known: dict[int, int]) -> int:
         inner = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_unfolded(item, known) for item in inner)
     return known[id(value)]
+
+
+def read_begun(output: Path, name: str, resume: bool, work: str) -> dict[str, Any] | None:
+    """What file `name` in folder `output` says of the `work` (a noun) begun there; None where the folder is vacant.
+
+    Raises NeecoError where `output` may not be written to: it is a file, is not empty (without `resume`), or holds
+    something else.
+    """
+    file = output / name
+    if output.exists() and not output.is_dir():
+        raise NeecoError(f"{output}: is a file; give a folder")
+    if is_vacant(output):
+        return None
+    if not resume:
+        raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue {work} begun there")
+    if not file.exists():
+        raise NeecoError(f"{output}: not empty and no {name} in it; --resume continues only {work} begun by neeco")
+    begun = read_json(require_inside(file, output))
+    if not isinstance(begun, dict):
+        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
+    return begun
+
+
+def require_same(place: str, pairs: Iterable[tuple[str, Any, Any]]) -> None:
+    """Raise NeecoError for the first field (name, value begun with, value now) of work to be continued, which `place`
+    describes, that is not as it was."""
+    for name, begun, now in pairs:
+        if begun != now:
+            raise NeecoError(f"{place}: {name}: begun with {begun!r}, now {now!r}; use a new folder")
 
 
 def require_like(value: Any, like: Any, place: str, remedy: str) -> Any:

@@ -206,7 +206,7 @@ def test_a_blender_folder_without_any_time_stands_still(folder, tmp_path, timed)
     assert bool(asked) == bool(timed)
 
 
-def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE") -> None:
+def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> None:
     capture = read_capture(folder.root)
     (folder.root / "images").rename(root / "images")
     sparse = root / "sparse" / "0"
@@ -219,7 +219,7 @@ def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE") -> No
     points = capture.points
     if binary:
         ids = {"PINHOLE": 1, "OPENCV": 4}
-        params = (40.0, 41.0, 16.5, 12.0, *[0.0] * (4 if model == "OPENCV" else 0))
+        params = (40.0, 41.0, 16.5, 12.0, *distortion)
         cameras = struct.pack("<QiiQQ", 1, 1, ids[model], 32, 24) + struct.pack(f"<{len(params)}d", *params)
         images = struct.pack("<Q", len(poses))
         for index, pose in enumerate(poses):
@@ -234,9 +234,8 @@ def write_colmap(folder, root: Path, binary: bool, model: str = "PINHOLE") -> No
         cloud_rows = [
             f"1 {x!r} {y!r} {z!r} 200 100 50 0.5 0 0\n" for x, y, z in points.positions.astype(float).tolist()
         ]
-        distortion = " 0 0 0 0" if model == "OPENCV" else ""
         contents = {
-            "cameras.txt": f"# cameras\n1 {model} 32 24 40 41 16.5 12{distortion}\n".encode(),
+            "cameras.txt": f"# cameras\n1 {model} 32 24 40 41 16.5 12 {' '.join(map(str, distortion))}\n".encode(),
             "images.txt": ("# images\n" + "\n".join(rows) + "\n").encode(),
             "points3D.txt": "".join(cloud_rows).encode(),
         }
@@ -260,8 +259,8 @@ def test_colmap_models_are_read(folder, tmp_path, binary):
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_distorted_or_damaged_colmap_models_are_refused(folder, tmp_path, binary):
-    write_colmap(folder, tmp_path, binary, "OPENCV")
-    with pytest.raises(NeecoError, match="OPENCV; run `colmap image_undistorter`"):
+    write_colmap(folder, tmp_path, binary, "OPENCV", (-0.1, 0.0, 0.0, 0.001))
+    with pytest.raises(NeecoError, match=r"OPENCV: the images are distorted .*: neeco ingest"):
         read_capture(tmp_path)
     for path in (tmp_path / "sparse/0").iterdir():
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 3])

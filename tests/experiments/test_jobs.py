@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +26,10 @@ from neeco.experiments.machine import peak_memory_mb, reset_peak_memory, threads
 from neeco.experiments.study import check_workers, run_jobs
 from neeco.experiments.training_job import UNLIMITED, Budget, HeldOutFrames
 from neeco.raster.native import set_threads
+from neeco.settings import with_fields
 from neeco.training import train as train_module
 from neeco.training.config import training_config
+from neeco.training.run import checkpoint_path, write_config
 from neeco.training.session import GaussianSession
 
 TIMES = ("seconds", "processor_seconds", "fps", "peak_memory_mb")
@@ -70,6 +75,24 @@ def test_a_finished_job_is_not_done_again(make_job, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "train", lambda *_, **__: pytest.fail("trained again"))
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: pytest.fail("scored again"))
     assert make_job().run() == first
+
+
+def test_a_begun_run_keeps_what_its_processor_decided(make_job) -> None:
+    job = make_job(config=training_config("neeco", {}))
+    for half in (True, False):  # one of them is not what this processor would decide
+        write_config(job.folder, job.capture, with_fields(job.train_config, {"deformation.half": half}), "")
+        job.check()
+    with pytest.raises(NeecoError, match="deformation: this run has"):
+        make_job(config=training_config("neeco", {}, ["deformation.half=true"])).check()
+
+
+def test_the_numbers_of_a_capture_that_changed_are_not_given_again(make_job) -> None:
+    job = make_job()
+    job.run()
+    config = job.folder / "config.yaml"
+    config.write_text(re.sub("capture_sha256: .*", "capture_sha256: of another capture", config.read_text()))
+    with pytest.raises(NeecoError, match=f"{job.capture} has changed since this run was begun"):
+        job.run()
 
 
 def test_other_splits_are_scored_without_training_again(make_job, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,7 +178,7 @@ def test_a_killed_job_counts_the_lost_steps_once(make_job, tmp_path, monkeypatch
 
     with monkeypatch.context() as patched:
         patched.setattr(GaussianSession, "step", killed)
-        assert "MemoryError" in run_jobs([cut])[0]["error"]
+        assert "memory: too little" in run_jobs([cut])[0]["error"]
     assert without_times(cut.run()) == without_times(expected)
     assert [row["iteration"] for row in curve_of(cut)] == [row["iteration"] for row in curve_of(whole)]
 
@@ -329,7 +352,7 @@ def test_a_job_in_a_worker_sees_the_gpu_it_was_given(make_job, monkeypatch) -> N
     monkeypatch.setattr(study, "attempt_job", lambda job: {"seen": os.environ["CUDA_VISIBLE_DEVICES"]})
     threads = torch.get_num_threads()
     try:
-        assert study._run_in_worker(make_job(), 1) == {"seen": "1"}
+        assert study._run_in_worker(make_job(), 1, os.getcwd()) == {"seen": "1"}
     finally:
         set_threads(0)
         torch.set_num_threads(threads)
@@ -373,6 +396,49 @@ def test_ray_gives_the_same_numbers(make_job, tmp_path) -> None:
     here = [make_job(seed=seed, folder=tmp_path / "here" / str(seed)) for seed in (0, 1)]
     there = [make_job(seed=seed, folder=tmp_path / "there" / str(seed)) for seed in (0, 1)]
     assert without_times(run_jobs(there, workers=2)) == without_times(run_jobs(here))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers in /proc")
+def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(make_job, tmp_path, monkeypatch) -> None:
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    config, budget = replace(training_config("3dgs", {}), checkpoint_interval=20), Budget(None, 300)
+    here, there = (
+        make_job(config=config, budget=budget, folder=tmp_path / where / "run") for where in ("here", "there")
+    )
+    expected = without_times(run_jobs([here]))
+    events, killed = [], []
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        for _ in range(2):
+            nodes.add_node(num_cpus=1)
+        monkeypatch.setenv("RAY_ADDRESS", nodes.address)
+        watcher = threading.Thread(
+            target=kill_when, args=(checkpoint_path(there.folder), "ray::_run_in_worker", killed)
+        )
+        watcher.start()
+        assert without_times(run_jobs([there], progress=events.append)) == expected  # one worker, and on the cluster
+        watcher.join()
+    finally:
+        nodes.shutdown()
+    assert killed
+    assert any("its worker died" in event.text and event.stage == "training" for event in events)
+
+
+def kill_when(file: Path, name: str, killed: list[int]) -> None:
+    """Kill a process once a file is there."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not killed:
+        for path in Path("/proc").glob("[0-9]*/cmdline") if file.exists() else ():
+            with contextlib.suppress(OSError):
+                if path.read_bytes().startswith(name.encode()):
+                    os.kill(int(path.parent.name), signal.SIGKILL)
+                    killed.append(int(path.parent.name))
+        time.sleep(0.05)
 
 
 def test_a_field_which_draws_slowly_is_drawn_less_often_for_its_curve(capture: Path) -> None:

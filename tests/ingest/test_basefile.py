@@ -54,6 +54,34 @@ def test_a_registration_of_the_dvrk_is_in_metres_and_one_in_its_own_axes_is_turn
     assert (base.sd_mm, base.sd_deg) == (8.0, 5.0)
     turned = read_dvrk_registration(tmp_path / "PSM1-registration-dVRK.json").matrix
     assert np.allclose(np.diag([-1, -1, 1, 1]) @ turned, MILLIMETRES)
+    whole = tmp_path / "mended" / "PSM1-registration-dVRK.json"  # made JSON by hand
+    whole.parent.mkdir()
+    whole.write_text('{"base-frame": ' + json.dumps(FRAME) + "}")
+    assert np.array_equal(read_dvrk_registration(whole).matrix, turned)
+
+
+def test_a_registration_to_the_ecm_must_say_in_which_axes(tmp_path):
+    path = tmp_path / "psm1.json"
+    path.write_text(json.dumps({"base-frame": FRAME | {"reference-frame": "/ECM"}}))
+    with pytest.raises(NeecoError, match=r"reference-frame'\]: is '/ECM', and nothing says whether .* or OpenCV's"):
+        read_dvrk_registration(path)
+
+
+def test_a_trackers_frame_has_no_cameras_axes(tmp_path):
+    (tmp_path / "video.mp4").touch()
+    (tmp_path / "psm.csv").touch()
+    document = {"video": "video.mp4", "instruments": [{"name": "psm1", "poses": "psm.csv"}]}
+    document["world_from_base"] = {"transform": MILLIMETRES, "axes": "ecm"}
+    (tmp_path / "recording.yaml").write_text(json.dumps(document))
+    with pytest.raises(NeecoError, match=r"world_from_base\.axes: a tracker's frame has none"):
+        read_recording(tmp_path / "recording.yaml")
+
+
+def test_a_transform_may_lead_to_the_camera_in_other_axes(tmp_path):
+    base = _recording(tmp_path, {"transform": MILLIMETRES, "axes": "ecm"})[0].base
+    assert np.array_equal(base.matrix, np.diag([-1, -1, 1, 1]) @ MILLIMETRES)
+    with pytest.raises(NeecoError, match=r"axes: 'left' is no convention; write one of camera, opencv, .*ecm"):
+        _recording(tmp_path, {"transform": MILLIMETRES, "axes": "left"})
 
 
 @pytest.mark.parametrize(

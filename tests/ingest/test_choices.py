@@ -92,6 +92,19 @@ def test_every_way_to_read_poses_is_drawn(tmp_path, names, titles):
         assert len(np.unique(np.asarray(image.convert("L")))) > 30
 
 
+def test_a_dvrks_poses_are_shown_in_either_axes(tmp_path):
+    places, turns = pivoting()
+    names = [f"psm1_{part}" for part in BODY]
+    states = [{STATE: np.column_stack([places, turns.as_quat()])}]
+    path = write_data_set(tmp_path / "set", "v2.1", states, names={STATE: names})
+    found = {poses.frame: poses for poses in open_poses(path)}
+    assert list(found) == ["camera", "ecm"]
+    np.testing.assert_allclose(found["ecm"].positions, found["camera"].positions * [-1, -1, 1], atol=1e-12)
+    for axis in range(3):  # of the tool, as the camera sees it
+        ways = [axis_directions(found[frame].readings[0].quats, axis) for frame in ("camera", "ecm")]
+        np.testing.assert_allclose(ways[1], ways[0] * [-1, -1, 1], atol=1e-12)
+
+
 def test_init_writes_the_picture_beside_the_recording(tmp_path, capsys):
     places, turns = pivoting()
     states = [{STATE: np.column_stack([places, turns.as_quat()])}]

@@ -159,14 +159,14 @@ def test_topics_of_a_session_s_bag_are_on_its_clock(world, session):
     (session / "endoscope_20260117_153206.json").write_text(json.dumps(sidecar), encoding="utf-8")
     log = read_pose_log(PoseColumns(session, stream="/PSM1/measured_cp"))
     np.testing.assert_allclose(log.times, TICKS, atol=1e-6)
-    np.testing.assert_allclose(log.positions, world.positions(TICKS), atol=1e-9)
+    np.testing.assert_allclose(log.positions, world.positions(TICKS) * [-1, -1, 1], atol=1e-9)  # ECM: x left, y up
     assert log.frame == CAMERA
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": [{"cpu_ts": BEGIN + i} for i in range(12)]}, "has 30 frames, and times of 12"),
+        ({"frames": [{"cpu_ts": BEGIN + i} for i in range(12)]}, "has 30 images for 12 times"),
         ({"frames": 7}, "frames: expected a cpu_ts"),
         ({"frames": [{"cpu_ts": "x"}] * 30}, "frames: expected a cpu_ts"),
         ({"estimated_latency": "long"}, "estimated_latency: 'long' is none in s"),

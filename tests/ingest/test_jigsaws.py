@@ -13,6 +13,7 @@ from neeco.ingest.columns import PoseColumns
 from neeco.ingest.formats import format_of
 from neeco.ingest.logs import read_pose_log, read_reading_log
 from neeco.ingest.recordingfile import read_recording
+from neeco.ingest.synchronized import SynchronizedRecording
 from neeco.ingest.template import write_template
 
 ROWS = 40
@@ -73,6 +74,37 @@ def test_a_template_takes_the_slaves_on_the_videos_clock(trial, world):
         np.testing.assert_allclose(read_pose_log(instrument.poses).positions, 1000 * arm(number)[0], atol=1e-3)
         readings = read_reading_log(instrument.joints["gripper_angle"])
         np.testing.assert_allclose(readings.values, arm(number)[2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "rate", "message"),
+    [
+        (40, 30, None),
+        (20, 15, "has 39 images for 40 states at 30 a second; both are taken to begin together"),
+        (38, 30, "has 38 images for 40 states at 30 a second; both are taken to begin together"),
+        (12, 30, "has 12 images for 40 states at 30 a second; they do not belong together: give the video of this log"),
+        (40, 15, "has 79 images for 40 states at 30 a second; .*: as it has 40, say `fps: 30` of it"),
+    ],
+)
+def test_there_is_a_row_for_every_image_of_the_video(frames, rate, message, trial, world):
+    world.video("Suturing_B001_capture1.mp4", frames, lambda i: round(i * 1000 / rate))
+    world.text(write_template(trial.parent), "recording.yaml")
+    recording = read_recording(world.folder / "recording.yaml")
+    if message is None or "begin together" in message:
+        notes = SynchronizedRecording(recording, lambda *_: None).notes
+        expected = [f"Suturing_B001_capture1.mp4: {message}"] if message else []
+        assert [note for note in notes if "images for" in note] == expected
+    else:
+        with pytest.raises(NeecoError, match=message):
+            SynchronizedRecording(recording, lambda *_: None)
+
+
+def test_a_log_on_the_videos_clock_that_is_longer_than_the_video_is_noted(world):
+    world.video(frames=40)
+    world.write("t_s,x_mm,y_mm,z_mm,qw,qx,qy,qz", world.rows(), "tool.csv")  # 5 s
+    world.text("video: video.mp4\ninstruments: [{name: a, poses: {file: tool.csv, clock: video}}]", "recording.yaml")
+    notes = SynchronizedRecording(read_recording(world.folder / "recording.yaml"), lambda *_: None).notes
+    assert "tool.csv: goes from 0.0 to 5.0 s on the video's clock, the video from 0.0 to 1.6 s" in str(notes)
 
 
 def test_an_arm_must_be_named(trial):

@@ -181,7 +181,9 @@ def test_the_convention_of_angles_is_not_guessed(tmp_path):
 
 
 def test_the_frame_of_poses_is_not_guessed(nameless):
-    with pytest.raises(NeecoError, match=r"frame: nothing says .* frame: camera, or frame: base"):
+    with pytest.raises(
+        NeecoError, match=r"frame: nothing says .* frame: camera \(.*x right, y down, z forward\), or frame: base"
+    ):
         read_pose_log(pose_columns(nameless, frame=None))
 
 
@@ -194,7 +196,7 @@ def test_the_unit_of_lengths_is_not_guessed(nameless):
     ("key", "frame"),
     [
         ("observation.state.camera_frame", "camera"),
-        ("observation.pose_in_ecm", "camera"),
+        ("observation.pose_in_ecm", "ecm"),
         ("observation.pose_in_base", "base"),
         ("observation.robot_base_frame", "base"),
         ("observation.state", None),

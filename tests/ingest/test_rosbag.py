@@ -136,11 +136,21 @@ def test_streams_say_what_there_is(tmp_path: Path, kind: str) -> None:
     assert found[ARM].rate_hz == pytest.approx(1 / STEP)
 
 
-@pytest.mark.parametrize(("frame", "meant"), [("ECM", CAMERA), ("/camera", CAMERA), ("PSM1_base", BASE), ("", BASE)])
+@pytest.mark.parametrize(("frame", "meant"), [("ECM", CAMERA), ("/ecm", CAMERA), ("PSM1_base", BASE), ("", BASE)])
 def test_poses_in_a_cameras_frame_are_known_as_such(tmp_path: Path, frame: str, meant: str) -> None:
     path = whole(tmp_path, frame=frame)  # its images are of `camera`
     assert poses(path).frame == meant
     assert read_pose_log(PoseColumns(path, stream=ARM, frame=BASE)).frame == BASE
+
+
+def test_a_dvrks_poses_in_the_images_own_frame_have_either_axes_and_are_asked_for(tmp_path: Path) -> None:
+    path = whole(tmp_path, frame="camera")  # as its images
+    message = refusal(lambda: poses(path))
+    assert "camera is the images' own frame" in message
+    assert "frame: ecm (the camera's, x left, y up, z forward), frame: camera (the camera's, x right" in message
+    seen = {frame: read_pose_log(PoseColumns(path, stream=ARM, frame=frame)) for frame in ("ecm", "camera")}
+    np.testing.assert_allclose(seen["ecm"].positions, seen["camera"].positions * [-1, -1, 1], atol=1e-12)
+    assert {log.frame for log in seen.values()} == {CAMERA}
 
 
 def test_times_are_the_headers_and_not_those_of_receipt(tmp_path: Path) -> None:
@@ -193,7 +203,8 @@ def test_transforms_are_chained_to_a_named_frame(tmp_path: Path) -> None:
         for time in np.arange(0.0, 1.2, 0.01):  # about one axis at one speed, as interpolation has it
             angles = Rotation.from_rotvec([0, 0, 0.7 * time]).as_quat(scalar_first=True)
             bag.tf(time, [time, 2 * time, 0.0], angles, "world", "base")
-    log = poses(bag.path, "tf:tip in camera")
+    assert "frame: camera may be the camera's frame" in refusal(lambda: poses(bag.path, "tf:tip in camera"))
+    log = read_pose_log(PoseColumns(bag.path, stream="tf:tip in camera", frame=CAMERA))
     np.testing.assert_allclose(log.times, TICKS, atol=2 * NS)
     for row, time in enumerate(TICKS):
         spun, tip = Rotation.from_rotvec([0, 0, 0.7 * time]), Rotation.from_quat(turn(time), scalar_first=True)

@@ -119,7 +119,8 @@ def test_a_dvrks_bag_becomes_a_recording_by_one_command(
     states, usable = data.states_at(times)
     assert usable.all()
     found, joints = states["PSM2"]
-    np.testing.assert_allclose(found[:, :3, 3], [1000 * shaft(time) for time in times], atol=0.01)
+    turned = np.array([-1000, -1000, 1000])  # ECM: x left, y up
+    np.testing.assert_allclose(found[:, :3, 3], [turned * shaft(time) for time in times], atol=0.01)
     np.testing.assert_allclose(joints["wrist_pitch"], times, atol=1e-6)
     np.testing.assert_allclose(joints["jaw"], 0.3 * times, atol=1e-6)
     assert data.poses["PSM1"].frame == CAMERA

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neeco.ingest.frame_selection import choose_frames, frame_features
+from neeco.ingest.frame_selection import choose_frames, describe_ranges, frame_features, frozen_frames
 
 
 def picture(shift: float, blur: int = 1) -> np.ndarray:
@@ -29,11 +29,28 @@ def test_a_blurred_frame_is_dropped_and_says_so() -> None:
 
 
 def test_a_frame_like_the_one_before_is_dropped_unless_the_instrument_moved() -> None:
-    features = frame_features(picture(4 * min(i, 20)) for i in range(30))
+    pictures = [picture(4 * min(i, 20)) for i in range(30)]
+    for i, image in enumerate(pictures):
+        image[10:16, 3 * i : 3 * i + 4] = 255  # the instrument, small
+    features = frame_features(pictures)
     still = STATES.copy()
     still[25:] = still[24]
     selected, _ = choose_frames(features, np.ones(30, dtype=bool), still, None)
     assert selected.tolist() == list(range(25))
+
+
+def test_frames_of_a_frozen_video_are_dropped_where_the_state_goes_on() -> None:
+    generator = np.random.default_rng(0)
+    pictures = [picture(4 * (min(i, 12) if i < 20 else i)) for i in range(30)]
+    coded = [np.clip(image + (generator.random(image.shape) < 0.05), 0, 255).astype(np.uint8) for image in pictures]
+    features = frame_features(coded)
+    usable, resting = np.ones(30, dtype=bool), STATES.copy()
+    resting[12:18] = resting[12]
+    assert frozen_frames(features, usable, STATES).tolist() == list(range(13, 20))
+    assert frozen_frames(features, usable, resting).tolist() == [18, 19]
+    _, dropped = choose_frames(features, usable, STATES, None)
+    assert {dropped[i] for i in range(13, 20)} == {"frozen: the state changed, not the picture"}
+    assert describe_ranges(np.array([3, 13, 14, 15, 19, 25])) == "3, 13-15, 19, ..."
 
 
 def test_a_limit_keeps_extremes_and_both_ends() -> None:

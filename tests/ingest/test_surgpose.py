@@ -74,7 +74,7 @@ def test_a_template_of_the_folder_is_complete(world, trajectory):
 
 def test_a_video_of_another_length_is_refused(world, trajectory):
     world.video("000003/regular/left_video.mp4", 12, lambda i: round(i * 1000 / 30))
-    with pytest.raises(NeecoError, match=r"left_video.mp4: is 0.4 s long, its states 1.0 s"):
+    with pytest.raises(NeecoError, match=r"left_video.mp4: has 12 images for 30 states at 30 a second; they do not"):
         format_of(trajectory).open_images(trajectory, "regular/left_video.mp4")
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from neeco.errors import NeecoError
+from neeco.ingest.chosen_images import _read_lens
+from neeco.ingest.episodes import Episodes
+from neeco.ingest.recordingfile import read_recording
 from neeco.ingest.video import open_images, open_video
 
 pytest.importorskip("av")
@@ -32,6 +37,53 @@ def test_a_variable_rate_is_kept(world):
     video = open_video(world.video(stamps=lambda i: int(stamps[i])))
     np.testing.assert_allclose(video.times, stamps / 1000, atol=1e-6)
     np.testing.assert_allclose(open_video(video.path, fps=10).times, np.arange(30) / 10)
+
+
+def film_of(path, streams):
+    """A film of 12 frames of noise; streams: (width, height, pixel aspect) of each."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        made = []
+        for width, height, aspect in streams:
+            stream = container.add_stream("mpeg4", rate=25)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            stream.codec_context.sample_aspect_ratio = aspect
+            made.append(stream)
+        generator = np.random.default_rng(0)
+        for _ in range(12):
+            for stream in made:
+                pixels = generator.integers(0, 255, (stream.height, stream.width, 3), dtype=np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        for stream in made:
+            container.mux(stream.encode())
+    return path
+
+
+def test_of_several_video_streams_the_first_is_read_and_the_others_are_named(world):
+    video = open_video(film_of(world.folder / "two.mkv", [(64, 48, 1), (32, 24, 1)]))
+    assert (video.size, len(video.times)) == ((64, 48), 12)
+    assert "two.mkv: holds 2 video streams; the first is read (others: 32x24)" in video.notes[0]
+
+
+def test_pixels_that_are_not_square_need_a_lens_that_says_so(world):
+    film = film_of(world.folder / "pal.mkv", [(64, 48, Fraction(16, 15))])
+    assert (
+        "its pixels are not square (1.07 times as wide as high); its frames are used as stored"
+        in (open_video(film).notes[0])
+    )
+
+    def lens_of(text):
+        world.text(f"video: pal.mkv\n{text}", "recording.yaml")
+        data = Episodes([read_recording(world.folder / "recording.yaml")], lambda *_: None)
+        return _read_lens(data), [note for note in data.notes if "fl_x / fl_y is 1," in note]
+
+    with pytest.raises(NeecoError, match=r"pal\.mkv: its pixels are not square .*; give the intrinsics"):
+        lens_of("")
+    lens, notes = lens_of("intrinsics: [60, 64, 32, 24]")
+    assert (lens.fl_x, notes) == (60, [])
+    _, notes = lens_of("intrinsics: [60, 60, 32, 24]")
+    assert notes
+    assert notes[0].endswith("fl_x / fl_y is 1, the shape of pal.mkv's pixels says 0.938")
 
 
 def test_a_truncated_film_gives_its_beginning_and_a_note(world):

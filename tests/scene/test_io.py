@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -237,6 +238,20 @@ def test_both_cameras_of_a_still_scope_have_the_lamps_of_the_first(any_scene: Sc
     assert first.world_from_lamps is None
     assert second.world_from_lamps is not None
     assert torch.equal(second.world_from_lamps, torch.eye(4))
+
+
+def test_infinite_numbers_are_no_json(kinematic: Scene, tmp_path: Path) -> None:
+    (item, *others) = kinematic.instruments
+    open_ended = {**item.joints, next(iter(item.joints)): (-math.inf, 1.5)}
+    kinematic.instruments = (dataclasses.replace(item, joints=open_ended), *others)
+    kinematic.diagnostics["found"] = {"depth_mm": [math.inf, 2.0], "share": math.nan}
+    path = tmp_path / "scene.safetensors"
+    save_scene(kinematic, path)
+    with safe_open(path, framework="pt") as stream:
+        json.loads(stream.metadata()["neeco"], parse_constant=pytest.fail)
+    again = load_scene(path)
+    assert again.instruments[0].joints == open_ended
+    assert again.diagnostics["found"] == {"depth_mm": [None, 2.0], "share": None}
 
 
 def test_a_scene_remembers_that_its_scope_stood_still(any_scene: Scene, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from neeco.methods.nps import NPS, NPSSettings
 from neeco.raster.devices import fast_bfloat16, processor_has
 from neeco.scene import Scene
 from neeco.scene.deformation import encode, mark_moving, otsu
-from neeco.scene.method_registry import make_deformation, method_settings
+from neeco.scene.method_registry import make_deformation, method_class, method_settings
 from neeco.training.config import method_defaults
 
 
@@ -241,5 +241,11 @@ def test_bfloat16_is_fast_with_tiles_and_on_amd(
 
 @pytest.mark.parametrize("method", ["neeco", "deformable-3dgs"])
 def test_networks_start_in_bfloat16_where_that_is_fast(method: str) -> None:
-    assert method_defaults(method).deformation.half is fast_bfloat16()
+    config = method_defaults(method)
+    assert config.deformation.half is None  # until training starts
+    assert method_class(method).resolved(config.deformation).half is fast_bfloat16()
+    for half in (True, False):
+        begun = replace(config.deformation, half=half)
+        assert method_class(method).resolved(config.deformation, begun).half is half
+        assert method_class(method).resolved(begun) is begun
     assert not method_settings(method, {}).half  # of a run that does not say: an older one

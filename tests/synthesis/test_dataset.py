@@ -18,6 +18,8 @@ from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.generator import Acceptance, SampleGenerator, draw_to_folder
 from neeco.synthesis.rendered_views import render, split_views, state_views
 from neeco.synthesis.settings import Settings
+from neeco.synthesis.writers.coco import write_coco
+from neeco.synthesis.writers.folder import load_record
 
 COUNT = 6
 SETTINGS = Settings(count=COUNT, seed=3, tissue_tolerance_mm=2.0)
@@ -106,6 +108,35 @@ def test_coco_is_read_by_pycocotools_and_its_polygons_are_the_masks(made):
     category = coco.cats[1]
     assert category["name"] == "rod"
     assert category["keypoints"] == ["shaft_far", "shaft_near", "hinge", "tip_left", "tip_right"]
+
+
+def test_coco_lies_as_its_readers_expect_a_split(made):
+    """Datumaro, CVAT: ROOT/annotations/instances_SPLIT.json and ROOT/images; the others are told both."""
+    numbers = []
+    for split, count in (("train", COUNT - 1), ("val", 1)):
+        coco = COCO(str(made / "coco" / "annotations" / f"instances_{split}.json"))
+        assert len(coco.imgs) == len(coco.anns) == count
+        numbers += coco.imgs
+        for image in coco.imgs.values():
+            file = made / "coco" / "images" / image["file_name"]
+            assert not file.is_symlink()
+            assert file.read_bytes() == (made / "images" / file.name).read_bytes()
+            assert image["split"] == split
+    assert sorted(numbers) == sorted(COCO(str(made / "coco" / "instances.json")).imgs)
+
+
+def test_ids_of_parts_do_not_depend_on_which_are_seen(made, tmp_path):
+    """They are those of dataset.json and parts/, in COCO, too."""
+    info = json.loads((made / "dataset.json").read_text())
+    ids = {item["id"]: f"{item['instrument']}/{item['part']}" for item in info["ids"][1:]}
+    records = [load_record(made, 0)]
+    records[0]["labels"][0]["parts"].pop("shaft")
+    shutil.copytree(made / "images", tmp_path / "images")
+    write_coco(tmp_path, records, (("rod", "shaft"), ("rod", "jaw")), (), ())
+    for file in (made / "coco/parts.json", made / "coco/annotations/parts_val.json", tmp_path / "coco/parts.json"):
+        assert {number: category["name"] for number, category in COCO(str(file)).cats.items()} == ids
+    (annotation,) = COCO(str(tmp_path / "coco/parts.json")).anns.values()
+    assert ids[annotation["category_id"]] == "rod/jaw"
 
 
 def test_coco_parts_cover_the_part_ids(made):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_world import RADIUS, ball_scene, run_of
+from ball_world import RADIUS, at, ball_scene, run_of
 from PIL import Image
 from rod_world import CAMERA, FakeRun
 
@@ -16,7 +18,8 @@ from neeco.raster.pinhole import project
 from neeco.synthesis.dataset import synthesize
 from neeco.synthesis.settings import Settings
 
-FORMATS = ("webdataset", "bop", "imagefolder")
+FORMATS = ("webdataset", "bop", "imagefolder", "coco", "yolo")
+READ_BACK = Path(__file__).parents[2] / "benchmarks" / "read_back.py"
 COUNT = 6
 
 
@@ -38,6 +41,24 @@ def made(runs: list[FakeRun], tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pixels(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         return np.array(image)
+
+
+def test_every_format_is_read_back_as_it_was_written(made: Path, tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("read_back", READ_BACK)
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    lines, good = script.read_back(made)
+    assert good, lines
+    assert sum("not installed" not in line for line in lines) >= 4
+
+    damaged = shutil.copytree(made, tmp_path / "damaged")
+    for file, old, new in (("coco/parts.json", '"id": 2', '"id": 3'), ("yolo/labels/train/000000.txt", " 0.", " 1.")):
+        (damaged / file).write_text((damaged / file).read_text().replace(old, new))
+    lines, good = script.read_back(damaged)
+    assert not good
+    assert [line.split()[:2] for line in lines if "WRONG" in line] == [["coco", "pycocotools"], ["yolo", "its"]]
 
 
 def test_webdataset_reads_its_shards(made: Path) -> None:
@@ -83,13 +104,13 @@ def test_bop_keeps_to_its_published_rules(made: Path) -> None:
                     pixels(scene / f"{kind}/{name}_{place:06d}.png") > 0 for kind in ("mask", "mask_visib")
                 )
                 assert not bool((visible & ~whole).any())
-                assert info["px_count_all"] == whole.sum() >= info["px_count_visib"] == visible.sum()
-                assert info["visib_fract"] == pytest.approx(visible.sum() / whole.sum(), abs=1e-5)
+                assert info["px_count_all"] >= whole.sum() >= info["px_count_visib"] == visible.sum()
+                assert info["visib_fract"] == visible.sum() / info["px_count_all"]
                 x, y, width, height = info["bbox_obj"]
-                rows, columns = np.nonzero(whole)
-                assert (x, y, x + width - 1, y + height - 1) == (
-                    columns.min(), rows.min(), columns.max(), rows.max(),
-                )  # fmt: skip
+                if x > 0 and y > 0 and x + width < 63 and y + height < 47:  # else the image cuts it
+                    assert info["px_count_all"] == whole.sum()
+                    assert info["bbox_obj"] == toolkit_box(whole)
+                assert info["bbox_visib"] == (toolkit_box(visible) if visible.any() else [-1] * 4)
                 middle = np.array(pose["cam_t_m2c"])  # the ball's: its silhouette is round it
                 at = project(middle, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
                 if x > 4 and x + width < 60 and y > 4 and y + height < 44:
@@ -97,6 +118,39 @@ def test_bop_keeps_to_its_published_rules(made: Path) -> None:
                     assert width == pytest.approx(2 * RADIUS / middle[2] * CAMERA.fx, abs=3)
                     seen += 1
     assert seen >= 4
+
+
+def toolkit_box(mask: np.ndarray) -> list[int]:
+    """x, y, width and height as bop_toolkit's misc.calc_2d_bbox has them: the last column less the first."""
+    rows, columns = np.nonzero(mask)
+    return [int(columns.min()), int(rows.min()), int(np.ptp(columns)), int(np.ptp(rows))]
+
+
+def test_bop_counts_what_lies_beyond_the_border(tmp_path: Path) -> None:
+    """A ball in the middle of the image, and as far away with its middle on the right border, in a corner, and out of
+    sight behind the border."""
+    places = [(0.0, 0.0), (32.0, 0.0), (-32.0, -24.0), (46.0, 0.0)]  # px from the middle, at 50 mm
+    poses = [(50 * u / CAMERA.fx, 50 * v / CAMERA.fy, 50.0) for u, v in places]
+    states = tmp_path / "states.jsonl"
+    lines = [{"instruments": [{"name": "ball", "pose": at(*pose).tolist(), "joints": {}}]} for pose in poses]
+    states.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    run = run_of(ball_scene("ball", [poses[0]]), tmp_path / "run")
+    settings = Settings(count=4, states=str(states), tissue_check=False, min_share=0.0, max_unobserved=1.0)
+    synthesize(run, tmp_path / "set", settings, ("bop",))  # type: ignore[arg-type]
+    text = (tmp_path / "set/bop/train/000000/scene_gt_info.json").read_text()
+    middle, right, corner, beyond = (infos[0] for _, infos in sorted(json.loads(text).items()))
+    assert middle["visib_fract"] == 1.0
+    area, (x, y, width, height) = middle["px_count_all"], middle["bbox_obj"]
+    for info, share, (u, v) in ((right, 1 / 2, places[1]), (corner, 1 / 4, places[2])):
+        assert info["px_count_all"] == pytest.approx(area, rel=0.2)  # seen aslant it is a little larger
+        assert info["visib_fract"] == info["px_count_visib"] / info["px_count_all"] == pytest.approx(share, abs=0.07)
+        assert info["px_count_valid"] == info["px_count_visib"]
+        assert info["bbox_obj"] == pytest.approx([x + u, y + v, width, height], abs=2)
+    assert right["bbox_visib"][0] + right["bbox_visib"][2] == 63
+    assert corner["bbox_visib"][:2] == [0, 0]
+    assert beyond["px_count_all"] == pytest.approx(area, rel=0.4)
+    assert (beyond["px_count_visib"], beyond["visib_fract"]) == (0, 0.0)
+    assert beyond["bbox_obj"] == beyond["bbox_visib"] == [-1] * 4
 
 
 def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
@@ -117,12 +171,20 @@ def test_imagefolder_has_a_line_for_every_image_and_mask(made: Path) -> None:
     assert found == COUNT
 
 
+def test_a_larger_data_set_is_larger_in_every_format_it_was_begun_in(runs: list[FakeRun], tmp_path: Path) -> None:
+    for count, formats in ((1, ("coco",)), (2, ("imagefolder",))):
+        settings = Settings(count=count, tissue_tolerance_mm=2.0)
+        synthesize(runs[0], tmp_path / "set", settings, formats, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
+    assert len(json.loads((tmp_path / "set/coco/instances.json").read_text())["images"]) == 2
+
+
 def test_a_format_can_be_added_later(made: Path, runs: list[FakeRun], tmp_path: Path) -> None:
     output = tmp_path / "set"
     settings = Settings(count=COUNT, tissue_tolerance_mm=2.0)
     synthesize(runs[0], output, settings, ("coco",), instrument_runs=runs[1:])  # type: ignore[arg-type]
     again = synthesize(runs[0], output, settings, FORMATS, resume=True, instrument_runs=runs[1:])  # type: ignore[arg-type]
     assert again.made_now == 0
+    assert json.loads((output / "dataset.json").read_text())["formats"] == list(FORMATS)
     for name in FORMATS:
         files = [path.relative_to(made) for path in (made / name).rglob("*") if path.is_file()]
         assert files

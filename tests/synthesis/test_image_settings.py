@@ -48,6 +48,7 @@ def lens_scene(scene, monkeypatch):
         (SizeSettings(size="64000x48000"), "--size: 64000x48000 is more than"),
         (SizeSettings(scale=1e30), "--scale: .* is more than"),
         (ImageSettings(quality=0), "--quality: 0"),
+        (ImageSettings(quality=50), "--quality: is of JPEG images, and PNG would be written"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused_by_name(size, words):

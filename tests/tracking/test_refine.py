@@ -63,6 +63,8 @@ def test_tracked_frames_join_the_recorded_ones(
     with pytest.raises(NeecoError, match="not empty"):
         refine.refine_run(tracked_run, [tracked], output, device=CPU)
     refine.refine_run(tracked_run, [tracked], output, device=CPU, resume=True)
+    with pytest.raises(NeecoError, match=r"refined.json: captures_sha256: begun with"):
+        refine.refine_run(tracked_run, [tracked, tracked], output, device=CPU, resume=True)
 
 
 def test_an_image_is_trained_on_once(tracked_run: RecordedRun) -> None:

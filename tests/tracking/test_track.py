@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from grasper_world import CAMERA, FRAMES, RecordedRun, grasper_state, moving, record, withheld
+from grasper_world import CAMERA, FRAMES, GRASPER, RecordedRun, grasper_state, moving, record, withheld
 
 from neeco.capture import check_capture, errors_only, read_capture
 from neeco.capture.images import write_image
+from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
 from neeco.capture.model import Capture, State
 from neeco.cli import main
 from neeco.errors import NeecoError
@@ -25,7 +26,7 @@ from neeco.tracking.drawing import InstrumentDrawer, Tissue, View, as_drawn, vie
 from neeco.tracking.fitting import Fitter, wide
 from neeco.tracking.follow import LOOK_EVERY, Follower, Step
 from neeco.tracking.motion import Motion
-from neeco.tracking.track import Tracked, _Work, state_of, track_footage
+from neeco.tracking.track import Tracked, _Work, _write, state_of, track_footage
 from neeco.tracking.trust import Reference, TrackTrust
 
 
@@ -184,6 +185,24 @@ def test_the_output_is_a_capture_that_says_its_trust(tracked: Tracked) -> None:
     page = write_track_page(tracked).read_text()
     assert page.count("<img") == 2 * FRAMES  # few frames: all in the strip, all among the least trusted
     assert "jaw_angle, deg" in page
+
+
+def test_what_is_known_of_the_footage_and_every_joint_that_was_found_are_written(
+    tracked: Tracked, tracked_run: RecordedRun, footage: Capture, tmp_path: Path
+) -> None:
+    scene = copy(tracked_run.scene)  # nobody recorded its jaw
+    tree = KinematicTree((Link("shaft"), Link("jaw", "shaft", REVOLUTE, value={"jaw_angle": 1.0})))
+    scene.instruments = (
+        replace(GRASPER, kinematics=tree, unrecorded=("jaw_angle",), joints={"jaw_angle": (0.0, 1.5)}),
+    )
+    trained_on = tracked_run.capture()
+    for still, registered in ((True, False), (False, True)):
+        output, given = tmp_path / str(still), replace(footage, still=still)
+        _write(output, given, scene, trained_on, footage.frames, tracked.records, 0.5, registered)
+        made = read_capture(output)
+        assert (made.still, made.registered) == (still, registered)
+        for frame, rec in zip(made.frames, tracked.records, strict=True):
+            assert frame.state.instruments["grasper"].joints == rec["instruments"]["grasper"]["joints"]
 
 
 def test_an_instrument_is_found_where_nothing_is_known(

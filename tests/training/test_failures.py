@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
         real, left = os.fsync, iter(range(whole_files))
 
         def full(descriptor: int) -> None:
-            if next(left, None) is None:
+            if stat.S_ISREG(os.fstat(descriptor).st_mode) and next(left, None) is None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             real(descriptor)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neeco.capture.kinematics import REVOLUTE, KinematicTree, Link
-from neeco.capture.model import Frame, Instrument, InstrumentState, State, Uncertainty
+from neeco.capture.model import Capture, Frame, Instrument, InstrumentState, State, Uncertainty
 from neeco.raster.types import Camera
 from neeco.scene.drawable import Recorded
 from neeco.training.config import RefineConfig
@@ -157,6 +157,16 @@ def test_a_joint_that_nobody_recorded_is_found_within_its_limits_and_told_beside
     beside = State({"rod": InstrumentState(frames[8].state.instruments["rod"].pose, {"jaw": 0.5})}, 4.0)
     assert jaw(beside) == pytest.approx(0.7, abs=1e-3)
     assert found.with_unrecorded(beside, (replace(instrument, unrecorded=()),)) is beside
+
+    def jaws(capture: Capture) -> list[float]:
+        return [
+            frame.state.instruments["rod"].joints["jaw"] for frame in found.completed(capture, (instrument,)).frames
+        ]
+
+    capture = Capture(Path(), frames, (instrument,))
+    assert jaws(capture)[::2] == pytest.approx(values[::2], abs=1e-3)
+    stated = replace(capture, instruments=(replace(instrument, unrecorded=()),))  # another recording, which logs it
+    assert jaws(stated) == [0.5] * len(frames)
 
 
 def test_a_joint_that_nobody_recorded_follows_the_instants_beside() -> None:

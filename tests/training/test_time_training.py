@@ -53,7 +53,9 @@ def test_without_an_instrument_the_scene_still_learns_to_move(method: str, tmp_p
     """What D-NeRF's data are: images, cameras and times."""
     capture = write_capture(tmp_path / "capture", instruments=False)
     config = training_config(method, {"iterations": 30}, SMALL[method])
-    scene = load_run(train(capture, tmp_path / "run", config)).scene
+    run = load_run(train(capture, tmp_path / "run", config))
+    scene = run.scene
+    assert run.config["deformation"].get("half", False) is getattr(scene.settings, "half", False) is not None
     assert scene.label_names == ()
     first, last = (scene.deltas(scene.recorded.states[k]).means for k in (0, -1))
     assert float((first - last).abs().max()) > 0

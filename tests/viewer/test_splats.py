@@ -150,3 +150,31 @@ def test_the_verb_writes_and_refuses(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["export", str(run), "--states", str(states), "--output", str(tmp_path / "a.ply")]) == 1
     assert "states.jsonl: line 1" in capsys.readouterr().err
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_the_format_is_that_of_the_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
+    for name, begin in (("a.spz", b"\x1f\x8b"), ("a.PLY", b"ply"), ("a", b"ply")):
+        assert main(["export", str(run), "--output", str(tmp_path / name)]) == 0
+        assert (tmp_path / name).read_bytes().startswith(begin)
+    for words, ends in ((["b.splat"], ".ply or .spz"), (["b.ply", "--format", "spz"], ".spz")):
+        assert main(["export", str(run), "--output", *words]) == 1
+        assert (
+            f"--output: {words[0]}: another format's name; what is written ends in {ends}\n" in capsys.readouterr().err
+        )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["view", "RUN", "--export", "page.pdf"],
+        ["evaluate", "RUN", "--json", "scores.csv"],
+        ["score-masks", "RUN", "RUN", "--json", "scores.txt"],
+    ],
+)
+def test_no_file_is_written_under_another_formats_name(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_folder(tmp_path / "run", ball_scene("ball", [(0.0, 0.0, 60.0)]))
+    assert main([str(run) if word == "RUN" else word for word in words]) == 1
+    assert f"{words[-2]}: {words[-1]}: another format's name" in capsys.readouterr().err

@@ -7,7 +7,6 @@ Here are checks of splits, times, image and mask files and instrument states; `c
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -20,20 +19,29 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
+from neeco.capture.check_masks import Hidden, masks_fault, measure_hidden, sample_points
 from neeco.capture.check_motion import check_motion
-from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
+from neeco.capture.documents import (
+    Node,
+    Parsed,
+    Problem,
+    ProblemReport,
+    condensed,
+    errors_only,
+    key_name,
+    printable,
+)
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
-from neeco.capture.statefile import passes_limits
 from neeco.errors import NeecoError
+from neeco.plausible import Fault, joint_fault, limits_fault, passes_limits
 from neeco.raster.types import Camera
 
 FEWEST_TRAIN_FRAMES = 4  # below, nothing can be learned
 FEW_TRAIN_FRAMES = 20  # below, expect little
 STILL_CAMERAS = 2  # of a scope that stands still
 ROLL_UNKNOWN_DEG = 45.0  # standard deviation from which a roll is as good as not known
-FULL_TURN = 2 * math.pi
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
 
@@ -96,7 +104,7 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
         if motion and not errors_only(report.problems):
             for part in parsed.by_tissue():
                 check_motion(part)
-    return Checked(report.problems, _summary(parsed), capture)
+    return Checked(condensed(report.problems), _summary(parsed), capture)
 
 
 def _summary(parsed: Parsed) -> CaptureSummary:
@@ -184,12 +192,17 @@ class _Decoded:
     uniform: bool  # one colour
     image_error: str
     mask_error: str
+    hidden: Hidden | None  # by the mask; None: there is no usable one
 
 
 def _check_images(parsed: Parsed) -> None:
     """Decode every image and mask and report those damaged, of the wrong size, empty, or with the same pixels."""
+    clouds = {tissue.name: sample_points(tissue.points) for tissue in parsed.tissues}
+    shared = sample_points(parsed.points)
+    points = [clouds.get(str(frame.state.tissue), shared) for frame in parsed.frames]
+    cameras = [None if row in parsed.without_camera else frame.camera for row, frame in enumerate(parsed.frames)]
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        decoded = list(pool.map(_decode, parsed.frames))
+        decoded = list(pool.map(_decode, parsed.frames, cameras, points))
     # the reader may have reported an image whose size it wanted to know
     reported = [place.child("file_path").reported for place in parsed.places]
     first: dict[bytes, int] = {}
@@ -206,11 +219,15 @@ def _check_images(parsed: Parsed) -> None:
     if without and len(without) < len(parsed.frames):
         message = f"has no mask while other frames do ({len(without)} of {len(parsed.frames)} without)"
         without[0].child("mask_path").warning(message, "its whole image counts in the loss")
+    if (fault := masks_fault([found.hidden for found in decoded if found.hidden is not None])) is not None:
+        parsed.header("frames[*].mask_path").warning(*fault)
 
 
-def _decode(frame: Frame) -> _Decoded:
-    """Decode a frame's image and mask. Errors name the file within the message, without its folder."""
+def _decode(frame: Frame, camera: Camera | None, points: np.ndarray) -> _Decoded:
+    """Decode a frame's image and mask. Errors name the file within the message, without its folder. camera, points
+    [P, 3] mm: what the mask hides of these is measured."""
     digest, uniform, image_error, mask_error = None, False, "", ""
+    image, hidden = None, None
     try:
         image = frame.load_image()
         digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
@@ -221,9 +238,11 @@ def _decode(frame: Frame) -> _Decoded:
         mask = frame.load_mask()
         if mask is not None and not torch.any(mask):
             mask_error = "ignores every pixel (black is ignored); invert it, write 255 instead of 1, or drop the frame"
+        elif mask is not None and image is not None:
+            hidden = measure_hidden(image, mask, camera, points)
     except NeecoError as error:
         mask_error = str(error).replace(str(frame.mask_path), frame.mask_path.name if frame.mask_path else "")
-    return _Decoded(digest, uniform, image_error, mask_error)
+    return _Decoded(digest, uniform, image_error, mask_error, hidden)
 
 
 def _report_duplicate(parsed: Parsed, first: int, second: int) -> None:
@@ -276,10 +295,9 @@ def _check_states(parsed: Parsed) -> None:
 def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
     limits = instrument.joints[joint]
     is_length = instrument.slides(joint)
-    if limits is not None and not is_length and max(map(abs, limits)) > 2 * FULL_TURN:
-        message = f"limits of joint {printable(joint)} are {limits[0]:g} .. {limits[1]:g} rad: degrees?"
-        parsed.header("instruments").error(message, "give radians")
-    largest: tuple[float, Node] | None = None
+    if limits is not None and (fault := limits_fault(limits, is_length)) is not None:
+        parsed.header("instruments").error(f"limits of joint {printable(joint)} are {fault[0]}", fault[1])
+    worst: tuple[float, Fault, Node] | None = None
     for state_place, state in parsed.states_of(instrument.name):
         place = state_place.child("joints").child(joint)
         if joint in instrument.unrecorded:
@@ -290,15 +308,13 @@ def _check_joint(parsed: Parsed, instrument: Instrument, joint: str) -> None:
         if joint not in state.joints:
             place.error("is missing", "give its value in every frame, or drop the frame")
             continue
-        value = state.joints[joint]
-        if limits is not None and passes_limits(value, limits):
-            message = f"is {value:g}, outside its limits {limits[0]:g} .. {limits[1]:g}"
-            place.error(message, "repair the reading (radians?) or the limits")
-        if largest is None or abs(value) > abs(largest[0]):
-            largest = value, place
-    if largest is not None and limits is None and not is_length and abs(largest[0]) > FULL_TURN:
-        message = f"reaches {largest[0]:g} rad, more than a full turn: degrees?"
-        largest[1].error(message, "give radians; state the joint's limits in the header if it does turn that far")
+        fault = joint_fault(state.joints[joint], limits, is_length)
+        if fault is not None and limits is not None:
+            place.error(*fault)
+        elif fault is not None and (worst is None or abs(state.joints[joint]) > worst[0]):
+            worst = abs(state.joints[joint]), fault, place
+    if worst is not None:  # without limits the largest value tells
+        worst[2].error(*worst[1])
 
 
 def _check_kinematics(parsed: Parsed, instrument: Instrument, tree: KinematicTree) -> None:

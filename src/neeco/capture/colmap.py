@@ -5,6 +5,7 @@ Not by pycolmap, which an installation may lack and which ends in a traceback fo
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,18 +16,28 @@ from typing import Any
 import numpy as np
 import torch
 
-from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable, relative_name
+from neeco.capture.conventions import COLMAP
+from neeco.capture.distortion import opencv_distortion
+from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, inside, printable, relative_name
+from neeco.capture.missing import NOWHERE, missing_file
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
 from neeco.files import read_bytes
+from neeco.plausible import center_fault, focal_fault, size_fault
 from neeco.raster.rotations import quat_to_matrix
 from neeco.raster.types import Camera
 
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}  # fmt: skip
+_COEFFICIENTS = {  # in a model's parameters, behind the focal lengths and the principal point
+    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
 }  # fmt: skip
 
 
@@ -54,12 +65,12 @@ def find_model(root: Path) -> Path | None:
     return None
 
 
-def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
-    """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit.
+def parse_colmap(model: Path, root: Path, report: ProblemReport, *, as_source: bool = False) -> Parsed:
+    """Read a COLMAP model; problems go to `report`. Lengths are in the model's own unit. as_source: see `Parsed`.
 
     Images lie in `images/` beside it; sorted by name, every 8th is a test frame, and time is the order.
     """
-    parsed = Parsed(root, timed=False)
+    parsed = Parsed(root, timed=False, as_source=as_source)
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     parse_cameras, parse_images, parse_points = _PARSERS[suffix]
     try:
@@ -75,10 +86,19 @@ def parse_colmap(model: Path, root: Path, report: ProblemReport) -> Parsed:
     for order, image in enumerate(sorted(images, key=lambda item: item.name)):
         place = Node(None, file, printable(image.name), report)
         try:
-            parsed.frames.append(_frame(image, cameras, root, order))
-            parsed.places.append(place)
+            path = inside(root, root / "images", image.name)
+            camera = _camera(image, cameras, parsed)
         except NeecoError as error:
             place.error_from(error)
+            continue
+        if not path.is_file():
+            message, remedy = missing_file(root / "images", image.name)
+            fault = Problem("error", file, place.field, f"{message} in images/", remedy)
+            (parsed.absent if as_source and remedy == NOWHERE else report.problems).append(fault)
+            continue
+        split = "test" if order % TEST_EVERY == 0 else "train"
+        parsed.frames.append(Frame(path, camera, State(time=float(order)), split))
+        parsed.places.append(place)
     return parsed
 
 
@@ -98,30 +118,31 @@ def _parse_points(
     parsed.points = PointCloud(positions, (rows[:, 3:].astype(np.float32) / 255).clip(0, 1))
 
 
-def _frame(image: _Image, cameras: dict[int, _Intrinsics], root: Path, order: int) -> Frame:
-    """Raises NeecoError, which does not name the frame."""
+def _camera(image: _Image, cameras: dict[int, _Intrinsics], parsed: Parsed) -> Camera:
+    """Raises NeecoError, which does not name the image, for distorted images read in place, too."""
     if image.camera_id not in cameras:
         raise NeecoError(f"uses camera {image.camera_id}, which the model lacks; export it again")
-    intrinsics = cameras[image.camera_id]
-    pose = torch.from_numpy(_world_from_camera(image)).float()
-    camera = Camera(pose, *_pinhole(intrinsics), intrinsics.width, intrinsics.height)
-    path = inside(root, root / "images", image.name)
-    if not path.is_file():
-        raise NeecoError("no such file in images/; put the undistorted images there")
-    return Frame(path, camera, State(time=float(order)), "test" if order % TEST_EVERY == 0 else "train")
-
-
-def _pinhole(camera: _Intrinsics) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy. Raises NeecoError for distorted or impossible cameras."""
-    if camera.model not in ("SIMPLE_PINHOLE", "PINHOLE"):
+    given = cameras[image.camera_id]
+    names = _COEFFICIENTS.get(given.model)
+    if names is None:
         raise NeecoError(
-            f"its camera model is {camera.model}; run `colmap image_undistorter` first, which gives PINHOLE"
+            f"its camera model is {given.model}; run `colmap image_undistorter` first, which gives PINHOLE"
         )
-    fx, fy, cx, cy = (camera.params[0], *camera.params)[-4:]  # a simple one has one focal length
-    usable = all(np.isfinite(camera.params)) and fx > 0 and fy > 0
-    if not (usable and 0 < cx < camera.width and 0 < cy < camera.height and max(camera.width, camera.height) < 65_536):
-        raise NeecoError("its camera has impossible intrinsics; repair the cameras file")
-    return fx, fy, cx, cy
+    fx, fy, cx, cy = (given.params[0], *given.params[: len(given.params) - len(names)])[-4:]  # or one focal length
+    width, height, coefficients = given.width, given.height, given.params[len(given.params) - len(names) :]
+    fault = size_fault(width, height) or focal_fault(fx, fy, width, height) or center_fault(cx, cy, width, height)
+    if fault is not None or not all(math.isfinite(value) for value in coefficients):
+        message = "its distortion is not finite" if fault is None else f"its camera is impossible: {fault[0]}"
+        raise NeecoError(f"{message}; repair the cameras file")
+    stated = dict(zip(names, coefficients, strict=True))
+    distortion = opencv_distortion(given.model, stated, (fx, fy, cx, cy), (width, height))
+    if distortion and not parsed.as_source:
+        raise NeecoError(
+            f"its camera model is {given.model}: the images are distorted; undistort them: neeco ingest {parsed.root} "
+            "--output CAPTURE (or `colmap image_undistorter`)"
+        )
+    pose = torch.from_numpy(_world_from_camera(image)).float()
+    return Camera(pose, fx, fy, cx, cy, width, height, distortion=distortion)
 
 
 def _world_from_camera(image: _Image) -> np.ndarray:
@@ -134,7 +155,7 @@ def _world_from_camera(image: _Image) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ translation
-    return pose
+    return COLMAP.camera_to_opencv(pose)
 
 
 def _parse(path: Path, parse: Callable[[bytes], Any]) -> Any:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal, NoReturn
@@ -15,7 +16,13 @@ from neeco.capture.lens import Lens
 from neeco.capture.model import Frame, Instrument, InstrumentState
 from neeco.capture.points import PointCloud
 from neeco.errors import NeecoError
+from neeco.files import placeholder
 from neeco.raster.rotations import rigid_fault
+
+MANY_ALIKE = 3  # problems like another one, from which they are counted instead of listed
+VARYING = re.compile(
+    r"'(?:[^'\\]|\\.)*'|\S+\.(?:png|jpe?g)\b|[-+]?\d[\d.]*(?:e[-+]?\d+)?|\b(?:nan|inf)\b", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,20 @@ def errors_only(problems: list[Problem]) -> list[Problem]:
     return [problem for problem in problems if problem.severity == "error"]
 
 
+def condensed(problems: Sequence[Problem]) -> list[Problem]:
+    """The problems, those that differ in their numbers and quoted names alone as one with its count."""
+    groups: dict[tuple[str, ...], list[Problem]] = {}
+    for problem in problems:
+        key = (VARYING.sub("#", part) for part in (problem.file, problem.field, problem.message, problem.remedy))
+        groups.setdefault((problem.severity, *key), []).append(problem)
+    found = []
+    for first, *others in groups.values():
+        many = len(others) >= MANY_ALIKE
+        found.append(replace(first, message=f"{first.message} (and {len(others)} more like it)") if many else first)
+        found += [] if many else others
+    return found
+
+
 @dataclass
 class ProblemReport:
     """Collects problems while a capture is read, so that all of them can be reported at once."""
@@ -52,7 +73,7 @@ class ProblemReport:
 
     def raise_first(self, root: object) -> None:
         """Raise NeecoError with the first error, if there is one. `root`: the capture, named in the message."""
-        errors = errors_only(self.problems)
+        errors = condensed(errors_only(self.problems))
         if not errors:
             return
         more = f" ({len(errors) - 1} more: run `neeco check {root}`)" if len(errors) > 1 else ""
@@ -241,7 +262,8 @@ class Parsed:
     """A capture as far as it could be read.
 
     Frames without image, split, time or states that could be read are left out (and reported); where only the camera is
-    wrong they stay, so that the rest of them can be checked.
+    wrong they stay, so that the rest of them can be checked. `as_source`: it is read to be converted; then distorted
+    images (whose cameras say how) and absent ones (listed as `absent`) are no errors.
     """
 
     root: Path
@@ -259,6 +281,8 @@ class Parsed:
     over: str | None = None  # which of several tissues all of it is of
     is_endonerf: bool = False  # an EndoNeRF folder, whose masks are the tool's
     without_camera: set[int] = field(default_factory=set)  # frames with a placeholder, as their camera is wrong
+    as_source: bool = False
+    absent: list[Problem] = field(default_factory=list)
 
     def header(self, field: str) -> Node:
         """The place `field` of the file that describes the first frame."""
@@ -305,6 +329,8 @@ def inside(root: Path, folder: Path, text: str) -> Path:
         outside = not path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError, ValueError):
         raise NeecoError(f"{printable(text)} is not a usable path; repair it") from None
+    if path.is_symlink() and (problem := placeholder(path)):
+        raise NeecoError(f"{printable(text)} {problem}")
     if outside:
         raise NeecoError(f"{printable(text)} leaves the capture's folder; copy the file into it and name it from there")
     return path

@@ -13,12 +13,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from neeco.capture.conventions import LLFF
 from neeco.capture.documents import Node, Parsed, ProblemReport, inside, printable
 from neeco.capture.images import EXTENSIONS
 from neeco.capture.model import Frame, PointCloud, State
 from neeco.capture.points import random_points
 from neeco.capture.transforms import TEST_EVERY
 from neeco.errors import NeecoError
+from neeco.files import placeholder, visible_entries
+from neeco.plausible import focal_fault, size_fault
 from neeco.raster.types import Camera
 
 POSES_FILE = "poses_bounds.npy"
@@ -85,7 +88,7 @@ def folder_images(root: Path, folder: str, report: ProblemReport) -> list[Path]:
     if not (root / folder).is_dir():
         return []
     paths = []
-    for path in sorted((root / folder).iterdir()):
+    for path in visible_entries(root / folder):
         if path.suffix not in EXTENSIONS:
             continue
         try:
@@ -99,6 +102,8 @@ def _load(root: Path) -> np.ndarray:
     """The table [N, 17] as float64. Raises NeecoError, which does not name the file."""
     remedy = "write an array of N x 17 numbers with numpy.save"
     path = inside(root, root, POSES_FILE)
+    if problem := placeholder(path):
+        raise NeecoError(problem)
     try:
         # mapped, so that a wrong header cannot make us allocate more than the file holds
         with warnings.catch_warnings(action="ignore"):  # of files that Python 2 wrote
@@ -114,14 +119,12 @@ def _load(root: Path) -> np.ndarray:
 
 def _row(values: np.ndarray, place: Node) -> _Row | None:
     matrix = values[:15].reshape(3, 5)
-    down, right, back, origin = (matrix[:, column] for column in range(4))
     with np.errstate(invalid="ignore"):
-        pose = np.stack([right, down, -back, origin], axis=1)
+        pose = LLFF.camera_to_opencv(matrix[:, :4])
     rigid = replace(place, value=pose.tolist()).rigid()
     height, width, focal = (float(value) for value in matrix[:, 4])
-    sized = 1 <= height < 65_536 and 1 <= width < 65_536 and height % 1 == 0 and width % 1 == 0
-    if not (sized and np.isfinite(focal) and focal > 0):
-        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}"
+    if (fault := size_fault(width, height) or focal_fault(focal, focal, width, height)) is not None:
+        message = f"its height, width and focal length are {height:g}, {width:g}, {focal:g}: {fault[0]}"
         place.error(message, "write whole pixels and a positive focal length in the fifth column")
         return None
     if rigid is None:

@@ -126,7 +126,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         require_file(path, "an image")
         with Image.open(path) as image:
             yield image
-    except NeecoError:
+    except (NeecoError, MemoryError):
         raise
     except FileNotFoundError as error:
         raise NeecoError(f"{path}: no such file") from error

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 
 from neeco.errors import NeecoError
+from neeco.plausible import center_fault, focal_fault
 from neeco.raster.types import Camera
 
-WIDEST, LONGEST = 0.1, 50.0  # focal length, in image sizes, of any lens that is not a mistake
-COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 BORDER = ("cx", "cy", "radius")
@@ -84,16 +83,9 @@ class Lens:
                 f"{source}: calibrated on {measured} images, the video is {found}; calibrate at the video's size, or "
                 "scale fl_x, fl_y, cx, cy and the size if the video was only resized"
             )
-        if not (0 < self.cx < size[0] and 0 < self.cy < size[1]):
-            raise NeecoError(
-                f"{source}: the principal point ({self.cx:g}, {self.cy:g}) lies outside the {size[0]}x{size[1]} video; "
-                "give the calibration of this video"
-            )
-        if not all(WIDEST < focal / max(size) < LONGEST for focal in (self.fl_x, self.fl_y)):
-            raise NeecoError(
-                f"{source}: focal lengths {self.fl_x:g} and {self.fl_y:g} px fit no lens on a {size[0]}x{size[1]} "
-                "video; give the calibration of this video, in pixels"
-            )
+        fault = center_fault(self.cx, self.cy, *size) or focal_fault(self.fl_x, self.fl_y, *size)
+        if fault is not None:
+            raise NeecoError(f"{source}: {fault[0]}; {fault[1]}")
 
     def pinhole(self, size: tuple[int, int]) -> Lens:
         """The pinhole of undistorted images (width, height): zoomed so that every pixel shows something. Raises

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from neeco.capture.documents import Node
-from neeco.capture.lens import BORDER, COEFFICIENT_NAMES, COEFFICIENTS, INTRINSICS, Border, Lens
+from neeco.capture.lens import BORDER, COEFFICIENT_NAMES, INTRINSICS, Border, Lens
 from neeco.errors import NeecoError
+from neeco.plausible import focal_fault, size_fault
+from neeco.raster.types import COEFFICIENTS
 
 MOST_PX = 65_536.0  # no image is as large
 MOST_BENT = 1e6  # nor any coefficient of a lens
@@ -24,6 +26,9 @@ def parse_lens(node: Node) -> Lens | None:
     if width is None or height is None or fl_x is None or fl_y is None or cx is None or cy is None:
         return None
     if distortion is None or (border is None and node.has("border")):
+        return None
+    if (fault := size_fault(width, height) or focal_fault(fl_x, fl_y, width, height)) is not None:
+        node.error(*fault)
         return None
     lens = Lens(fl_x, fl_y, cx, cy, distortion, (width, height), border)
     try:

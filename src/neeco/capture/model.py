@@ -6,6 +6,7 @@ Lengths are mm, angles rad, times s. The world is right-handed and fixed to the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,16 +17,18 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from neeco.capture.conventions import OPENGL
 from neeco.capture.images import read_image, read_image_bytes, read_mask
 from neeco.capture.kinematics import PRISMATIC, KinematicTree
 from neeco.capture.lens import Lens
 from neeco.capture.points import PointCloud
-from neeco.raster.rotations import as_pose
+from neeco.errors import NeecoError
+from neeco.plausible import Fault, joint_fault
+from neeco.raster.rotations import as_pose, rigid_fault
 from neeco.raster.types import Camera
 
 REFERENCE_PIXELS = 320 * 256  # of the images for which sizes in pixels and numbers of Gaussians are stated
 STILL = 1e-9  # a coordinate that varies less than this in the recording tells nothing apart
-_OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class InstrumentState:
     """Where one instrument is and how its joints stand.
 
     The pose may be given as a tensor, an array or nested lists; what is no tensor becomes float64. Raises NeecoError
-    when it is not 4x4, or given so and no rotation and translation.
+    when it is not 4x4, or given so and no rotation and translation, and for joints that are not finite numbers.
     """
 
     pose: Tensor  # [4, 4] float64, world_from_instrument, mm
@@ -62,6 +65,9 @@ class InstrumentState:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_pose(self.pose, "InstrumentState.pose", torch.float64))
+        for joint, value in self.joints.items():
+            if not isinstance(value, Tensor) and not _is_finite(value):
+                raise NeecoError(f"InstrumentState.joints: {joint!r} is {value!r}, not a finite number; correct it")
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,31 @@ class State:
             for name, state in self.instruments.items()
         }
         object.__setattr__(self, "instruments", given)
+        if not isinstance(self.time, Tensor) and not _is_finite(self.time):
+            raise NeecoError(f"State.time: is {self.time!r}, not a finite number of seconds; correct it")
+
+    def check(self, instruments: Sequence[Instrument], *, fitted: bool = False) -> None:
+        """Raise NeecoError for what none of a scene's instruments can be: poses that are not rigid, instruments and
+        joints that it does not have, joints beyond their limits.
+
+        fitted: it may come from a fit, so joints may leave their limits by the range between these and be others than
+        the scene's, and tensors on a GPU or with gradients are not read.
+        """
+        known = {item.name: item for item in instruments}
+        for name, given in self.instruments.items():
+            item, place = known.get(name), f"state: {name}"
+            if item is None and known and not fitted:
+                raise NeecoError(f"{place}: is not in the scene; it has {', '.join(known)}")
+            if _is_readable(given.pose, fitted):
+                fault = rigid_fault(given.pose.detach().cpu().double().numpy())
+                if fault is not None:
+                    raise NeecoError(f"{place}: pose {fault[0]}; {fault[1]}")
+            for joint, value in given.joints.items() if item is not None else ():
+                if (fitted and joint not in item.joints) or not _is_readable(value, fitted):
+                    continue
+                fault = item.joint_fault(joint, float(value), slack=1.0 if fitted else 0.0)
+                if fault is not None:
+                    raise NeecoError(f"{place}: joint {joint!r} {fault[0]}; {fault[1]}")
 
     def to(self, device: torch.device | str) -> State:
         """The same state, its poses on `device`."""
@@ -106,13 +137,24 @@ class Instrument:
     """One tracked rigid body and what is joined to it. `joints`: name of every reading -> (lower, upper) limit in rad,
     or None when not stated. `kinematics`: the links and which reading drives which joint, where that is known.
     `unrecorded`: joints of those that move the links and that no sensor logged, each with limits; in a capture's states
-    they stand half way between these until they are found. `from_video`: its poses were found in the images."""
+    they stand half way between these until they are found. `from_video`: its poses were found in the images.
+    `left_out`: recorded joints that a learned scene does not use."""
 
     name: str
     joints: Mapping[str, tuple[float, float] | None] = field(default_factory=dict)
     kinematics: KinematicTree | None = None
     unrecorded: tuple[str, ...] = ()
     from_video: FromVideo | None = None
+    left_out: tuple[str, ...] = ()
+
+    def joint_fault(self, joint: str, value: float, slack: float = 0.0) -> Fault | None:
+        """What is wrong with a value, rad or mm, of a joint, and what to do; None: it may be right. slack: see
+        `neeco.plausible.joint_fault`."""
+        if joint in self.joints:
+            return joint_fault(value, self.joints[joint], self.slides(joint), slack)
+        if joint in self.left_out:
+            return None
+        return f"is no joint of {self.name}", f"it has {', '.join(self.joints) or 'none'}"
 
     def halfway(self, joint: str) -> float:
         """The middle of a joint's limits; 0 where none are stated."""
@@ -203,6 +245,20 @@ class Capture:
         return tuple(dict.fromkeys(frame.split for frame in self.frames))
 
 
+def _is_finite(value: object) -> bool:
+    try:
+        return not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _is_readable(value: object, only_cheaply: bool) -> bool:
+    """Whether a number or tensor may be read; `only_cheaply`: without waiting for a GPU, and none with gradients."""
+    if not isinstance(value, Tensor):
+        return True
+    return not value.is_meta and not (only_cheaply and (value.requires_grad or value.device.type != "cpu"))
+
+
 def share_lamps(cameras: Sequence[Camera], states: Sequence[State]) -> tuple[Camera, ...]:
     """The cameras of a still scope, of which the first (over each tissue, as `states` say) has the lamps beside it: a
     second one, of a stereo scope, has none of its own."""
@@ -258,7 +314,7 @@ def swap_camera_axes(world_from_camera: np.ndarray) -> np.ndarray:
 
     The only place where the two conventions meet.
     """
-    return world_from_camera * _OPENGL_FROM_OPENCV
+    return world_from_camera * np.diag(OPENGL.opencv_from_own)  # exact, and its own inverse
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:

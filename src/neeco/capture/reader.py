@@ -17,6 +17,7 @@ from neeco.capture.model import Capture, Frame, Instrument, State, Tissue, share
 from neeco.capture.points import PointCloud, points_in_view
 from neeco.capture.transforms import is_blender, load_document, parse_blender, parse_transforms
 from neeco.errors import NeecoError
+from neeco.files import require_utf8
 
 
 def read_capture(path: Path | str, transforms: str = "transforms.json", *, background: float = 1.0) -> Capture:
@@ -97,10 +98,17 @@ def _of_roots(state: State, instruments: Sequence[Instrument], parsed: Parsed) -
 
 
 def parse_capture(
-    path: Path | str, report: ProblemReport, transforms: str = "transforms.json", background: float = 1.0
+    path: Path | str,
+    report: ProblemReport,
+    transforms: str = "transforms.json",
+    background: float = 1.0,
+    *,
+    as_source: bool = False,
 ) -> Parsed:
-    """Read as much of a capture as can be read; what is wrong with it goes to `report`."""
+    """Read as much of a capture as can be read; what is wrong with it goes to `report`. as_source: see `Parsed`. Raises
+    NeecoError for a path that is not in UTF-8."""
     path = Path(path)
+    require_utf8(path)
     if os.path.isfile(path):
         path, transforms = path.parent, path.name
     if not os.path.isdir(path):
@@ -114,16 +122,17 @@ def parse_capture(
     if file.is_file():
         document = load_document(file, path, report)
         if is_blender(document):
-            return parse_blender({file: document}, path, background)
-        return parse_transforms(document, file.parent, path, background)
+            return parse_blender({file: document}, path, background, as_source=as_source)
+        return parse_transforms(document, file.parent, path, background, as_source=as_source)
     if transforms != "transforms.json":
         report.error(transforms, "", "no such file", "name a transforms file of the capture")
         return Parsed(path)
     splits = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     if blender_files := [file for file in splits if file.is_file()]:
-        return parse_blender({file: load_document(file, path, report) for file in blender_files}, path, background)
+        documents = {file: load_document(file, path, report) for file in blender_files}
+        return parse_blender(documents, path, background, as_source=as_source)
     if (model := find_model(path)) is not None:
-        return parse_colmap(model, path, report)
+        return parse_colmap(model, path, report, as_source=as_source)
     if is_endonerf_folder(path):
         return parse_endonerf(path, report)
     message = "no such file, nor transforms_train.json, a COLMAP model or poses_bounds.npy"

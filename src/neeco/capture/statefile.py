@@ -24,7 +24,6 @@ from neeco.errors import NeecoError
 from neeco.files import read_text
 
 Limits = tuple[float, float] | None
-LIMIT_TOLERANCE = 1e-3  # rad (mm for sliding joints) by which rounding and noise may pass a limit
 
 
 @dataclass(frozen=True)
@@ -67,11 +66,6 @@ def state_to_json(state: State) -> dict[str, Any]:
 def camera_to_json(world_from_camera: np.ndarray) -> list[list[float]]:
     """world_from_camera [4, 4] with OpenCV axes, as transforms.json writes it (OpenGL axes)."""
     return (swap_camera_axes(world_from_camera) + 0.0).tolist()  # + 0.0: no negative zeros
-
-
-def passes_limits(value: float, limits: Limits) -> bool:
-    """Whether a joint's value lies outside its limits by more than rounding explains."""
-    return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
 
 
 def parse_instruments(frame: Node) -> dict[str, InstrumentState] | None:
@@ -214,10 +208,10 @@ def _parse_line(text: str, where: str, instruments: Sequence[Instrument], tissue
 
 
 def _check_joints(item: Node, instrument: Instrument) -> None:
-    """Refuse a state without one of its instrument's joints, or with one outside its limits."""
+    """Refuse a state without one of its instrument's joints, with one that it does not have, or an impossible value."""
     joints = item.child("joints")
     if not all(joints.has(joint) for joint in instrument.joints if joint not in instrument.unrecorded):
         joints.error(f"expected these joints, in rad: {', '.join(instrument.joints)}")
-    for joint, limits in instrument.joints.items():
-        if joints.has(joint) and passes_limits(joints.value[joint], limits):
-            joints.child(joint).error(f"{joints.value[joint]:.4g} rad is outside its limits {list(limits or ())}")
+    for joint, value in (joints.value or {}).items():
+        if (fault := instrument.joint_fault(joint, value)) is not None:
+            joints.child(joint).error(*fault)

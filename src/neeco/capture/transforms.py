@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from neeco.capture.distortion import StatedDistortion, opencv_distortion, stated_distortion
 from neeco.capture.documents import Node, Parsed, ParsedTissue, ProblemReport, inside, printable, relative_name
 from neeco.capture.images import EXTENSIONS, image_size
 from neeco.capture.lensfile import parse_lens
-from neeco.capture.model import Frame, State, swap_camera_axes
+from neeco.capture.missing import NOWHERE, missing_file
+from neeco.capture.model import Frame, Instrument, State, swap_camera_axes
 from neeco.capture.points import PointCloud, random_points, read_ply
 from neeco.capture.statefile import all_instruments, declared_instruments, parse_instruments
 from neeco.errors import NeecoError
 from neeco.files import read_json
+from neeco.plausible import LARGEST_SIZE, focal_fault, size_fault, time_fault
 from neeco.raster.types import Camera
 
 SCHEMA = "neeco-capture/1"
-LARGEST_SIZE = 65_535  # px
 TEST_EVERY = 8  # without splits, every 8th frame is a test frame (as in 3DGS and nerfstudio)
 BLENDER_HALF_SIZE = 1.5  # the synthetic scenes fit in this cube; 3DGS starts from random points there
-_PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _MILLIMETRES = ("mm", "millimeter", "millimetre", "millimeters", "millimetres")
 
 
@@ -44,10 +44,12 @@ def load_document(file: Path, root: Path, report: ProblemReport) -> Node:
     return node if node.is_object() else Node({}, name, "", report)
 
 
-def parse_transforms(document: Node, folder: Path, root: Path, background: float = 1.0) -> Parsed:
+def parse_transforms(
+    document: Node, folder: Path, root: Path, background: float = 1.0, *, as_source: bool = False
+) -> Parsed:
     """Read the transforms file in `folder` of the capture at `root`, given its content. Relative paths start at the
-    file."""
-    parsed = Parsed(root)
+    file. as_source: see `Parsed`."""
+    parsed = Parsed(root, as_source=as_source)
     _parse_header(document, parsed)
     _parse_tissues(document, folder, parsed)
     _parse_frames(document, folder, parsed, background)
@@ -57,24 +59,36 @@ def parse_transforms(document: Node, folder: Path, root: Path, background: float
 
 
 def is_blender(document: Node) -> bool:
-    """Whether a transforms file gives the field of view instead of intrinsics, as Blender's exporters do."""
+    """Whether a transforms file gives the field of view instead of intrinsics and no states, as Blender's exporters
+    do."""
     value = document.value
-    return "camera_angle_x" in value and "fl_x" not in value and "instruments" not in value
+    return "camera_angle_x" in value and "fl_x" not in value and not _lists_states(document)
 
 
-def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0) -> Parsed:
+def _lists_states(document: Node) -> bool:
+    return "instruments" in document.value or any("instruments" in frame for frame in _frame_objects(document))
+
+
+def parse_blender(files: dict[Path, Node], root: Path, background: float = 1.0, *, as_source: bool = False) -> Parsed:
     """Read the files of a Blender capture, given with their content, one split each, named by the file.
 
-    Transparent pixels show `background`. Without a point cloud, seeded random ones in a cube are used. Where no frame
-    at all has a time nothing moves (NeRF's synthetic scenes): every frame then has time 0.
+    Transparent pixels show `background`. Without a point cloud, and without states, seeded random ones in a cube are
+    used. Where no frame at all has a time and no state nothing moves (NeRF's synthetic scenes): every frame then has
+    time 0. as_source: see `Parsed`.
     """
-    parsed = Parsed(root)
+    parsed = Parsed(root, as_source=as_source)
+    declared: dict[str, Instrument] = {}
     for file, document in files.items():
         suffix = file.stem.rpartition("_")[2]
         split = suffix if suffix in ("train", "val", "test") else None
+        _parse_header(document, parsed)
         _parse_frames(document, file.parent, parsed, background, split, EXTENSIONS)
         if parsed.points is None:
             _parse_points(document, file.parent, parsed)
+        declared = {item.name: item for item in declared_instruments(document)} | declared
+    parsed.instruments = all_instruments(parsed.frames, tuple(declared.values()))
+    if parsed.instruments:
+        return parsed
     if not any("time" in frame for document in files.values() for frame in _frame_objects(document)):
         parsed.frames = [replace(frame, state=replace(frame.state, time=0.0)) for frame in parsed.frames]
         parsed.timed = True
@@ -104,14 +118,14 @@ def _parse_header(document: Node, parsed: Parsed) -> None:
     registration = value.get("instrument_frame", "world")
     if registration not in ("world", "unregistered"):
         document.child("instrument_frame").error(f"is {printable(registration)}", "write 'world' or 'unregistered'")
-    parsed.registered = registration != "unregistered"
+    parsed.registered = parsed.registered and registration != "unregistered"
     motion = value.get("camera_motion", "moving")
     if motion not in ("moving", "still"):
         document.child("camera_motion").error(f"is {printable(motion)}", "write 'moving' or 'still'")
-    parsed.still = motion == "still"
+    parsed.still = parsed.still or motion == "still"
     if document.has("lens"):
         parsed.lens = parse_lens(document.child("lens"))
-    parsed.says_units = value.get("units") is not None or value.get("schema") == SCHEMA
+    parsed.says_units = parsed.says_units or value.get("units") is not None or value.get("schema") == SCHEMA
 
 
 def _parse_frames(
@@ -139,16 +153,16 @@ def _parse_frames(
         if (file := node.child("file_path")).value is None:
             file.error("is missing", "name the frame's image")
         else:
-            image_path = _file(file, folder, parsed.root, extensions)
+            image_path = _image(file, folder, parsed, extensions)
         name = splits.of(node, index)
         pose = node.child("transform_matrix").rigid()
         mask_path = _file(node.child("mask_path"), folder, parsed.root) if node.has("mask_path") else None
-        time = node.child("time").number() if node.has("time") else float(index)
+        time = _time(node) if node.has("time") else float(index)
         timed += node.has("time")
         instruments, tissue = parse_instruments(node), _tissue_of(node, parsed)
         if image_path is None:
             continue
-        camera = _Intrinsics(node, header.document, image_path).camera()
+        camera = _Intrinsics(node, header.document, image_path, parsed).camera()
         if name is None or time is None or instruments is None:
             continue
         if pose is None or camera is None:
@@ -168,6 +182,14 @@ def _parse_frames(
         parsed.timed = False
         for order, frame in enumerate(parsed.frames):
             parsed.frames[order] = replace(frame, state=replace(frame.state, time=float(order)))
+
+
+def _time(frame: Node) -> float | None:
+    time = frame.child("time").number()
+    fault = None if time is None else time_fault(time)
+    if fault is not None:
+        frame.child("time").error(*fault)
+    return None if fault is not None else time
 
 
 def _parse_tissues(document: Node, folder: Path, parsed: Parsed) -> None:
@@ -270,8 +292,18 @@ def _file(node: Node, folder: Path, root: Path, extensions: tuple[str, ...] = ()
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    node.error(f"no such file: {printable(text)}", "put it there or correct the path")
+    node.error(*missing_file(folder, text))
     return None
+
+
+def _image(node: Node, folder: Path, parsed: Parsed, extensions: tuple[str, ...]) -> Path | None:
+    """`_file` of a frame's image. Of a source, one that is nowhere is counted, and no error."""
+    before = len(node.report.problems)
+    found = _file(node, folder, parsed.root, extensions)
+    problems = node.report.problems
+    if parsed.as_source and len(problems) > before and problems[-1].remedy == NOWHERE:
+        parsed.absent.append(problems.pop())
+    return found
 
 
 class _HeaderReport(ProblemReport):
@@ -304,20 +336,28 @@ def _size_or_largest(image_path: Path) -> tuple[int, int]:
 class _Intrinsics:
     """Looks a camera's numbers up in the frame first, then at the top level, and checks them."""
 
-    def __init__(self, frame: Node, document: Node, image_path: Path) -> None:
-        self.frame, self.document, self.image_path = frame, document, image_path
+    def __init__(self, frame: Node, document: Node, image_path: Path, parsed: Parsed) -> None:
+        self.frame, self.document, self.image_path, self.parsed = frame, document, image_path, parsed
 
     def camera(self) -> Camera | None:
-        """The frame's pinhole camera at the origin; None, and reported, where its numbers are wrong."""
-        is_pinhole = self._is_pinhole()
+        """The frame's camera at the origin; None, and reported, where its numbers are wrong."""
+        stated = self._distortion()
         size = self._size()
         width, height = size or _size_or_largest(self.image_path)
         fx = self._focal("fl_x", "camera_angle_x", width)
         fy = self._focal("fl_y", "camera_angle_y", height) if self._has("fl_y", "camera_angle_y") else fx
         cx, cy = self._center("cx", width), self._center("cy", height)
-        if size is None or fx is None or fy is None or cx is None or cy is None or not is_pinhole:
+        if size is None or fx is None or fy is None or cx is None or cy is None or stated is None:
             return None
-        return Camera(torch.eye(4), fx, fy, cx, cy, width, height)
+        if (fault := focal_fault(fx, fy, width, height)) is not None:
+            self._node("fl_x" if self._has("fl_x") else "camera_angle_x").error(*fault)
+            return None
+        try:
+            distortion = opencv_distortion(stated.model, stated.coefficients, (fx, fy, cx, cy), size)
+        except NeecoError as error:
+            (stated.place or self._node("camera_model")).error_from(error)
+            return None
+        return Camera(torch.eye(4), fx, fy, cx, cy, width, height, distortion=distortion)
 
     def _has(self, *keys: str) -> bool:
         return any(self.frame.has(key) or self.document.has(key) for key in keys)
@@ -325,23 +365,14 @@ class _Intrinsics:
     def _node(self, key: str) -> Node:
         return (self.frame if self.frame.has(key) else self.document).child(key)
 
-    def _is_pinhole(self) -> bool:
-        """False (and reported) for distorted images: undistorting belongs before the capture."""
-        model = self._node("camera_model")
-        if model.value is not None and model.value not in _PINHOLE_MODELS:
-            model.error(f"is {printable(model.value)}; only PINHOLE is drawn", "undistort the images first")
-            return False
-        for key in _DISTORTION:
-            node = self._node(key)
-            if node.value is None:
-                continue
-            value = node.number()
-            if value is None:
-                return False
-            if value != 0:
-                node.error(f"is {value:g}: the images are distorted", "undistort them first, then write 0")
-                return False
-        return True
+    def _distortion(self) -> StatedDistortion | None:
+        """None, and reported, where it cannot be read, and for distorted images that are read in place."""
+        stated = stated_distortion(self._node)
+        if stated is None or stated.place is None or self.parsed.as_source:
+            return stated
+        message = f"is {printable(stated.place.value)}: only PINHOLE is drawn, and the images are distorted"
+        stated.place.error(message, f"undistort them: neeco ingest {self.parsed.root} --output CAPTURE")
+        return None
 
     def _size(self) -> tuple[int, int] | None:
         """(width, height), from the image itself where not stated."""
@@ -355,8 +386,8 @@ class _Intrinsics:
         width, height = (self._positive(key) for key in ("w", "h"))
         if width is None or height is None:
             return None
-        if width % 1 or height % 1 or max(width, height) > LARGEST_SIZE:
-            self._node("w").error(f"image size {width:g} x {height:g} is not usable", "write whole numbers of pixels")
+        if (fault := size_fault(width, height)) is not None:
+            self._node("w").error(*fault)
             return None
         return int(width), int(height)
 

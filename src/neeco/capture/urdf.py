@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from neeco.files import read_text
 MM = 1000.0  # per m
 TYPES = {"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC}
 WHAT = "a URDF file: XML (of a .xacro, what `xacro` makes of it)"
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)  # a processed file names its source in one
+_XACRO_PREFIX = re.compile(r"xmlns:([\w.-]+)\s*=\s*[\"'][^\"']*xacro[^\"']*[\"']")  # a processed file keeps it, too
+_SUBSTITUTION = re.compile(r"\$\{|\$\((?:arg|find|eval|env|optenv|dirname|anon)\b")
 
 
 def read_urdf(
@@ -32,6 +36,8 @@ def read_urdf(
     """
     path, names = Path(path), dict(readings or {})
     robot = _parse(path)
+    if not robot.links:
+        raise NeecoError(f"{path}: defines no link; give the robot's URDF")
     children: dict[str, list[Any]] = {}
     known = {link.name: link for link in robot.links}
     for joint in robot.joints:
@@ -51,6 +57,9 @@ def read_urdf(
     first = tops[0] if root is None else root
     assert first is not None
     reached = [(first, None), *((joint.child, joint) for joint in _below(first, children, path))]
+    for what, defined in (("link", [link.name for link in robot.links]), ("joint", [j.name for j in robot.joints])):
+        if twice := next((name for name in defined if defined.count(name) > 1), None):
+            raise NeecoError(f"{path}: {what} {twice!r} is defined twice; rename one of them")
     moving = {joint.name for _, joint in reached if joint is not None and TYPES.get(joint.type) != FIXED}
     for given in names:
         if given not in moving:
@@ -74,6 +83,7 @@ def _parse(path: Path) -> Any:
     except ImportError:
         raise NeecoError(f"{path}: needs urdfdom-py to be read; pip install 'neeco[urdf]'") from None
     text = read_text(path, WHAT)
+    _refuse_xacro(path, text)
     core.on_error = lambda message: None  # of tags that it does not know, which it would print
     try:
         return urdf.URDF.from_xml_string(text.encode())
@@ -81,6 +91,16 @@ def _parse(path: Path) -> Any:
     except Exception as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise NeecoError(f"{path}: not readable as {WHAT} ({reason}); correct it") from None
+
+
+def _refuse_xacro(path: Path, text: str) -> None:
+    """Raise NeecoError for unprocessed xacro, of which a URDF parser would read what lies outside its macros."""
+    text = _COMMENT.sub("", text)
+    prefixes = "|".join(map(re.escape, {"xacro", *_XACRO_PREFIX.findall(text)}))
+    if _SUBSTITUTION.search(text) or re.search(rf"[<\s/](?:{prefixes}):[\w.-]+[\s=/>]", text):
+        stem = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        target = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_processed.urdf"
+        raise NeecoError(f"{path}: is xacro; run `xacro {path.name} > {target}` and give that")
 
 
 def _below(first: str, children: Mapping[str, list[Any]], path: Path) -> Iterator[Any]:

@@ -6,7 +6,9 @@ Each verb is one module of this package: a frozen dataclass (its docstring and f
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import os
 import signal
 import sys
@@ -17,7 +19,8 @@ from dataclasses import make_dataclass
 from typing import Any, get_type_hints
 
 from neeco import __version__
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, memory_failure
+from neeco.files import require_utf8
 from neeco.settings import RenamedWarning, warn_renamed
 
 VERBS = {
@@ -61,40 +64,86 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line (default: this process's) and return its exit status.
 
-    0 done; 1 bad input, one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our output went
-    away. Usage errors (2) and `--help` (0) leave through SystemExit.
+    0 done; 1 bad input or too little memory, one line on stderr; 130 interrupted by Ctrl-C; 141 when the reader of our
+    output went away. Usage errors (2) and `--help` (0) leave through SystemExit. Standard streams may be closed, and
+    may be in any encoding.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
     terminate = None
     if threading.current_thread() is threading.main_thread():
         # SIGTERM ends as Ctrl-C does: tidily
         terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        try:
+            return _status(words)
+        finally:
+            sys.stdout.flush()
+    except (BrokenPipeError, SystemExit) as error:
+        # rich turns a broken pipe into SystemExit
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        return PIPE_CLOSED
+    except OSError as error:  # a full disk
+        with contextlib.suppress(OSError):
+            _print_error(f"output: {error.strerror or error}; check that path and the disk")
+        return 1
+    finally:
+        _discard_unwritable()
+        if terminate is not None:
+            signal.signal(signal.SIGTERM, terminate)
+
+
+def _status(words: list[str]) -> int:
+    """Exit status of a command line; a failure that the user can mend is one line on stderr."""
+    try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
             warnings.simplefilter("always", RenamedWarning)
-            status = _dispatch(words)
-        sys.stdout.flush()
-        return status
-    except NeecoError as error:
-        print(f"neeco: error: {_printable(' '.join(str(error).split()))}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            # the interpreter flushes stdout once more on its way out; give it somewhere to go
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return PIPE_CLOSED
-        where = f"{error.filename}: " if error.filename else ""
-        message = f"{where}{error.strerror or error}; check that path and the disk"
-        print(f"neeco: error: {_printable(message)}", file=sys.stderr)
-        return 1
+            return _dispatch(words)
+    except BrokenPipeError:
+        raise
     except KeyboardInterrupt as interrupt:
         message = " ".join(map(str, interrupt.args)) or "run the same command again"
         print(f"\nneeco: interrupted: {message}", file=sys.stderr)
         return INTERRUPTED
-    finally:
-        if terminate is not None:
-            signal.signal(signal.SIGTERM, terminate)
+    except Exception as error:
+        if failure := memory_failure(error):
+            _print_error(failure)
+        elif isinstance(error, NeecoError):
+            _print_error(str(error))
+        elif isinstance(error, OSError):
+            where = error.filename or "output"
+            _print_error(f"{where}: {error.strerror or error}; check that path and the disk")
+        else:
+            raise
+        return 1
+
+
+def _prepare_streams() -> None:
+    """Replace standard streams that are closed, as under cron, by the null device, so that no file gets their numbers,
+    and escape what their encoding cannot write."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            null = os.open(os.devnull, os.O_RDWR)  # the lowest free number: that of the stream
+            os.set_inheritable(null, True)
+            setattr(sys, name, os.fdopen(null, "w" if number else "r", encoding="utf-8"))
+        elif number and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _discard_unwritable() -> None:
+    """Let nothing be left for the interpreter to write on its way out that cannot be written."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _print_error(message: str) -> None:
+    print(f"neeco: error: {_printable(' '.join(message.split()))}", file=sys.stderr)
 
 
 def _printable(text: str) -> str:
@@ -118,6 +167,8 @@ def _dispatch(words: list[str]) -> int:
         choices, prog="neeco", description=DESCRIPTION, args=words, config=(tyro.conf.FlagCreatePairsOff,)
     )
     assert run is not None, "tyro leaves through SystemExit when no verb was given"
+    for word in (os.getcwd(), *words):
+        require_utf8(word)
     from neeco.raster.devices import readable_failures
     from neeco.raster.native import keep_freed_memory
 

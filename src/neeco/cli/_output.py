@@ -89,13 +89,22 @@ def print_outcome(
     return 1
 
 
+def require_ending(option: str, path: Path, *endings: str) -> None:
+    """Raise NeecoError where the name of an output file ends as another format's than the one that is written, whose
+    names end in one of `endings`; one without an ending is nobody's."""
+    if path.suffix and path.suffix.lower() not in endings:
+        raise NeecoError(f"{option}: {path}: another format's name; what is written ends in {' or '.join(endings)}")
+
+
 @contextmanager
 def ready_for_json(path: Path | None) -> Iterator[None]:
     """For the work whose numbers go to `--json`: checks before it that the file can be written.
 
-    Raises NeecoError for a folder, or a file whose folder cannot be written to.
+    Raises NeecoError for a folder, a name of another format, or a file whose folder cannot be written to.
     """
     if path is not None and path.is_dir():
         raise NeecoError(f"--json: {path} is a folder; name a file")
+    if path is not None:
+        require_ending("--json", path, ".json")
     with nullcontext() if path is None else new_folder(path.parent):
         yield

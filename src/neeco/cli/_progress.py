@@ -99,7 +99,7 @@ def counting(title: str, total: int | None = None) -> Iterator[Callable[..., Non
 
 @contextmanager
 def resumable(how: str, begun: Path | None = None) -> Iterator[None]:
-    """Where Ctrl-C or a failing GPU ends the block, say `how` to resume, once the file `begun` exists.
+    """Where Ctrl-C, a failing GPU or too little memory ends the block, say `how` to resume, once `begun` exists.
 
     Ctrl-C's own message goes first where it has one. Raises KeyboardInterrupt and NeecoError.
     """

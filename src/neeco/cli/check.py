@@ -11,6 +11,8 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
+from neeco.files import finite
+
 if TYPE_CHECKING:
     from neeco.capture.check import CaptureSummary, Problem
 
@@ -37,7 +39,7 @@ def run(arguments: Arguments) -> int:
     if arguments.json:
         report = {"capture": str(arguments.capture), "errors": errors, "warnings": len(problems) - errors}
         report["problems"] = [asdict(problem) for problem in problems]
-        print(json.dumps({**report, "summary": summary.as_json()}, indent=1))
+        print(json.dumps(finite({**report, "summary": summary.as_json()}), indent=1, allow_nan=False))
     else:
         _print(problems, errors, summary)
     return 1 if errors else 0

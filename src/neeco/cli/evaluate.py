@@ -57,9 +57,9 @@ def run(args: Evaluate) -> int:
 
     console = Console()
     networks = find_lpips(args.lpips_weights)
-    with open_run(args.run, device_of(args.device)) as trained:
+    with ready_for_json(args.json), open_run(args.run, device_of(args.device)) as trained:
         capture = trained.capture()
-        with new_folder(args.run), ready_for_json(args.json), Bars() as bars:
+        with new_folder(args.run), Bars() as bars:
             evaluation = evaluate_run(
                 trained, capture, args.splits, align=args.align, networks=networks, progress=bars.stage
             )

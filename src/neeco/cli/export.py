@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import tyro
 
 from neeco.errors import NeecoError
 from neeco.settings import Device
+
+Format = Literal["ply", "spz"]
 
 
 @dataclass(frozen=True)
@@ -19,10 +21,11 @@ class Arguments:
 
     run: tyro.conf.Positional[Path]
     """Run folder that `neeco train` wrote."""
-    format: Literal["ply", "spz"] = "ply"
-    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser."""
+    format: Format | None = None
+    """ply: as 3D Gaussian splatting's own code writes it. spz: a tenth of the size, coarser. By default as --output
+    ends, else ply."""
     output: Path | None = None
-    """File to write; scene.ply or scene.spz in the run folder when not given."""
+    """File to write, .ply or .spz; scene.ply or scene.spz in the run folder when not given."""
     frame: int = 0
     """Number of the frame, of those trained on, whose state and light are taken."""
     states: Path | None = None
@@ -32,18 +35,25 @@ class Arguments:
 
 def run(arguments: Arguments) -> int:
     """Write the file and say what it holds."""
+    from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.scene.scene import gaussian_scene
     from neeco.training.run import open_run
     from neeco.viewer.splats import exported_state, splats_of, write_splats
 
+    format = arguments.format or "ply"
+    if arguments.output is not None:
+        endings = get_args(Format) if arguments.format is None else (format,)
+        require_ending("--output", arguments.output, *(f".{ending}" for ending in endings))
+        if arguments.format is None and arguments.output.suffix:
+            format = cast(Format, arguments.output.suffix[1:].lower())
     with open_run(arguments.run, device_of(arguments.device)) as trained:
         scene = gaussian_scene(trained.scene, "export")
         frames = len(scene.recorded.states)
         if not 0 <= arguments.frame < frames:
             raise NeecoError(f"--frame: {arguments.frame}: the scene was trained on frames 0 to {frames - 1}")
         splats = splats_of(scene, *exported_state(scene, arguments.frame, arguments.states))
-    output = arguments.output or arguments.run / f"scene.{arguments.format}"
-    write_splats(splats, output, arguments.format)
+    output = arguments.output or arguments.run / f"scene.{format}"
+    write_splats(splats, output, format)
     print(f"{output}: {len(splats.means):,} Gaussians, {output.stat().st_size / 1e6:.1f} MB, without joints and labels")
     return 0

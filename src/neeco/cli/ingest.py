@@ -172,13 +172,16 @@ def recordings_of(args: Ingest) -> list[Recording]:
 def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json: bool) -> int:
     from neeco.capture import read_capture
     from neeco.capture.check import Problem, errors_only, inspect_capture
+    from neeco.cli._output import require_ending
     from neeco.errors import NeecoError
+    from neeco.files import finite
     from neeco.ingest.pipeline import ingest
     from neeco.ingest.tissues import ingest_tissues
     from neeco.report.ingest_page import write_ingest_page
     from neeco.report.rerun_log import require_rerun, write_rrd
 
     if rrd is not None:
+        require_ending("--rrd", rrd, ".rrd")
         require_rerun()
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -219,8 +222,8 @@ def _ingest(recordings: list[Recording], output: Path, rrd: Path | None, as_json
         except KeyboardInterrupt:
             raise KeyboardInterrupt("nothing was written") from None
     if as_json:
-        numbers = {tissue: result.as_json() for tissue, result in results.items()}
-        print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2))
+        numbers = finite({tissue: result.as_json() for tissue, result in results.items()})
+        print(json.dumps(numbers.get("", {"tissues": numbers}), indent=2, allow_nan=False))
         return 0
     for tissue, result in results.items():
         if tissue:

@@ -38,7 +38,7 @@ class Arguments:
     resume: bool = False
     """Continue a data set begun with the same settings, or make it larger."""
     workers: int = 1
-    """Processes that share the work; the files are the same for any number."""
+    """Processes that share the work, here or on RAY_ADDRESS's cluster; the files are the same for any number."""
     device: Device = "auto"
 
 

@@ -19,9 +19,9 @@ class Arguments:
     """Capture folder (or a transforms file in one)."""
     output: Path
     """Run folder to write."""
-    method: str = "kinematic"
-    """kinematic, neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's training
-    adjustment."""
+    method: str | None = None
+    """kinematic (the default), neeco (the paper), 3dgs, deformable-3dgs, 4dgs or nerfies; NAME+dta: with the paper's
+    training adjustment."""
     iterations: int | None = None
     """Frames drawn and learned from; by default as the method has it."""
     batch_size: int | None = None
@@ -29,12 +29,12 @@ class Arguments:
     minutes: float | None = None
     """Stop in time with a finished run."""
     device: Device = "auto"
-    seed: int = 0
-    """The same seed gives the same scene on the same machine (without --minutes)."""
+    seed: int | None = None
+    """The same seed gives the same scene on the same machine (without --minutes); by default 0."""
     resume: bool = False
-    """Continue an interrupted run in --output, under the settings it was started with."""
-    transforms: str = "transforms.json"
-    """Which transforms file of the capture to read."""
+    """Continue an interrupted run in --output, under the settings it was started with; others are refused."""
+    transforms: str | None = None
+    """Which transforms file of the capture to read; by default transforms.json."""
     scale: float | None = None
     """Share of the recorded images' size to learn at: less for a quick run or little memory; by default 1."""
     joints: tuple[str, ...] | None = None
@@ -52,6 +52,7 @@ def run(args: Arguments) -> int:
     from neeco.cli._progress import train_with_progress
     from neeco.raster.devices import device_of
     from neeco.training.config import training_config
+    from neeco.training.run import begun_config
 
     config = training_config(
         args.method,
@@ -67,6 +68,7 @@ def run(args: Arguments) -> int:
             "max_instrument_gaussians": args.max_instrument_gaussians,
         },
         args.set,
+        begun_config(args.output) if args.resume else None,
     )
     path = train_with_progress(args.capture, args.output, config, device_of(args.device), resume=args.resume)
     print(f"finished: {path}  (next: neeco evaluate {path})")

@@ -94,10 +94,12 @@ def _annotate(arguments: Arguments) -> int:
 
 
 def _export(arguments: Arguments, output: Path) -> int:
+    from neeco.cli._output import require_ending
     from neeco.raster.devices import device_of
     from neeco.viewer.export import export_page
 
     if len(arguments.runs) != 1:
         raise NeecoError(f"--export: {len(arguments.runs)} runs given; a file shows one")
+    require_ending("--export", output, ".html", ".htm")
     print(export_page(arguments.runs[0], output, arguments.sh, device_of(arguments.device), arguments.tissue))
     return 0

@@ -160,8 +160,7 @@ def fit_frame(
     """
     config = config or AlignConfig()
     names = tuple(instrument.name for instrument in scene.instruments if instrument.name in frame.state.instruments)
-    state = scene.recorded.with_unrecorded(frame.state, scene.instruments)
-    problem, mask = _Problem(scene, state, names, _stated_joints(scene, names), config), frame.load_mask()
+    problem, mask = _Problem(scene, frame.state, names, _stated_joints(scene, names), config), frame.load_mask()
     largest = min(1.0, math.sqrt(config.max_pixels / (frame.camera.width * frame.camera.height)))
     levels = [_level(frame.camera, image, mask, factor, largest, config) for factor in config.levels]
     increments = torch.zeros(len(problem.sigmas), dtype=torch.float64)

@@ -22,7 +22,6 @@ from neeco.evaluation.mask_folders import Reference, load_reference, truth_names
 from neeco.evaluation.mask_metrics import (
     PartTally,
     dice,
-    finite,
     iou,
     mean_of,
     pairs_of,
@@ -30,7 +29,7 @@ from neeco.evaluation.mask_metrics import (
     precision,
     to_truth_ids,
 )
-from neeco.files import write_json
+from neeco.files import finite, write_json
 from neeco.labels.drawing import Drawing, draw
 from neeco.labels.labellers import threshold_of
 from neeco.raster.native import synchronise
@@ -96,7 +95,7 @@ def evaluate_run(
     found. How many the rest takes is the caller's to set (`open_run`). Raises NeecoError for unknown splits and
     unreadable frames.
     """
-    scene = run.scene
+    scene, capture = run.scene, run.completed(capture)
     splits = held_out_splits(capture, splits)
     if align:
         gaussian_scene(scene, "--align")
@@ -173,7 +172,7 @@ def _score_frame(context: _Context, frame: Frame, tallies: dict[str, _Tally]) ->
     recorded = _Recorded(image, mask, reference, unobserved, tissue, features)
     for kind, tally in tallies.items():
         row: dict[str, Any] = {"frame": frame.name}
-        state, camera = scene.recorded.with_unrecorded(frame.state, scene.instruments), frame.camera
+        state, camera = frame.state, frame.camera
         if kind == "aligned":
             fit = fit_frame(gaussian_scene(scene, "--align"), frame, image)
             state, camera = fit.state, fit.camera

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, conv2d, interpolate, max_pool2d, relu
 
 from neeco.errors import NeecoError
+from neeco.files import require_content
 from neeco.raster.native import torch_threads
 
 Pixels = NDArray[np.uint8]  # [H, W, 3]
@@ -185,6 +186,7 @@ def find_lpips(folder: Path | None = None) -> dict[str, Lpips]:
 def load_lpips(path: Path, network: str) -> Lpips:
     """Read a network ("alexnet" or "vgg16") from a safetensors file. Raises NeecoError when unreadable or misshapen."""
     layers = NETWORKS[network]
+    require_content(path)
     try:
         weights = load_file(path)
     except Exception as error:  # safetensors raises its own, undocumented types

@@ -17,7 +17,7 @@ from neeco.capture.images import open_image, read_labels, read_mask
 from neeco.capture.model import Capture, Frame
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_inside
+from neeco.files import read_json, require_inside, visible_entries
 
 PARTS_SUFFIX, MASK_SUFFIX = "_parts", "_mask"  # what `neeco render` writes beside its images
 PARTS_FILE = "parts.json"  # what the ids of masks in a folder mean
@@ -134,7 +134,7 @@ def open_masks(path: Path, classes: Mapping[int, str] | None = None, option: str
     """
     if not path.is_dir():
         raise NeecoError(f"{path}: no such folder; give a folder of masks")
-    pictures = {file.stem: file for file in sorted(path.iterdir()) if file.suffix.lower() == ".png" and file.is_file()}
+    pictures = {file.stem: file for file in visible_entries(path) if file.suffix.lower() == ".png" and file.is_file()}
     if not pictures:
         raise NeecoError(f"{path}: has no PNG file; give the folder that holds the masks themselves")
     for suffix in (PARTS_SUFFIX, MASK_SUFFIX, ""):

@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -126,17 +126,6 @@ def mean_of(values: Sequence[float | None]) -> float:
     """Mean of the values that are numbers; NaN when there are none."""
     numbers = [value for value in values if value is not None and not math.isnan(value)]
     return sum(numbers) / len(numbers) if numbers else math.nan
-
-
-def finite(value: Any) -> Any:
-    """The same structure with NaN and infinity as None: JSON has no such numbers."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def boundary_pixels(mask: np.ndarray) -> np.ndarray:

@@ -19,12 +19,12 @@ from neeco.evaluation.mask_metrics import (
     boundary_f,
     boxes_of,
     dice,
-    finite,
     iou,
     mean_of,
     pairs_of,
     total,
 )
+from neeco.files import finite
 
 SCHEMA = "neeco-mask-scores/1"
 OVERLAPS = ("iou", "dice", "boundary_f")  # of each image

@@ -99,7 +99,7 @@ def score_runs(
         with open_run(path, device) as run:
             for split in splits:
                 folder = output / "masks" / f"{name}-seed{seed}" / split
-                if draw_masks(run, folder, capture.split(split)):
+                if draw_masks(run, folder, run.completed(capture).split(split)):
                     rows += score_folder(name, seed, folder, capture, [split])[0]
     report(len(runs), len(runs))
     return rows
@@ -111,7 +111,7 @@ def score_label_ways(run: Run, capture: Capture, splits: Sequence[str]) -> Label
     None where no frame has a true or reference mask, or where a way cannot label the scene (nothing moves in it).
     Threads of torch: the caller's to set. Raises NeecoError for an unreadable mask.
     """
-    scene = gaussian_scene(run.scene, "label ways")
+    scene, capture = gaussian_scene(run.scene, "label ways"), run.completed(capture)
     min_component = Settings(count=1).min_component
     scores: LabelScores = {}
     for way, kind in (("composited", CompositedLabels), ("threshold", ThresholdLabels)):

@@ -17,6 +17,7 @@ import math
 import os
 import statistics
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +26,13 @@ from typing import Any, Protocol
 import torch
 
 from neeco.capture import Capture
-from neeco.cluster import address, joined, require_ray
+from neeco.cluster import address, cpu_share, joined, require_ray, require_shared
 from neeco.errors import NeecoError
-from neeco.experiments.machine import threads_per_worker
-from neeco.files import is_vacant, read_json, require_inside, write_text
+from neeco.experiments.machine import threads_per_worker, usable_cores
+from neeco.files import TEMPORARY, is_vacant, read_json, require_inside, write_text
 from neeco.raster.devices import device_of, readable_failures
 
+RETRIES = 3  # of a job whose worker died, each from its last checkpoint
 GRACE = 60.0  # s that interrupted workers get to write their checkpoints
 
 JobProgress = Callable[[str, float, str], None]  # "training" or "evaluating", share done in [0, 1], what is going on
@@ -135,7 +137,8 @@ def run_jobs(
 ) -> list[Result]:
     """Run every job and return their results, in their order.
 
-    workers 1: in this process, one after another; more: so many at once by Ray. captures: those of the jobs that are
+    workers 1: in this process, one after another; more, or where RAY_ADDRESS names a cluster: so many at once by Ray, a
+    job whose worker dies again from its checkpoint. captures: those of the jobs that are
     read already, by path, for this process; jobs read the others. A failed job writes no job.json, so that the next
     start tries again. Raises NeecoError before any work when a job's folder is another job's or Ray is not there, and
     KeyboardInterrupt saying which job was stopped.
@@ -144,7 +147,7 @@ def run_jobs(
     report = progress or (lambda event: None)
     for job in jobs:
         job.check()
-    if workers > 1:
+    if workers > 1 or address():
         return _run_on_cluster(jobs, workers, report)
     return [_run_here(place, jobs, (captures or {}).get(job.capture), report) for place, job in enumerate(jobs)]
 
@@ -166,11 +169,11 @@ def attempt_job(job: Job, progress: JobProgress | None = None, capture: Capture 
 
 
 def check_workers(workers: int, device: torch.device) -> None:
-    """Raises NeecoError for fewer than one, for several where Ray cannot be had, or for more than have a GPU of this
+    """Raises NeecoError for fewer than one, where Ray is needed and cannot be had, or for more than have a GPU of this
     machine each, where `device` is one."""
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if workers > 1:
+    if workers > 1 or address():
         require_ray()
     if workers > 1 and device.type == "cuda" and not address():
         if device.index is not None:
@@ -240,21 +243,26 @@ def _run_on_cluster(jobs: Sequence[Job], workers: int, report: Callable[[JobEven
     With RAY_ADDRESS set they go to that cluster; capture and output must then lie where its machines see them. A job's
     device is opened in its worker, who sees one GPU, that no other has.
     """
-    threads = threads_per_worker(workers)
-    with joined(threads * workers) as ray:
+    with joined(max(workers, usable_cores())) as ray:
+        threads = cpu_share(ray.nodes(), workers) if address() else threads_per_worker(workers)
+        if address() and jobs:
+            folder = Path(os.path.commonpath([job.folder.absolute().parent for job in jobs]))
+            require_shared(ray, folder / f"{TEMPORARY}probe", {job.capture.absolute() for job in jobs})
         gpus = _gpus(ray, jobs)
         if gpus:
             _check_gpus(workers, gpus)
-        # a process serves one job: its peak memory is the job's own, and no thread setting outlives it
+        # a process serves one job: its peak memory is the job's own, and no thread setting outlives it. Ray would
+        # retry for ever where memory runs out: `_run_remotely` does it
         options = {"num_cpus": threads, "num_gpus": min(gpus, 1), "max_calls": 1, "max_retries": 0}
         remote = ray.remote(**options)(_run_in_worker)
-        return _run_remotely(ray, remote, jobs, workers, report)
+        return _run_remotely(ray, remote, jobs, workers, threads, report)
 
 
 def _run_remotely(
-    ray: Any, remote: Any, jobs: Sequence[Job], workers: int, report: Callable[[JobEvent], None]
+    ray: Any, remote: Any, jobs: Sequence[Job], workers: int, threads: int, report: Callable[[JobEvent], None]
 ) -> list[Result]:
-    """Keep `workers` jobs going until all are done."""
+    """Keep `workers` jobs going until all are done; one whose worker dies is begun again, at most RETRIES times."""
+    deaths: Counter[int] = Counter()
     results: dict[int, Result] = {}
     waiting = list(range(len(jobs)))
     running: dict[Any, int] = {}
@@ -262,7 +270,7 @@ def _run_remotely(
         while waiting or running:
             while waiting and len(running) < workers:
                 index = waiting.pop(0)
-                running[remote.remote(jobs[index], threads_per_worker(workers))] = index
+                running[remote.remote(jobs[index], threads, os.getcwd())] = index
                 report(JobEvent(index, len(jobs), jobs[index], "training"))
             for reference in ray.wait(list(running), timeout=1.0)[0]:
                 index = running.pop(reference)
@@ -270,6 +278,12 @@ def _run_remotely(
                     results[index] = dict(ray.get(reference))
                 except ray.exceptions.RayError as error:  # a failure of this job alone
                     reason = str(error).strip().splitlines()[0]
+                    deaths[index] += 1
+                    if deaths[index] <= RETRIES and not isinstance(error, ray.exceptions.RayTaskError):
+                        waiting.insert(0, index)
+                        text = f"its worker died ({reason}); it goes on from its checkpoint"
+                        report(JobEvent(index, len(jobs), jobs[index], "training", text=text))
+                        continue
                     results[index] = _failed(jobs[index], f"its worker died: {reason}")
                 report(_end(index, len(jobs), jobs[index], results[index]))
     except KeyboardInterrupt:
@@ -281,14 +295,17 @@ def _run_remotely(
     return [results[index] for index in range(len(jobs))]
 
 
-def _run_in_worker(job: Job, threads: int) -> Result:
-    """Use no more than the worker's share of cores and GPUs, then run the job."""
+def _run_in_worker(job: Job, threads: int, folder: str) -> Result:
+    """Use no more than the worker's share of cores and GPUs, then run the job, whose paths may be relative to
+    `folder`."""
     import ray
 
     from neeco.raster.native import keep_freed_memory, set_threads
 
     if own := ray.get_runtime_context().get_accelerator_ids().get("GPU"):
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(own)  # before PyTorch looks for the first time
+    with contextlib.suppress(OSError):  # where a node has no such folder, all paths are absolute
+        os.chdir(folder)
     set_threads(threads)
     torch.set_num_threads(threads)
     keep_freed_memory()

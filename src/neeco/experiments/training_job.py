@@ -18,17 +18,18 @@ from torch import Tensor
 from neeco.capture import Capture, read_capture
 from neeco.capture.check import read_checked
 from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.writer import fingerprint
 from neeco.errors import NeecoError
 from neeco.evaluation.evaluate import evaluate_run, held_out_splits
 from neeco.evaluation.image_metrics import find_lpips, psnr
 from neeco.experiments.machine import peak_memory_mb, reset_peak_memory
 from neeco.experiments.study import JobProgress, Result
-from neeco.files import read_json, read_text, require_like, write_json, write_text
+from neeco.files import finite, read_json, read_text, require_like, write_json, write_text
 from neeco.labels.drawing import draw
 from neeco.raster.devices import device_of
 from neeco.scene.method_registry import method_class
 from neeco.training.config import TrainConfig
-from neeco.training.run import open_run, read_config, stored_config
+from neeco.training.run import open_run, read_config, require_same_capture, stored_config
 from neeco.training.train import ProgressRow, train
 
 if TYPE_CHECKING:
@@ -150,9 +151,14 @@ class TrainingJob:
             for key in (key for key in identity if values[key] != identity[key]):
                 raise NeecoError(f"{file}: {key}: is {values[key]}, not {identity[key]}; {differs}")
         try:
-            old, new = vars(stored_config(folder, stored)), vars(self.train_config)
+            begun = stored_config(folder, stored)
         except NeecoError as error:  # of another version
             raise NeecoError(f"{str(error).removesuffix('; train again')}; {differs}") from None
+        wanted = self.train_config
+        if begun.method == wanted.method:
+            kind = method_class(wanted.method)
+            wanted = replace(wanted, deformation=kind.resolved(wanted.deformation, begun.deformation))
+        old, new = vars(begun), vars(wanted)
         for field in (name for name in new if old[name] != new[name]):
             raise NeecoError(f"{folder}: {field}: this run has {old[field]}, not {new[field]}; {differs}")
 
@@ -173,6 +179,7 @@ class TrainingJob:
         splits = held_out_splits(capture, self.splits)
         networks, device = find_lpips(self.lpips_weights), device_of(self.device)
         if file.exists():
+            require_same_capture(self.folder, capture.root, fingerprint(capture))
             stored = read_result(file)
             if list(stored["splits"]) == list(splits) and stored["lpips_networks"] == sorted(networks):
                 return stored
@@ -338,7 +345,8 @@ class TrainingRecorder:
         for split, value in self.held_out.score(scene).items():
             row = {key: self.totals[key] for key in ("iteration", "seconds", "processor_seconds")}
             self.rows.append(row | {"progress": round(progress, 4), "split": split, "psnr": value})
-        write_text(self.folder / CURVE_FILE, "".join(json.dumps(row) + "\n" for row in self.rows))
+        lines = [json.dumps(row, allow_nan=False) + "\n" for row in finite(self.rows)]
+        write_text(self.folder / CURVE_FILE, "".join(lines))
         self.save()
 
     def save(self) -> None:

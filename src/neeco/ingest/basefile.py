@@ -10,15 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from neeco.capture.conventions import DVRK_ECM
 from neeco.capture.documents import Node, RaisingReport, printable
 from neeco.errors import NeecoError
 from neeco.files import read_text
+from neeco.ingest.columns import CAMERA
+from neeco.ingest.frames import CAMERA_FRAMES, meaning_of
 
 UNKNOWN = "unknown"
 DVRK_SD_MM, DVRK_SD_DEG = 8.0, 5.0  # what the dVRK's registration by a marker reaches, by its own README: 5 to 10 mm
 MM = 1000.0  # per m
 WHAT = "a camera registration of the dVRK: JSON"
-_OPENCV_FROM_DVRK = np.diag([-1.0, -1.0, 1.0, 1.0])  # its cameras look along z, x to the left and y up
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +50,8 @@ def same_base(one: StatedBase | None, other: StatedBase | None) -> bool:
 
 def read_dvrk_registration(path: Path) -> StatedBase:
     """The file that `camera_registration.py` of jhu-dvrk/dvrk_camera_registration writes for a camera that stands
-    still: `…-registration-open-cv.json`, or `…-registration-dVRK.json`, which is no JSON by itself but a piece of a
-    system.json, in the dVRK's axes. Metres. Raises NeecoError for another file."""
+    still: `…-registration-open-cv.json`, or, in the dVRK's axes, `…-registration-dVRK.json`, which is no JSON by
+    itself but a piece of a system.json. Metres. Raises NeecoError for another file."""
     text = read_text(path, WHAT).strip()
     whole = text.startswith("{")
     try:
@@ -69,11 +71,19 @@ def read_dvrk_registration(path: Path) -> StatedBase:
     assert matrix is not None
     matrix = matrix.copy()
     matrix[:3, 3] *= MM
-    return StatedBase(matrix if whole else _OPENCV_FROM_DVRK @ matrix, DVRK_SD_MM, DVRK_SD_DEG)
+    name, reference = path.stem.lower(), str(frame.value.get("reference-frame", ""))
+    turned = not whole or name.endswith("-dvrk")
+    if not turned and "open-cv" not in name and meaning_of(reference).frame == DVRK_ECM.name:
+        frame.child("reference-frame").error(
+            f"is {printable(reference)}, and nothing says whether in the dVRK's axes ({DVRK_ECM.words}) or OpenCV's",
+            "call the file …-registration-dVRK.json or …-registration-open-cv.json",
+        )
+    return StatedBase(DVRK_ECM.poses_to_opencv(matrix) if turned else matrix, DVRK_SD_MM, DVRK_SD_DEG)
 
 
 def parse_base(node: Node, folder: Path) -> StatedBase:
-    """`unknown`, a registration of the dVRK (a file's name, relative to `folder`), or {transform, sd_mm, sd_deg}."""
+    """`unknown`, a registration of the dVRK (a file's name, relative to `folder`), or {transform, axes, sd_mm, sd_deg},
+    axes: those of the camera that the transform leads to."""
     value: Any = node.value
     if value == UNKNOWN:
         return StatedBase()
@@ -85,11 +95,16 @@ def parse_base(node: Node, folder: Path) -> StatedBase:
     if not isinstance(value, dict):
         node.error(f"expected `unknown`, a file or {{transform: …}}, found {printable(value)}")
     for key in value:
-        if key not in ("transform", "sd_mm", "sd_deg"):
-            node.child(str(key)).error("unknown key", "the keys here are transform, sd_mm and sd_deg")
+        if key not in ("transform", "axes", "sd_mm", "sd_deg"):
+            node.child(str(key)).error("unknown key", "the keys here are transform, axes, sd_mm and sd_deg")
     if not node.has("transform"):
         node.child("transform").error("is missing", "give 4 rows of 4 numbers, mm")
     matrix = node.child("transform").rigid()
+    axes = value.get("axes", CAMERA)
+    if not isinstance(axes, str) or axes not in CAMERA_FRAMES:
+        node.child("axes").error(f"{printable(axes)} is no convention", f"write one of {', '.join(CAMERA_FRAMES)}")
+    assert matrix is not None
+    matrix = CAMERA_FRAMES[axes].poses_to_opencv(matrix)
     sd_mm, sd_deg = (node.child(key).number(above=0.0) if node.has(key) else None for key in ("sd_mm", "sd_deg"))
     if (sd_mm is None) != (sd_deg is None):
         missing = "sd_mm" if sd_mm is None else "sd_deg"

@@ -15,6 +15,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.columns import (
+    BASE,
     EULER,
     QUATERNION_WXYZ,
     QUATERNION_XYZW,
@@ -23,7 +24,8 @@ from neeco.ingest.columns import (
     recognise_pose,
 )
 from neeco.ingest.formats import POSES, Stream, format_of, numbers, read_table
-from neeco.ingest.logs import to_quaternions
+from neeco.ingest.frames import CAMERA_FRAMES, NamedFrame
+from neeco.ingest.logs import in_opencv, to_quaternions, with_named_frame
 
 UNIT_NORM = 1e-3  # of a quaternion's length, and of R^T R - I: what float32 and rounded text leave
 CONVENTIONS = ("XYZ", "ZYX", "xyz", "zyx")  # of three angles, as scipy names them
@@ -52,14 +54,14 @@ class Reading:
 
 @dataclass(frozen=True)
 class OpenPoses:
-    """Poses of which something is not said. times [R] s; positions [R, 3] in the file's unit; frame: CAMERA or BASE
-    where the file says it."""
+    """Poses of which something is not said. times [R] s; positions [R, 3] in the file's unit; frame: what they are
+    taken to be stated in, BASE or a camera's frame, whose axes are turned to OpenCV's."""
 
     title: str
     times: np.ndarray
     positions: np.ndarray
     readings: tuple[Reading, ...]
-    frame: str | None
+    frame: str
 
 
 def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
@@ -85,11 +87,11 @@ def find_rotations(values: np.ndarray) -> list[tuple[int, str]]:
 
 
 def open_poses(source: Path) -> list[OpenPoses]:
-    """The poses of a file of which something is not said, with every way to read them. Raises NeecoError."""
+    """The poses of a file of which something is not said, in every frame that may be meant, with every way to read
+    them. Raises NeecoError."""
     known = format_of(source)
     streams = () if known is None else known.streams(source)
-    found = [_open(source, stream) for stream in streams if stream.kind == POSES and stream.asks]
-    return [poses for poses in found if poses is not None]
+    return [poses for stream in streams if stream.kind == POSES and stream.asks for poses in _open(source, stream)]
 
 
 def shaft_of(positions: np.ndarray, quats: np.ndarray) -> Shaft:
@@ -125,7 +127,7 @@ def largest_step(quats: np.ndarray) -> float:
     return float(2 * np.arccos(cosines).max(initial=0.0))
 
 
-def _open(source: Path, stream: Stream) -> OpenPoses | None:
+def _open(source: Path, stream: Stream) -> list[OpenPoses]:
     table = read_table(source, stream.name)
     columns = table.header[1:] if not stream.columns else stream.columns
     poses = recognise_pose(columns)
@@ -135,7 +137,7 @@ def _open(source: Path, stream: Stream) -> OpenPoses | None:
         place = columns.index(ways[0][1][0])
         position = tuple(columns[place - 3 : place]) if place >= 3 else None
     if position is None or not ways:
-        return None
+        return []
     places = numbers(table, position)[0]
     readings, good = [], np.isfinite(places).all(axis=1)
     for title, used, form, convention in ways:
@@ -145,11 +147,18 @@ def _open(source: Path, stream: Stream) -> OpenPoses | None:
         good &= usable
         readings.append(Reading(f"{title}{' in deg' if degrees else ''}", quats))
     if good.sum() < 2:
-        return None
-    times = numbers(table, table.header[:1])[0][:, 0]
-    ways_left = tuple(Reading(way.title, way.quats[good]) for way in readings)
-    return OpenPoses(f"{stream.name}{f', {stream.body}' if stream.body else ''}", times[good], places[good], ways_left,
-                     table.frame)  # fmt: skip
+        return []
+    times = numbers(table, table.header[:1])[0][good, 0]
+    title = f"{stream.name}{f', {stream.body}' if stream.body else ''}"
+    meaning = with_named_frame(table, position).meaning or NamedFrame(BASE)
+    frames = [meaning.frame] if meaning.frame else [frame for frame in meaning.choices if frame in CAMERA_FRAMES]
+    return [
+        OpenPoses(
+            title, times, in_opencv(frame, places[good], readings[0].quats[good])[0],
+            tuple(Reading(way.title, in_opencv(frame, places[good], way.quats[good])[1]) for way in readings), frame,
+        )
+        for frame in frames
+    ]  # fmt: skip
 
 
 _Way = tuple[str, tuple[str, ...], str, str | None]  # title, columns, form, convention

@@ -16,10 +16,14 @@ from neeco.capture.lens import Border, Lens
 from neeco.capture.model import evenly_spaced
 from neeco.errors import NeecoError
 from neeco.ingest.episodes import Episodes
-from neeco.ingest.frame_selection import choose_frames, frame_features
+from neeco.ingest.formats import VideoSource
+from neeco.ingest.frame_selection import choose_frames, describe_ranges, frame_features, frozen_frames
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
 from neeco.ingest.recording import MIN_FRAMES
 from neeco.ingest.sfm import StageProgress
+
+MIN_REPEATED = 5  # frames with the picture before them that are worth a note where no state tells that it is wrong
+ASPECT_TOLERANCE = 0.02  # of fl_x / fl_y against the pixels' shape; calibrations agree to 0.5 %
 
 
 class ChosenImages:
@@ -103,6 +107,8 @@ class ChosenImages:
 def _read_lens(data: Episodes) -> Lens | None:
     """The lens given, checked against the video's size. Raises NeecoError naming where it was given."""
     lens, where = data.recording.read_lens()
+    for video in [part.video for part in data.parts]:
+        _check_pixels(video, lens, where, data)
     if lens is not None:
         lens.check_size(data.video.size, where)
         try:
@@ -110,6 +116,22 @@ def _read_lens(data: Episodes) -> Lens | None:
         except NeecoError as error:  # it knows nothing of where it came from
             raise NeecoError(f"{where}: {str(error).removeprefix('lens: ')}") from error
     return lens
+
+
+def _check_pixels(video: VideoSource, lens: Lens | None, where: str, data: Episodes) -> None:
+    """Note a lens whose focal lengths contradict the pixels' shape. Raises NeecoError for pixels that are not square
+    and an unknown lens: structure from motion finds one focal length."""
+    if lens is None and video.pixel_aspect != 1:
+        raise NeecoError(
+            f"{video.path}: its pixels are not square ({video.pixel_aspect:.3g} times as wide as high); give the "
+            "intrinsics of the frames as stored, or square pixels: ffmpeg -vf scale=iw*sar:ih,setsar=1"
+        )
+    if lens is not None and video.pixel_aspect != 1:
+        found, expected = lens.fl_x / lens.fl_y, 1 / video.pixel_aspect
+        if abs(found / expected - 1) > ASPECT_TOLERANCE:
+            data.note(
+                f"{where}: fl_x / fl_y is {found:.3g}, the shape of {video.path.name}'s pixels says {expected:.3g}"
+            )
 
 
 def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[int, str]]:
@@ -124,6 +146,14 @@ def _choose(data: Episodes, progress: StageProgress) -> tuple[np.ndarray, dict[i
 
     features = frame_features(images())
     states, usable = data.coverage_states()
+    known = states.any()  # else the clocks are found later, by frames that are not frozen
+    frozen = frozen_frames(features, usable, states) if known else np.flatnonzero(features.repeats)
+    if len(frozen) >= (1 if known else MIN_REPEATED):
+        why = (
+            "while the state changes; frozen, and left out" if known else "and are left out; is the video frozen there?"
+        )
+        share = f"{len(frozen)} of {count} frames ({len(frozen) / count:.0%}: {describe_ranges(frozen)})"
+        data.note(f"{data.video.path.name}: {share} repeat the picture before them {why}")
     limit = recording.frames or settings.max_frames
     selected, dropped = choose_frames(features, usable, states, limit, settings.min_sharpness)
     if recording.frames is None and count > limit:

@@ -12,7 +12,7 @@ from neeco.errors import NeecoError
 TRACKER_CLOCK = "em"  # what a tracker's clock is called unless the recording names it
 VIDEO_CLOCK = "video"  # that of the images, and of logs that stand in the same file
 QUATERNION_WXYZ, QUATERNION_XYZW = "quaternion_wxyz", "quaternion_xyzw"
-CAMERA, BASE = "camera", "base"  # frames that poses may be stated in
+CAMERA, BASE = "camera", "base"  # frames that poses may be stated in: OpenCV's camera axes, or what registration places
 ROTATION_VECTOR, EULER, ROTATION_MATRIX, MATRIX = "rotation_vector", "euler", "rotation_matrix", "matrix"
 FORMS = {
     QUATERNION_WXYZ: (4,),
@@ -55,7 +55,8 @@ class PoseColumns:
     many columns as `form` takes; euler_convention: as scipy names it, "XYZ" intrinsic, "xyz" extrinsic; state: a
     column of which only the values `good` mark measured rows; rate_hz: where time counts frames; tool: which, by port,
     name or serial number, in an NDI export of several; stream: which, of a file that holds several; frame: what the
-    poses are stated in, CAMERA or BASE (a robot's base, a tracker's frame); None: the format says so, else BASE.
+    poses are stated in, of `frames.FRAMES` (CAMERA, BASE: a robot's base, a tracker's frame); None: the file says so,
+    else BASE.
     """
 
     path: Path

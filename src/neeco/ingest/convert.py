@@ -13,58 +13,88 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from neeco.capture.documents import Parsed, ProblemReport
+from neeco.capture.check_masks import masks_fault, measure_hidden, sample_points
+from neeco.capture.documents import Parsed, ProblemReport, condensed
 from neeco.capture.endonerf import MASKS, folder_images
 from neeco.capture.images import read_mask, write_labels
-from neeco.capture.model import Frame, evenly_spaced
+from neeco.capture.lens import Border
+from neeco.capture.model import Capture, Frame, evenly_spaced
 from neeco.capture.reader import capture_of, parse_capture
 from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.files import LOCK, TEMPORARY, new_folder, own_folder
 from neeco.ingest.lens import BORDER_SAMPLES, find_border, visible_mask
+from neeco.ingest.undistortion import undistort_frames
 
 
 def convert_folder(folder: Path | str, output: Path | str) -> tuple[str, ...]:
     """Write `folder` as a neeco-capture/1 at `output` and say what it lacks, one sentence each.
 
-    Images are copied bit by bit. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a
-    mask, an endoscope's round border is looked for, and masked. The capture appears
-    whole or not at all. Raises NeecoError when the folder cannot be read, with the first problem found, when `output`
-    exists already, and when the disk refuses.
+    Images are copied bit by bit; distorted ones are undistorted, and their lens is kept. Frames without an image are
+    left out. EndoNeRF's tool masks become loss masks that ignore the tool; where no frame has a mask, an endoscope's
+    round border is looked for, and masked. The capture appears whole or not at all. Raises NeecoError when the folder
+    cannot be read, with the first problem found, when `output` exists already, and when the disk refuses.
     """
     folder, output = Path(folder), Path(output)
     with staged(output) as work:
         report = ProblemReport()
-        parsed = parse_capture(folder, report)
+        parsed = parse_capture(folder, report, as_source=True)
+        if not parsed.frames and not report.problems:
+            report.problems.extend(parsed.absent)
         if not parsed.frames and not report.problems:
             report.error("frames", "", "no frame could be read", f"run `neeco check {folder}`")
         tool_masks = _tool_masks(parsed, report) if parsed.is_endonerf else []
         report.raise_first(folder)
-        frames = parsed.frames
+        capture, notes = capture_of(parsed), _absent_images(parsed)
+        frames = list(capture.frames)
         if tool_masks:
-            pairs = zip(frames, tool_masks, strict=True)
-            frames = [_with_tool_mask(frame, mask, work / "tool") for frame, mask in pairs]
+            frames, found = _with_tool_masks(frames, tool_masks, work / "tool")
+            notes += found
         border = None if any(frame.mask_path for frame in frames) else _shared_border(frames)
         if border is not None:
-            write_labels(work / "border.png", torch.from_numpy(border.astype(np.uint8) * 255))
+            seen = visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
+            write_labels(work / "border.png", torch.from_numpy(seen.astype(np.uint8) * 255))
             frames = [replace(frame, mask_path=work / "border.png") for frame in frames]
-        write_capture(replace(capture_of(parsed), frames=tuple(frames)), work / "capture")
+            notes.append(f"The endoscope's dark border ({1 - seen.mean():.0%} of the image) is masked.")
+        undistorted = undistort_frames(frames, work / "undistorted", border)
+        notes += undistorted.notes
+        capture = replace(capture, frames=undistorted.frames, lens=undistorted.lens or capture.lens)
+        notes += _doubtful_masks(capture)
+        write_capture(capture, work / "capture")
     settled = ("instruments", "units")  # warnings that `_lacking` says; converting settles those of masks
     warnings = [problem for problem in report.problems if problem.severity == "warning" and problem.file != f"{MASKS}/"]
-    others = [str(problem) for problem in warnings if problem.field not in settled]
-    if border is not None:
-        others.append(f"The endoscope's dark border ({1 - border.mean():.0%} of the image) is masked.")
-    return (*_lacking(parsed, masked=bool(tool_masks)), *others)
+    others = [str(problem) for problem in condensed(warnings) if problem.field not in settled]
+    return (*_lacking(parsed, masked=bool(tool_masks)), *others, *notes)
 
 
-def _shared_border(frames: Sequence[Frame]) -> np.ndarray | None:
-    """bool [H, W], False on the endoscope's dark border that all frames share; None where there is none or they differ
-    in size. Raises NeecoError when an image cannot be read."""
+def _absent_images(parsed: Parsed) -> list[str]:
+    """What to say of frames whose images are not there."""
+    if not (count := len(parsed.absent)):
+        return []
+    total, first = count + len(parsed.frames), parsed.absent[0]
+    return [f"Left out: {count} of {total} frames, which have no image ({first.field}: {first.message})."]
+
+
+def _doubtful_masks(capture: Capture) -> list[str]:
+    """What to say of loss masks that may be inverted."""
+    masked = [frame for frame in capture.frames if frame.mask_path is not None]
+    found = []
+    for index in evenly_spaced(len(masked), BORDER_SAMPLES, floor=True):
+        frame, mask = masked[index], masked[index].load_mask()
+        points = {tissue.name: tissue.points for tissue in capture.tissues}.get(str(frame.state.tissue), capture.points)
+        assert mask is not None
+        found.append(measure_hidden(frame.load_image(), mask, frame.camera, sample_points(points)))
+    fault = masks_fault(found)
+    return [] if fault is None else [f"Warning: {fault[0]} {fault[1]}."]
+
+
+def _shared_border(frames: Sequence[Frame]) -> Border | None:
+    """The endoscope's dark border that all frames share; None where there is none or they differ in size. Raises
+    NeecoError when an image cannot be read."""
     if len({(frame.camera.width, frame.camera.height) for frame in frames}) != 1:
         return None
     chosen = evenly_spaced(len(frames), BORDER_SAMPLES, floor=True)
-    border = find_border(frames[index].load_image_bytes().numpy() for index in chosen)
-    return None if border is None else visible_mask(border, (frames[0].camera.width, frames[0].camera.height))
+    return find_border(frames[index].load_image_bytes().numpy() for index in chosen)
 
 
 def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
@@ -76,12 +106,31 @@ def _tool_masks(parsed: Parsed, report: ProblemReport) -> list[Path]:
     return paths
 
 
-def _with_tool_mask(frame: Frame, tool_mask: Path, work: Path) -> Frame:
-    """The frame, its loss mask ignoring what the tool mask shows white. Raises NeecoError for a damaged mask."""
-    tool = read_mask(tool_mask, (frame.camera.width, frame.camera.height))
-    loss_path = work / f"{frame.name}.png"
-    write_labels(loss_path, (~tool).to(torch.uint8) * 255)
-    return replace(frame, mask_path=loss_path)
+def _with_tool_masks(frames: Sequence[Frame], masks: Sequence[Path], work: Path) -> tuple[list[Frame], list[str]]:
+    """The frames with loss masks that ignore the tool, and notes on the masks.
+
+    White is the tool, as EndoNeRF writes it, unless that would be more than MOST_HIDDEN of the lit pixels of most
+    images: then black is the tool, as in StereoMIS. Raises NeecoError for a damaged mask.
+    """
+    sizes = [(frame.camera.width, frame.camera.height) for frame in frames]
+    white = []
+    for index in evenly_spaced(len(frames), BORDER_SAMPLES, floor=True):
+        tool = read_mask(masks[index], sizes[index])
+        white.append(measure_hidden(frames[index].load_image(), ~tool, None, np.zeros((0, 3))))
+    fault = masks_fault(white)
+    masked = []
+    for frame, mask, size in zip(frames, masks, sizes, strict=True):
+        shown = read_mask(mask, size)
+        path = work / f"{frame.name}.png"
+        write_labels(path, (shown if fault is not None else ~shown).to(torch.uint8) * 255)
+        masked.append(replace(frame, mask_path=path))
+    if fault is None:
+        return masked, []
+    share = float(np.median([one.pixels for one in white if one.pixels is not None]))
+    return masked, [
+        f"Warning: tool masks have inverted polarity: white is {share:.0%} of most images, so black is read as the "
+        "tool; invert them if white is the tool."
+    ]
 
 
 def _lacking(parsed: Parsed, *, masked: bool) -> list[str]:

@@ -15,6 +15,11 @@ NEIGHBOURS = 7  # frames on each side, whose sharpness a frame is compared with
 STILL = 0.004  # mean absolute change of the picture, in [0, 1], that sensor noise alone makes
 STILL_PLACE = 0.06  # the same at one place of a thumbnail
 STILL_MM, STILL_RAD = 0.3, 0.005  # and of the state, within the tracker's noise
+# Levels of 255, mean and largest, by which a picture that is coded again differs at half size: 0.07 and 19 by H.264
+# at its coarsest, 0.4 and 40 or more where a camera or an instrument moves.
+REPEATED_MEAN, REPEATED_MAX = 0.2, 24
+FROZEN_MM, FROZEN_RAD = 1.0, 0.03  # by which a state changes visibly while the picture does not
+MAX_RANGES = 3  # of frames, named in a note
 THUMBNAIL = 64  # px, width
 UNSEEN_MARGIN = 3  # video frames on each side of an unseen one chosen by us that no other split may use
 MIN_RANGE = 0.1  # rad a joint's readings must span to be split by
@@ -28,19 +33,44 @@ class FrameFeatures:
 
     sharpness: np.ndarray  # [N]
     thumbnails: np.ndarray  # [N, h, w] grey in [0, 1]
+    repeats: np.ndarray  # [N] bool: the picture is that of the frame before
 
 
 def frame_features(images: Iterable[np.ndarray]) -> FrameFeatures:
-    """Sharpness and a thumbnail of every image [H, W, 3] uint8."""
-    sharpness, thumbnails = [], []
+    """Sharpness and a thumbnail of every image [H, W, 3] uint8, and whether it repeats the one before."""
+    sharpness, thumbnails, repeats = [], [], []
+    before: np.ndarray | None = None
     for image in images:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         # at half size, or sensor noise is taken for detail
-        half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        levels = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        repeats.append(before is not None and is_repeated(before, levels))
+        before, half = levels, levels.astype(np.float32) / 255
         sharpness.append(float(cv2.Laplacian(half, cv2.CV_32F).var()))
         size = (THUMBNAIL, max(1, round(THUMBNAIL * image.shape[0] / image.shape[1])))
         thumbnails.append(cv2.resize(half, size, interpolation=cv2.INTER_AREA))
-    return FrameFeatures(np.array(sharpness), np.array(thumbnails))
+    return FrameFeatures(np.array(sharpness), np.array(thumbnails), np.array(repeats))
+
+
+def is_repeated(before: np.ndarray, picture: np.ndarray) -> bool:
+    """Whether a grey picture, uint8 [h, w], is the one before, coded again."""
+    change = cv2.absdiff(before, picture)
+    return bool(change.mean() < REPEATED_MEAN and change.max() < REPEATED_MAX)
+
+
+def frozen_frames(features: FrameFeatures, usable: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Frames whose picture repeats an earlier one, though the state changed since; arguments as of `choose_frames`."""
+    source = np.maximum.accumulate(np.where(features.repeats, 0, np.arange(len(states))))
+    change = states - states[source]
+    moved = (np.linalg.norm(change[:, :3], axis=1) > FROZEN_MM) | (np.linalg.norm(change[:, 3:], axis=1) > FROZEN_RAD)
+    return np.flatnonzero(moved & usable & usable[source])
+
+
+def describe_ranges(frames: np.ndarray) -> str:
+    """Increasing frame numbers as `61-89, 104`, the first three ranges."""
+    parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    words = [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts[:MAX_RANGES]]
+    return ", ".join(words) + (", ..." if len(parts) > MAX_RANGES else "")
 
 
 def choose_frames(
@@ -52,6 +82,9 @@ def choose_frames(
     rad, joints rad of the instrument; min_sharpness: of the neighbours' median.
     """
     dropped = {int(i): "no instrument state at its time" for i in np.flatnonzero(~usable)}
+    dropped |= dict.fromkeys(
+        frozen_frames(features, usable, states).tolist(), "frozen: the state changed, not the picture"
+    )
     for i in np.flatnonzero(usable).tolist():
         around = features.sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1]
         if features.sharpness[i] < min_sharpness * np.median(around):

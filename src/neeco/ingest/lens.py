@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,20 @@ import numpy as np
 import yaml
 from scipy import ndimage
 
-from neeco.capture.documents import as_float, printable
-from neeco.capture.lens import COEFFICIENTS, Border, Lens
+from neeco.capture.distortion import opencv_distortion, stated_distortion
+from neeco.capture.documents import Node, RaisingReport, as_float, printable
+from neeco.capture.lens import Border, Lens
 from neeco.errors import NeecoError
 from neeco.files import parse_yaml, read_json, read_text, require_file
+from neeco.plausible import size_fault
+from neeco.raster.types import COEFFICIENTS
 
-NERFSTUDIO_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
 DISTORTION_NAMES = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs", "D", "d")
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
+FISHEYE_MODEL = "OPENCV_FISHEYE"
 FISHEYE = ("fisheye", "equidistant", "kannala_brandt", "opencv_fisheye")
 LARGEST = 1e9  # of any of a lens's numbers
-WIDEST_ANGLE = math.radians(80)  # off the axis, that a fisheye lens may see
-MISFIT_PX = 0.1  # of a fisheye lens written as another model
 
 # The dark border around a round field of view.
 BORDER_SAMPLES = 48  # frames looked at
@@ -64,9 +66,13 @@ def _nerfstudio(path: Path, document: Any) -> Lens:
     if missing:
         raise NeecoError(f"{path}: {missing[0]}: missing; give fl_x, fl_y, cx, cy (and k1, k2, p1, p2 if distorted)")
     values = [document["fl_x"], document.get("fl_y", document["fl_x"]), document["cx"], document["cy"]]
-    names = FISHEYE_DISTORTION if _is_fisheye(document, "camera_model") else NERFSTUDIO_DISTORTION
-    distortion = [document.get(key, 0.0) for key in names]
-    return checked_lens(path, values, distortion, size, fisheye=names is FISHEYE_DISTORTION)
+    stated = stated_distortion(Node(document, str(path), "", RaisingReport()).child)
+    assert stated is not None  # else it raised
+    lens = checked_lens(path, values, (), size)
+    try:
+        return replace(lens, distortion=opencv_distortion(stated.model, stated.coefficients, lens.intrinsics, size))
+    except NeecoError as error:
+        raise NeecoError(f"{path}: distortion: {error}") from None
 
 
 def opencv_lens(where: Path | str, document: Any) -> Lens:
@@ -117,7 +123,8 @@ def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | N
     """(width, height) px; None where one is not given. Raises NeecoError."""
     if width is None or height is None:
         return None
-    if not all(isinstance(value, int | float) and 1 <= value < 1e6 for value in (width, height)):
+    sides = [as_float(value) for value in (width, height)]
+    if None in sides or size_fault(*sides) is not None:
         raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
     return int(width), int(height)
 
@@ -129,35 +136,17 @@ def _is_fisheye(document: dict[Any, Any], field: str) -> bool:
 def _rational(
     source: object, values: Sequence[float], fisheye: Sequence[float], size: tuple[int, int] | None
 ) -> tuple[float, ...]:
-    """OpenCV's eight coefficients of the rational model that bend the image as four of a fisheye (Kannala & Brandt
-    2006) do, to MISFIT_PX or better: least squares, reweighted by the denominator. Raises NeecoError."""
+    """OpenCV's coefficients of a lens with four of a fisheye (Kannala & Brandt 2006). Raises NeecoError."""
     if len(fisheye) != 4:
         raise NeecoError(
             f"{source}: distortion: a fisheye lens has 4 coefficients, not {len(fisheye)}; calibrate again"
         )
     fl_x, fl_y, cx, cy = values
-    width, height = size or (2 * cx, 2 * cy)
-    theta = np.linspace(1e-3, WIDEST_ANGLE, 2000)
-    bent = theta * np.polynomial.polynomial.polyval(theta**2, (1.0, *fisheye))
-    farthest = math.hypot(max(cx, width - cx) / fl_x, max(cy, height - cy) / fl_y)
-    used = bent <= farthest
-    if used.all() or (np.diff(bent[used]) <= 0).any():
-        what = f"sees farther than {math.degrees(WIDEST_ANGLE):.0f} degrees off its axis, or folds the image over"
-        raise NeecoError(f"{source}: distortion: this fisheye lens {what}; crop the images, or calibrate again")
-    radius, share = np.tan(theta[used]), bent[used] / np.tan(theta[used])
-    powers = (radius[:, None] ** 2) ** np.arange(1, 4)  # [N, 3]
-    weight = radius
-    for _ in range(8):
-        rows = np.hstack([powers, -share[:, None] * powers]) * weight[:, None]
-        found = np.linalg.lstsq(rows, (share - 1) * weight, rcond=None)[0]
-        weight = radius / np.maximum(1 + powers @ found[3:], 1e-6)
-    error = np.abs((1 + powers @ found[:3]) / (1 + powers @ found[3:]) - share) * radius * max(fl_x, fl_y)
-    if not error.max() < MISFIT_PX:
-        raise NeecoError(
-            f"{source}: distortion: this fisheye lens bends too much for OpenCV's rational model ({error.max():.2f} px "
-            "off); crop the images, or calibrate again"
-        )
-    return (*found[:2].tolist(), 0.0, 0.0, *found[2:].tolist())
+    coefficients = dict(zip(FISHEYE_DISTORTION, fisheye, strict=True))
+    try:
+        return opencv_distortion(FISHEYE_MODEL, coefficients, (fl_x, fl_y, cx, cy), size)
+    except NeecoError as error:
+        raise NeecoError(f"{source}: distortion: {error}") from None
 
 
 class _Loader(yaml.SafeLoader):

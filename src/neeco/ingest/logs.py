@@ -6,23 +6,28 @@ most of the rows unusable) is refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from neeco.capture.conventions import OPENCV
 from neeco.errors import NeecoError
 from neeco.ingest import columns as named
 from neeco.ingest.columns import EULER, MATRIX, ROTATION_VECTOR, JointColumns, PoseColumns, RecognisedColumns
-from neeco.ingest.formats import Table, column_index, count_rows, numbers, read_table
+from neeco.ingest.formats import Table, column_index, count_rows, numbers, parse_number, read_table
+from neeco.ingest.frames import CAMERA_FRAMES, meaning_in, meaning_of, of_dvrk
 from neeco.ingest.ndi import tool_columns
 from neeco.raster.rotations import rotation_error
 
 MIN_SAMPLES = 4  # of a usable log
 WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the file is refused
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
+_FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
 LISTED_STATES = 8  # states that drop rows and are named in the notes
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
@@ -38,7 +43,8 @@ class PoseLog:
 
     times [T] s, increasing; positions [T, 3] mm; quats [T, 4] wxyz, unit, sign-continuous; gaps: (last time before,
     first time after) where samples are missing; notes: what was dropped or repaired, in words; frame: what the poses
-    are stated in, CAMERA or BASE; stated_in: what the file calls it, None where it does not, or the recording says.
+    are stated in, CAMERA (OpenCV's axes) or BASE; stated_in: what the file calls it, None where it does not, or the
+    recording says; image_hz: as in `Table`.
     """
 
     path: Path
@@ -50,6 +56,7 @@ class PoseLog:
     notes: tuple[str, ...] = ()
     frame: str = named.BASE
     stated_in: str | None = None
+    image_hz: float | None = None
 
 
 @dataclass(frozen=True, eq=False)  # compared and cached by identity: it holds arrays
@@ -62,6 +69,7 @@ class ReadingLog:
     values: np.ndarray
     gaps: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = ()
+    image_hz: float | None = None
 
 
 class Rows:
@@ -101,12 +109,9 @@ class Rows:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
-    if table.asks_frame and table.frame is None and source.frame is None:
-        raise NeecoError(
-            f"{table.where}: frame: nothing says what its poses are stated in; say so in the recording: frame: "
-            f"{named.CAMERA}, or frame: {named.BASE} (a robot's base or a tracker)"
-        )
     found = named.recognise_pose(table.header)
+    table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
+    frame = _frame_of(table, source)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
     times = _times(rows, source, found)
@@ -116,9 +121,70 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
     gaps, gap_notes = _gaps(table, times)
-    notes, frame = (*rows.notes(), *gap_notes), source.frame or table.frame or named.BASE
+    notes = (*rows.notes(), *gap_notes)
     stated_in = table.stated_in if source.frame is None else None
-    return PoseLog(table.path, source.clock, times, positions[order], quats, gaps, notes, frame, stated_in)
+    positions = positions[order]
+    if frame != named.BASE:
+        positions, quats = in_opencv(frame, positions, quats)
+        frame = named.CAMERA
+        if source.frame is None and table.meaning is not None:
+            notes = (*notes, f"{table.title}: poses are stated in {table.meaning.why}")
+    log = PoseLog(table.path, source.clock, times, positions, quats, gaps, notes, frame, stated_in)
+    return replace(log, image_hz=table.image_hz)
+
+
+def in_opencv(frame: str, positions: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [T, 3] and quaternions [T, 4] wxyz stated in a camera's frame (`frames.CAMERA_FRAMES`), in OpenCV's
+    axes; what is stated in a base stays."""
+    turn = CAMERA_FRAMES[frame].opencv_from_own[:3, :3] if frame != named.BASE else np.eye(3)
+    if np.array_equal(turn, np.eye(3)):
+        return positions, quats
+    turned = Rotation.from_matrix(turn) * Rotation.from_quat(quats, scalar_first=True)
+    return positions @ turn.T, continuous(turned.as_quat(scalar_first=True))[0]
+
+
+def with_named_frame(table: Table, columns: Sequence[str]) -> Table:
+    """The table with what is said of the frame of its poses: by the names of their columns, else by the file, else by a
+    column of frames' names, else by the file's name. Raises NeecoError where the column names several."""
+    dvrk = of_dvrk(table.path.stem, *columns)
+    meaning = meaning_in(columns, dvrk=dvrk)
+    if meaning is None and (table.meaning is not None or table.stream is not None):
+        return table
+    names = [] if meaning is not None else _frame_names(table)
+    if names:
+        return replace(table, stated_in=names[0], meaning=meaning_of(names[0], dvrk=dvrk))
+    return replace(table, meaning=meaning or meaning_in([table.path.stem], dvrk=dvrk))
+
+
+def _frame_names(table: Table) -> list[str]:
+    """The name in a column such as `header.frame_id`; [] where there is none, or it counts or names images."""
+    for index, name in enumerate(table.header):
+        if isinstance(table.rows, np.ndarray) or not _FRAME_COLUMN.fullmatch(name.strip().lower()):
+            continue
+        found = sorted({cells[index].strip("/\"' ") for cells in table.rows if index < len(cells)} - {""})
+        if len(found) > 1 and any(meaning_of(cell).frame != named.BASE for cell in found):
+            listed = ", ".join(found[:4])
+            raise NeecoError(f"{table.where}: {name}: poses are stated in several frames ({listed}); write one a file")
+        if len(found) == 1 and parse_number(found[0]) is None:
+            return found
+    return []
+
+
+def _frame_of(table: Table, source: PoseColumns) -> str:
+    """What poses are stated in: as the recording says, else as the file does. Raises NeecoError where neither does, or
+    the two contradict each other."""
+    if source.frame is None:
+        if table.meaning is not None and table.frame is None:
+            raise NeecoError(f"{table.where}: frame: {table.meaning.question}")
+        return table.frame or named.BASE
+    own = CAMERA_FRAMES.get(table.frame or "")
+    if source.frame == named.CAMERA and own is not None and own.words != OPENCV.words:
+        raise NeecoError(
+            f"{table.where}: frame: {named.CAMERA} means OpenCV's axes ({OPENCV.words}), and the file states its poses "
+            f"in {table.stated_in or own.name}, whose axes are {own.words}; leave it out (or write frame: {own.name}), "
+            f"or frame: {OPENCV.name} where they are turned already"
+        )
+    return source.frame
 
 
 def read_reading_log(source: JointColumns) -> ReadingLog:
@@ -143,7 +209,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
         rows.drop_wrong(impossible, reason)
     times, order = _in_order(rows, times)
     gaps, gap_notes = _gaps(table, times)
-    return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))
+    notes = (*rows.notes(), *clamped, *gap_notes)
+    return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
 
 
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from neeco.ingest import columns as named
 from neeco.ingest.basefile import StatedBase, parse_base
 from neeco.ingest.columns import FORMS, TRACKER_CLOCK, VIDEO_CLOCK, JointColumns, PoseColumns, Units
 from neeco.ingest.formats import format_of
+from neeco.ingest.frames import CAMERA_FRAMES, FRAMES
 from neeco.ingest.recording import (
     MIN_FRAMES,
     MOVING,
@@ -268,10 +269,12 @@ def _base(section: Section, poses: PoseColumns | None) -> StatedBase | None:
         return None
     if len(given) > 1:
         raise section.error(WORLD_KEY, f"{BASE_KEY} is given, too; keep the one that it stands still to")
-    if poses.frame == named.CAMERA:
+    if poses.frame in CAMERA_FRAMES:
         if section.place:
             raise section.error(given[0], "its poses are in the camera's frame already; leave out one of the two")
         return None
+    if given[0] == WORLD_KEY and isinstance(value := section.value[WORLD_KEY], dict) and "axes" in value:
+        raise section.error(f"{WORLD_KEY}.axes", "a tracker's frame has none of a camera's; leave it out")
     base = parse_base(section.node.child(given[0]), section.file.parent)
     return replace(base, to_world=given[0] == WORLD_KEY)
 
@@ -347,8 +350,9 @@ def _pose_columns(parent: Section, key: str, value: Any, video: Path | None) -> 
     if form == named.EULER and convention is None:
         raise columns.error("euler_convention", "missing; name the axes in order: ZYX intrinsic, zyx extrinsic, ...")
     frame = section.text("frame")
-    if frame not in (None, named.CAMERA, named.BASE):
-        raise section.error("frame", f"{printable(frame)} is no frame of poses; write {named.CAMERA} or {named.BASE}")
+    frame = None if frame is None else frame.lower()
+    if frame not in (None, *FRAMES):
+        raise section.error("frame", f"{printable(frame)} is no frame of poses; write one of {', '.join(FRAMES)}")
     good = columns.value.get("good")
     goods = tuple(str(item) for item in (good if isinstance(good, list) else [good])) if good is not None else ("OK",)
     clock = section.text("clock") or (VIDEO_CLOCK if file == video else TRACKER_CLOCK)

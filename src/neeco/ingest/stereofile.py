@@ -12,11 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
-from neeco.capture.lens import COEFFICIENTS, Lens
+from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import read_json, read_text, require_file
+from neeco.files import read_json, read_text, require_file, visible_entries
 from neeco.ingest.lens import checked_lens, first_of, image_size, matrix_numbers, opencv_lens, read_opencv_yaml
 from neeco.raster.rotations import rotation_error
+from neeco.raster.types import COEFFICIENTS
 
 # names of the left and right camera matrix, and of their distortion
 MATRICES = (
@@ -188,7 +189,7 @@ def _camera_infos(left: Path, right: Path) -> tuple[Lens, Lens, np.ndarray]:
 
 
 def _pair_of_files(folder: Path) -> tuple[Path, Path]:
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".yaml", ".yml"))
+    files = [file for file in visible_entries(folder) if file.suffix.lower() in (".yaml", ".yml")]
     left, right = ([file for file in files if side in file.stem.lower()] for side in ("left", "right"))
     if len(left) != 1 or len(right) != 1:
         raise NeecoError(f"{folder}: holds no one left and one right calibration; name the file of one as left.yaml")

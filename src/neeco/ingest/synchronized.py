@@ -6,6 +6,7 @@ import numpy as np
 
 from neeco.errors import NeecoError
 from neeco.ingest.columns import BASE, VIDEO_CLOCK
+from neeco.ingest.formats import MAX_UNLIKE, compare_lengths
 from neeco.ingest.from_video import with_roll
 from neeco.ingest.interpolate import poses_at, readings_at
 from neeco.ingest.logs import PoseLog, ReadingLog, read_pose_log, read_reading_log
@@ -54,6 +55,7 @@ class SynchronizedRecording:
         if not self.placed:
             self.note("no instrument was tracked: the capture has cameras and images only (method 3dgs trains)")
         self._check_video()
+        self._check_lengths(logs)
         self.clocks = {name: ClockOffset(float(seconds), 0.0, GIVEN) for name, seconds in recording.sync.items()}
         if VIDEO_CLOCK in recording.clocks:
             self.clocks[VIDEO_CLOCK] = ClockOffset(0.0, 0.0, "the images' own")
@@ -158,6 +160,24 @@ class SynchronizedRecording:
         if min(video.size) < SMALLEST:
             width, height = video.size
             raise NeecoError(f"{video.path}: its frames are {width}x{height} pixels; give {SMALLEST} or more each way")
+
+    def _check_lengths(self, logs: list[PoseLog | ReadingLog]) -> None:
+        """Note logs on the video's clock that are longer than the video, and those whose rows belong to images one by
+        one and are not as many. Raises NeecoError where these are far from as many."""
+        video = self.video
+        of_video = [log for log in logs if log.clock == VIDEO_CLOCK and log.path != self.recording.video]
+        for log in of_video:
+            if log.image_hz is not None:
+                rows = round(float(log.times[-1]) * log.image_hz) + 1
+                for note in compare_lengths(video.path, video, rows, log.image_hz):
+                    self.note(note)
+                continue
+            beyond = max(0.0, log.times[-1] - self.times[-1]) + max(0.0, self.times[0] - log.times[0])
+            if beyond > MAX_UNLIKE * (self.times[-1] - self.times[0]):
+                self.note(
+                    f"{log.path.name}: goes from {log.times[0]:.1f} to {log.times[-1]:.1f} s on the video's clock, the "
+                    f"video from {self.times[0]:.1f} to {self.times[-1]:.1f} s: are they of one recording?"
+                )
 
     def _assume_joint_clocks(self) -> None:
         """Joints' clocks that nothing gives are taken to be the video's: images tell them to some 20 ms at best.

@@ -7,14 +7,14 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from neeco.errors import NeecoError
-from neeco.files import read_json
+from neeco.files import placeholder, read_json, require_content
 from neeco.ingest.columns import (
     MATRIX,
     PoseColumns,
@@ -26,7 +26,9 @@ from neeco.ingest.columns import (
 )
 from neeco.ingest.formats import IMAGES as IMAGE_STREAMS
 from neeco.ingest.formats import POSES, READINGS, Stream, format_of, read_table
+from neeco.ingest.frames import without_frame
 from neeco.ingest.lens import read_lens
+from neeco.ingest.logs import with_named_frame
 from neeco.ingest.ndi import tool_columns, tool_names
 from neeco.ingest.video import IMAGES
 
@@ -57,6 +59,10 @@ class _Log:
     @property
     def stem(self) -> str:
         """What it may be called."""
+        return without_frame(self._name)
+
+    @property
+    def _name(self) -> str:
         if self.body is not None:
             return self.body
         if self.tool is not None:
@@ -81,6 +87,7 @@ class _FolderFiles:
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
+    placeholders: list[str] = field(default_factory=list)  # what stands in a file's place, in words
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
 
@@ -94,12 +101,15 @@ def write_template(source: Path) -> str:
     known = format_of(source)
     if known is not None and source.exists():
         known.require_package(source)
+    require_content(source)
     if source.is_file() and (known is None or not known.streams(source)):
         raise NeecoError(f"{source}: is a file of no format that holds images and logs; give the recording's folder")
     if not source.exists():
         raise NeecoError(f"{source}: not there; give the recording's folder")
     found = _find_files(source)
     if not found.videos and not found.images:
+        if found.placeholders:
+            raise NeecoError(f"{source / found.placeholders[0]}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
     frames = [_frames_line(log) for log in found.videos]
     frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
@@ -123,7 +133,7 @@ def write_template(source: Path) -> str:
         scope_hints=scopes[0][0].hints if scopes else (),
         other_scopes=[", ".join(log.lines()) for log, _ in scopes[1:]],
         sync=next(iter(found.syncs), None),
-        others=found.others[:MAX_OTHERS],
+        others=[*found.placeholders, *found.others][:MAX_OTHERS],
         episodes=found.episodes,
         partner=next((line for line in frames[1:] if line.startswith(("video:", "images:"))), "video: right.mp4"),
     )
@@ -142,7 +152,9 @@ def _find_files(source: Path) -> _FolderFiles:
     for inner in sorted(entry for pattern in ("*", "*/*") for entry in folder.glob(pattern) if entry.is_dir()):
         _add_streams(found, inner, inner.relative_to(folder).as_posix())
     held = [folder / log.file for log in [*found.videos, *(log for log, _ in found.poses)]]
-    files = sorted(file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.is_file())
+    files = sorted(
+        file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.is_file() or placeholder(file)
+    )
     files = [file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts)]
     files = [file for file in files if not any(other in file.parents for other in held)]
     for parent, count in Counter(file.parent for file in files if file.suffix.lower() in IMAGES).items():
@@ -150,7 +162,9 @@ def _find_files(source: Path) -> _FolderFiles:
             found.images.append(parent.relative_to(folder).as_posix())
     for file in [file for file in files if file.suffix.lower() not in IMAGES][:MAX_FILES]:
         name, suffix = file.relative_to(folder).as_posix(), file.suffix.lower()
-        if suffix in VIDEOS:
+        if problem := placeholder(file):
+            found.placeholders.append(f"{name}: {problem}")
+        elif suffix in VIDEOS:
             found.videos.append(_Log(name))
         elif format_of(file) is not None:
             if not _add_streams(found, file, name):
@@ -209,6 +223,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     name = log.file
     try:
         table = read_table(file)
+        meaning = with_named_frame(table, recognise_pose(table.header).position or ()).meaning
     except NeecoError as error:
         found.others.append(" ".join(str(error).replace(str(file), name).split()))
         return
@@ -222,6 +237,8 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     columns = [column for column in table.header if column]
     angles = [column for column in columns if split_unit(column, "angle")[1] or column.lower().startswith("angle")]
     if pose.rotation or "rotation" in pose.unclear:
+        if meaning is not None:
+            log = replace(log, hints=meaning.hints, asks=meaning.asks)
         found.poses.append((log, pose))
     elif value and when.time:
         found.joints.append((log, when, value, None))

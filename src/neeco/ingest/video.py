@@ -14,11 +14,13 @@ import numpy as np
 
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
+from neeco.files import require_content, visible_entries
 from neeco.ingest.columns import recognise_time, scale_of
 from neeco.ingest.formats import VideoSource, numbers, read_table
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MIN_IMAGES = 2
+SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
 
 
 def require_installed(name: str) -> None:
@@ -32,6 +34,7 @@ def open_video(path: Path, fps: float | None = None, part: tuple[float, float] |
     those that can be, with their own times (`fps`: overrides them). What is damaged is left out and noted; raises
     NeecoError when nothing can be read."""
     path = Path(path)
+    require_content(path)
     if not path.is_file():
         raise NeecoError(f"{path}: {'is a folder; give it as images' if path.is_dir() else 'no such file'}")
     scan = _Scan(path, part=part).run()
@@ -48,7 +51,7 @@ def open_images(folder: Path, fps: float | None = None, times: Path | None = Non
     if not folder.is_dir():
         raise NeecoError(f"{folder}: {'is a file; give a folder of images' if folder.exists() else 'no such folder'}")
     folder = folder if folder.name else folder.resolve()  # "." says nothing in a message
-    files = sorted((file for file in folder.iterdir() if file.suffix.lower() in IMAGES), key=_natural_order)
+    files = sorted((file for file in visible_entries(folder) if file.suffix.lower() in IMAGES), key=_natural_order)
     if len(files) < MIN_IMAGES:
         raise NeecoError(f"{folder}: holds {len(files)} images; expected frames as {', '.join(IMAGES[:3])} files")
     if times is not None:
@@ -123,12 +126,15 @@ class _Scan:
     corrupt: int = 0
     interlaced: bool = False
     turned: int = 0
+    pixel_aspect: float = 1.0
+    others: tuple[str, ...] = ()  # sizes of the video streams besides the one that is read
     promised: int = 0  # frames the file's header speaks of
 
     def decoded(self) -> Iterator[Any]:
         """Frames as far as they can be decoded; damaged ones are counted and left out."""
         require_installed("av")
         import av
+        from av.stream import Disposition
 
         try:
             container = av.open(str(self.path))
@@ -139,7 +145,12 @@ class _Scan:
         with container:
             if not container.streams.video:
                 raise NeecoError(f"{self.path}: holds no video stream; give the recording's video")
-            stream = container.streams.video[0]
+            # what players show as a file's cover is a video stream, too
+            films = [film for film in container.streams.video if not film.disposition & Disposition.attached_pic]
+            stream, *others = films or container.streams.video
+            self.others = tuple(f"{film.width}x{film.height}" for film in others)
+            aspect = float(stream.sample_aspect_ratio or 1)
+            self.pixel_aspect = 1.0 if abs(aspect - 1) < SQUARE else aspect
             stream.thread_type = self.threads
             self.promised = int(stream.frames or 0)
             self.rate = float(stream.average_rate) if stream.average_rate else None
@@ -206,7 +217,7 @@ class _Scan:
                 times = np.arange(len(order)) / fps
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads, self.part)
+            return self._video(notes, times, tuple(order), False)
         rate = fps or self.rate
         if not rate:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
@@ -214,8 +225,14 @@ class _Scan:
             notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
         count = len(self.stamps)
         times = np.arange(count) / rate
-        numbers = tuple(range(count))
-        return _Video(self.path, self.size, tuple(notes), times, numbers, True, self.threads, self.part)
+        return self._video(notes, times, tuple(range(count)), True)
+
+    def _video(self, notes: list[str], times: np.ndarray, stamps: tuple[int, ...], numbered: bool) -> _Video:
+        assert self.size is not None
+        return _Video(
+            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part,
+            pixel_aspect=self.pixel_aspect,
+        )  # fmt: skip
 
     def _notes(self) -> list[str]:
         notes, read = [], len(self.stamps)
@@ -224,6 +241,14 @@ class _Scan:
             notes.append(f"{self.path.name}: is damaged: {what}")
         elif self.promised > read and self.part is None:
             notes.append(f"{self.path.name}: ends early: {read} of {self.promised} frames are there")
+        if self.others:
+            several = (
+                f"holds {1 + len(self.others)} video streams; the first is read (others: {', '.join(self.others)})"
+            )
+            notes.append(f"{self.path.name}: {several}; copy another into a file of its own: ffmpeg -map 0:v:1 -c copy")
+        if self.pixel_aspect != 1:
+            shape = f"are not square ({self.pixel_aspect:.3g} times as wide as high); its frames are used as stored"
+            notes.append(f"{self.path.name}: its pixels {shape}, so fl_x / fl_y is {1 / self.pixel_aspect:.3g}")
         if self.interlaced:
             notes.append(f"{self.path.name}: is interlaced; deinterlace it (ffmpeg -vf yadif) for sharper frames")
         if self.turned:

@@ -116,6 +116,23 @@ def draw_layers(
     )
 
 
+@torch.no_grad()
+def extended_silhouettes(scene: Scene, labeller: Labeller, state: State, camera: Camera) -> dict[str, np.ndarray]:
+    """Silhouette (bool [3 H, 3 W]) of every instrument drawn alone, by name, in the image of a pinhole `camera` and
+    beyond its border: the image is the middle ninth."""
+    width, height = camera.width, camera.height
+    wide = replace(camera, cx=camera.cx + width, cy=camera.cy + height, width=3 * width, height=3 * height)
+    wide = scene.recorded.as_learned(wide)
+    gaussians = scene.at(state)
+    owners = labeller.owners(state, gaussians)
+    colorless = replace(gaussians, sh=gaussians.sh[:, :1], headlight=None)
+    return {
+        name: (rasterize(colorless.select(owners == k), wide).alpha > threshold_of(scene)).cpu().numpy()
+        for k, name in enumerate(instruments_of(labeller.names))
+        if name in state.instruments
+    }
+
+
 def surface_depth(rendering: Rendering) -> np.ndarray:
     """Expected depth [H, W] mm where something opaque was drawn, 0 elsewhere."""
     return to_numpy(rendering.depth * (rendering.alpha > SURFACE_ALPHA))

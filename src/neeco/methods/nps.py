@@ -33,6 +33,7 @@ from neeco.scene.deformation import (
     check_warm_up,
     encode,
     floored_decay,
+    half_resolved,
     octave_weights,
     robust_bounds,
     state_of,
@@ -55,7 +56,8 @@ class NPSSettings:
     `preset`: what the fields below were set to before each was set for itself; "practical" departs from the paper.
     `state`: "full" (position, quaternion, joints), "rotation_jaw" (the 2024 drafts: quaternion and joints) or, with
     `membership`, which carries what poses move, "joints".
-    `half`: hidden layers multiply in bfloat16 on a CPU that has it; a run is started with it where that is fast.
+    `half`: hidden layers multiply in bfloat16 on a CPU that has it; None: decided when training starts,
+    by whether this processor is fast at it.
     `chunk`: Gaussians per evaluation without gradients. `warm_up`: share of the training over which the network is off;
     without it the first steps, whose gradients all ask to fill a half-empty image, may move the Gaussians out of sight
     for good. `rate`: learning rate at the start.
@@ -75,7 +77,7 @@ class NPSSettings:
     L_state: int = 10
     identity: bool = False
     state: Literal["full", "rotation_jaw", "joints"] = "full"
-    half: bool = False
+    half: bool | None = False
     chunk: int = 65536
     warm_up: float = 0.075
     gate_mm: float | None = None
@@ -130,6 +132,11 @@ class NPS(LabelledByMotion):
     first_quats: Tensor
     rest: Tensor  # [I, 4, 4] mm: the instruments' poses in the state in which the canonical Gaussians are placed
     opened: Tensor  # share of the octaves that are open
+
+    @classmethod
+    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
+        """`settings` with `half` decided: by this processor, or as in those of a run that was `begun`."""
+        return half_resolved(settings, begun)
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: NPSSettings | None = None) -> None:
         super().__init__(instruments, settings)
@@ -330,7 +337,7 @@ class NPS(LabelledByMotion):
         with tf32_products(means.device):
             # one row, and what tells states apart: in float32, as low octaves alone have no place in eight bits
             begin, again = self.state_in(state), self.state_skip(state) if self.skip > 0 else None
-            with bfloat16_products(means.device, self.settings.half):
+            with bfloat16_products(means.device, bool(self.settings.half)):
                 summed = self.mean_in(encoded)
                 features = torch.relu(summed + begin.to(summed.dtype))
                 for index, layer in enumerate(self.hidden, start=1):

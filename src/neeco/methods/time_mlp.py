@@ -37,6 +37,7 @@ from neeco.scene.deformation import (
     RecordedTimes,
     check_warm_up,
     encode,
+    half_resolved,
     log_linear,
     robust_bounds,
 )
@@ -55,8 +56,8 @@ class TimeMLPSettings:
     """`width` of the network and the octaves `L_mean`, `L_time` as published (None: 10, or 6 where synthetic);
     `synthetic`: the variant for D-NeRF's data; `warm_up`: share of the training over which the network is off;
     `time_noise` at the start, in frame intervals, falling to none at the share `time_noise_stop` of the training;
-    `rate` and `final_rate`: learning rates at its ends; `half`: layers multiply in bfloat16 on a CPU that has it, and a
-    run is started with it where AMX makes it pay."""
+    `rate` and `final_rate`: learning rates at its ends; `half`: layers multiply in bfloat16 on a CPU that has it;
+    None: decided when training starts, by whether this processor is fast at it."""
 
     width: int = 256
     L_mean: int = 10
@@ -67,7 +68,7 @@ class TimeMLPSettings:
     time_noise_stop: float = 0.5
     rate: float = 8e-4
     final_rate: float = 1.6e-6
-    half: bool = False
+    half: bool | None = False
 
     def __post_init__(self) -> None:
         check_warm_up(self.warm_up)
@@ -96,6 +97,11 @@ class TimeMLP(LabelledByMotion):
 
     mean_center: Tensor
     mean_halfwidth: Tensor
+
+    @classmethod
+    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
+        """`settings` with `half` decided: by this processor, or as in those of a run that was `begun`."""
+        return half_resolved(settings, begun)
 
     def __init__(self, instruments: tuple[Instrument, ...], settings: TimeMLPSettings | None = None) -> None:
         super().__init__(instruments, settings)
@@ -166,7 +172,7 @@ class TimeMLP(LabelledByMotion):
                 if index in (0, SKIP + 1):  # the time is the same for all: its columns, the last, are multiplied once
                     timeless = features.shape[1]
                     weight, bias = weight[:, :timeless], bias + weight[:, timeless:] @ encoded_time
-                with bfloat16_products(positions.device, self.settings.half):  # the time, one row, is not
+                with bfloat16_products(positions.device, bool(self.settings.half)):  # the time, one row, is not
                     features = torch.relu(nn.functional.linear(features, weight, bias))
         return self.head(features.float())
 

@@ -12,7 +12,7 @@ from functools import cache, lru_cache
 import torch
 from torch import Tensor
 
-from neeco.errors import NeecoError
+from neeco.errors import NeecoError, memory_failure
 from neeco.raster.triton.ready import missing, require_triton
 
 
@@ -53,7 +53,8 @@ def device_of(word: str, drawing: bool = True) -> torch.device:
 
 
 def device_failure(error: BaseException) -> str | None:
-    """What a CUDA device ended the work with, and what to do, in one line; None: the error is of another kind."""
+    """What a CUDA device, or too little memory, ended the work with, and what to do, in one line; None: the error is of
+    another kind."""
     message = _first_line(error)
     if isinstance(error, torch.cuda.OutOfMemoryError) or re.match("CUDA error: (out of memory|CUBLAS.*ALLOC)", message):
         asked = re.search(r"Tried to allocate ([\d.]+ \w+)", message)
@@ -70,12 +71,13 @@ def device_failure(error: BaseException) -> str | None:
     gpu_messages = ("CUDA error:", "cuDNN error:", "Triton Error [CUDA]:")
     if isinstance(error, accelerator_error) or message.startswith(gpu_messages):
         return f"--device: the GPU gave up ({message}): look at `nvidia-smi` and the system's log, then start again"
-    return None
+    return memory_failure(error)
 
 
 @contextmanager
 def readable_failures() -> Iterator[None]:
-    """Raises NeecoError, one line, where a CUDA device fails in the block (`device_failure`)."""
+    """Raises NeecoError, one line, where a CUDA device fails, or memory is too little, in the block
+    (`device_failure`)."""
     try:
         yield
     except Exception as error:

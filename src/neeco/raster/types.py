@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from neeco.errors import NeecoError
+from neeco.plausible import camera_fault
 from neeco.raster.rotations import as_pose
+
+COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many distortion coefficients OpenCV's models have
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,8 @@ class Camera:
     A pinhole, unless it is given OpenCV's distortion or a round border, black beyond, as an endoscope has. `learned_fx`
     asks that an image of another size than the learned one show the same picture, larger or smaller (see `draw_through`
     in neeco.raster.optics); `Scene.draw` sees to it. The pose may also be given as an array or nested lists, which
-    become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation.
+    become float32 (`as_pose`). Raises NeecoError when it is not 4x4, or given so and no rotation and translation, for a
+    size that is not whole and positive, and for other numbers that are not finite.
 
         neeco.Camera(np.eye(4), fx=290, fy=290, cx=160, cy=128, width=320, height=256)
     """
@@ -144,6 +150,21 @@ class Camera:
     def __post_init__(self) -> None:
         pose = as_pose(self.world_from_camera, "Camera.world_from_camera", torch.float32)
         object.__setattr__(self, "world_from_camera", pose)
+        try:
+            fault = camera_fault(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.near)
+            shown = all(math.isfinite(number) for number in (*self.distortion, *(self.border or ())))
+        except (TypeError, ValueError, OverflowError):
+            raise NeecoError("Camera: expected numbers of px; correct them") from None
+        if fault is not None:
+            raise NeecoError(f"Camera: {fault[0]}; {fault[1]}")
+        if len(self.distortion) not in COEFFICIENTS:
+            raise NeecoError(
+                f"Camera.distortion: has {len(self.distortion)} coefficients; OpenCV has 4, 5, 8, 12 or 14"
+            )
+        if not shown or (self.border is not None and self.border[2] <= 0):
+            raise NeecoError("Camera: distortion, border: must be finite, the radius positive; correct them")
+        object.__setattr__(self, "width", int(self.width))
+        object.__setattr__(self, "height", int(self.height))
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera, its pose and that of its lamps on `device`."""

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from neeco.files import write_atomically
 from neeco.ingest.choices import AXES, OpenPoses, Reading, axis_directions, largest_step, open_poses, shaft_of
-from neeco.ingest.columns import BASE, CAMERA
+from neeco.ingest.columns import BASE
 from neeco.ingest.formats import IMAGES, VideoSource, format_of
 from neeco.report.charts import page_style
 
@@ -61,7 +61,7 @@ def _draw_frames(row: np.ndarray, poses: OpenPoses, reading: Reading, scene: _Sc
     """Three frames with the body's axes on them."""
     for axes in row:
         axes.set_axis_off()
-    row[0].set_title(f"{poses.title}\n{reading.title}", fontsize=9, loc="left")
+    row[0].set_title(f"{poses.title}\n{reading.title}, frame: {poses.frame}", fontsize=9, loc="left")
     if scene is None:
         return
     width, height = scene.video.size
@@ -73,16 +73,17 @@ def _draw_frames(row: np.ndarray, poses: OpenPoses, reading: Reading, scene: _Sc
         if poses.frame == BASE:
             words = "stated in a base's frame"
         else:
-            words = _draw_body(axes, poses.positions[sample], reading.quats[sample], scene)
+            words = f"{_draw_body(axes, poses.positions[sample], reading.quats[sample], scene)}frame: {poses.frame}"
         axes.text(0.02, 0.02, words, transform=axes.transAxes, fontsize=8, color="white", backgroundcolor="#0008")
         axes.set_xlim(-MARGIN * width, (1 + MARGIN) * width)
         axes.set_ylim((1 + MARGIN) * height, -MARGIN * height)
 
 
 def _draw_body(axes: Axes, place: np.ndarray, quat: np.ndarray, scene: _Scene) -> str:
-    """Axes of a body as a camera at the origin sees them (OpenCV's axes); returns where it is, in words."""
+    """Axes of a body as a camera at the origin sees them (OpenCV's axes); returns where it is, in words,
+    where it is not in view."""
     if place[2] <= 0:
-        return f"behind the camera in frame: {CAMERA}"
+        return "behind the camera in "
     start = scene.seen(place)
     for axis, color in enumerate(COLORS):
         point = place + AXIS_SHARE * place[2] * axis_directions(quat[None], axis)[0]
@@ -90,7 +91,7 @@ def _draw_body(axes: Axes, place: np.ndarray, quat: np.ndarray, scene: _Scene) -
         axes.plot(*ends, color="white", linewidth=4)
         axes.plot(*ends, color=color, linewidth=2.2)
     inside = (start >= 0).all() and (start < scene.video.size).all()
-    return f"frame: {CAMERA}" if inside else f"outside the image in frame: {CAMERA}"
+    return "" if inside else "outside the image in "
 
 
 @dataclass(frozen=True)

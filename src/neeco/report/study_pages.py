@@ -230,7 +230,8 @@ def _frame_images(comparison: ComparisonResult, capture: Capture, output: Path) 
             first_seeds.setdefault(job["name"], job["seed"])
     for name, seed in first_seeds.items():
         with open_run(job_folder(output, name, seed)) as run:
-            for index, frame in enumerate(chosen):
+            completed = run.completed(replace(capture, frames=tuple(chosen))).frames
+            for index, frame in enumerate(completed):
                 image = draw(run.scene, frame.state, frame.camera).image.numpy()
                 recorded, counted = frame.load_image(), frame.load_mask()
                 score = psnr(torch.from_numpy(image), recorded, counted)

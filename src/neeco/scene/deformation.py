@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +24,7 @@ FINAL_RATE = 0.03  # of the first rate, at the end (3DGS: 0.01; runs here are sh
 MODULE_FLOOR = 0.3  # of the first rate: joints keep learning to the end
 MEMBERSHIP = "membership"  # the per-Gaussian extra [N] in {0, 1} that `mark_moving` stores
 STILL_MM = 1e-6  # what moves less does not move
-HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": fast_bfloat16()}  # how a training of a network starts
+HALF_BY_DEFAULT: Mapping[str, Any] = {"deformation.half": None}  # decided by `half_resolved` where training starts
 MARKING_STRIDE = 4  # recorded states between those that moving Gaussians are found from
 
 
@@ -50,6 +50,14 @@ class Perturbation:
 
 
 UNPERTURBED = Perturbation()
+
+
+def half_resolved(settings: Any, begun: Any | None) -> Any:
+    """A network's `settings` with `half`, where left open, as the run has it that was `begun` with such settings, or as
+    this processor is fast."""
+    if settings.half is not None:
+        return settings
+    return replace(settings, half=fast_bfloat16() if begun is None else begun.half)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from neeco.capture.lens import Lens
-from neeco.capture.model import Camera, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
+from neeco.capture.model import Camera, Capture, Frame, Instrument, InstrumentState, RecordedStates, State, Tissue
 from neeco.raster.types import Rendering
 
 Skeleton = tuple[tuple[str, str], ...]  # pairs of keypoints' names that a line joins
+FAR_OUT = 2.0  # times the recorded range beyond it, no joint without stated limits goes
 BESIDE = 4  # training frames beside one of which a joint is not known
 
 
@@ -78,18 +79,34 @@ class Recorded:
         """The training frames of each tissue; all of them where there is one."""
         return tuple(self.over(tissue) for tissue in self.tissues) or (self,)
 
+    def completed(self, capture: Capture, instruments: Sequence[Instrument]) -> Capture:
+        """`capture`, of the scene's `instruments`, with the values of joints that neither recording states as they were
+        found at the training frames nearest to each frame."""
+        unstated = {item.name: set(item.unrecorded) for item in capture.instruments}
+        found = [
+            replace(item, unrecorded=tuple(joint for joint in item.unrecorded if joint in unstated[item.name]))
+            for item in instruments
+            if unstated.get(item.name, set()) & set(item.unrecorded)
+        ]
+        if not found or not self.states:
+            return capture
+        worlds = {tissue: self.over(tissue) for tissue in self.tissues}
+        frames = [
+            replace(frame, state=worlds.get(frame.state.tissue or "", self).with_unrecorded(frame.state, found))
+            for frame in capture.frames
+        ]
+        return replace(capture, frames=tuple(frames))
+
     def with_unrecorded(self, state: State, instruments: Sequence[Instrument]) -> State:
-        """A state of the recording with joints that nobody recorded as they were found at the training frames beside
-        it: nearest by pose, then by time."""
-        if not any(item.unrecorded for item in instruments) or not self.states:
+        """A state with the unrecorded joints of `instruments` as they were found at the training frames nearest to it
+        by pose and time, all of one tissue."""
+        if not any(item.unrecorded for item in instruments):
             return state
-        if self.tissues and state.tissue is not None and any(item.tissue != state.tissue for item in self.states):
-            return self.over(state.tissue).with_unrecorded(state, instruments)
         filled = dict(state.instruments)
         for item in instruments:
             if not item.unrecorded or item.name not in filled:
                 continue
-            far = RecordedStates(self.states, [item.name], joints=False).distances(state)
+            far = self._poses[item.name].distances(state)
             far = far + np.abs([state.time - other.time for other in self.states])
             nearest = np.argsort(far, kind="stable")[:BESIDE]
             shares = 1 / (far[nearest] + 1e-6)
@@ -99,6 +116,23 @@ class Recorded:
                 found[joint] = float(np.average(values, weights=shares))
             filled[item.name] = replace(filled[item.name], joints={**filled[item.name].joints, **found})
         return replace(state, instruments=filled)
+
+    @cached_property
+    def _poses(self) -> dict[str, RecordedStates]:
+        """The recorded poses of every instrument."""
+        return {name: RecordedStates(self.states, [name], joints=False) for name in self.states[0].instruments}
+
+    def with_limits(self, instruments: Sequence[Instrument]) -> tuple[Instrument, ...]:
+        """The instruments, joints without stated limits limited to FAR_OUT times the recorded range beyond it."""
+        limited = []
+        for item in instruments:
+            joints = dict(item.joints)
+            for joint in (name for name, limits in joints.items() if limits is None and self.states):
+                values = [float(state.instruments[item.name].joints[joint]) for state in self.states]
+                room = FAR_OUT * (max(values) - min(values))
+                joints[joint] = (min(values) - room, max(values) + room) if room else None
+            limited.append(replace(item, joints=joints))
+        return tuple(limited)
 
     def as_learned(self, camera: Camera) -> Camera:
         """The camera, told what size of images was learned from, unless it says so itself: the focal length of theirs

@@ -19,7 +19,7 @@ from neeco.capture.kinematicsfile import kinematics_of
 from neeco.capture.lensfile import parse_lens
 from neeco.capture.model import Camera, Instrument, InstrumentState, State, share_lamps
 from neeco.errors import NeecoError
-from neeco.files import HALVES, require_like, write_atomically
+from neeco.files import HALVES, finite, require_content, require_like, write_atomically
 from neeco.raster.rotations import rigid_fault
 from neeco.scene.deformation import Deformation
 from neeco.scene.drawable import Learned, Recorded
@@ -41,7 +41,7 @@ HEADER = {  # what every scene's header holds, whatever its method
     "method": str,
     "diagnostics": {},
     "deformation": {},
-    "instruments": [{"name": str, "joints": {str: ([float], None)}}],
+    "instruments": [{"name": str, "joints": {str: ([(float, None)], None)}}],
     "recorded": [{"name": str, "split": str, "time": float, "joints": {str: {str: float}}, "intrinsics": [float]}],
 }
 
@@ -49,7 +49,7 @@ HEADER = {  # what every scene's header holds, whatever its method
 def save_scene(scene: Learned, path: Path) -> None:
     """Write `scene` atomically. The same scene gives the same bytes."""
     tensors, header = pack_scene(scene)
-    save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True)}, path)
+    save_tensors(tensors, {"neeco": json.dumps(header, sort_keys=True, allow_nan=False)}, path)
 
 
 def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Path) -> None:
@@ -67,6 +67,7 @@ def save_tensors(tensors: dict[str, Tensor], metadata: dict[str, str], path: Pat
 def load_scene(path: Path) -> Learned:
     """Read what `save_scene` wrote. Raises NeecoError when absent, damaged or of another schema."""
     path = Path(path)
+    require_content(path)
     if not path.is_file():
         raise NeecoError(f"{path}: no such scene; has training finished?")
     try:
@@ -103,7 +104,7 @@ def pack_scene(scene: Learned) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "schema": SCHEMA,
         "version": __version__,
         "method": scene.method,
-        "diagnostics": scene.diagnostics,
+        "diagnostics": finite(scene.diagnostics),
         "instruments": [_described(instrument) for instrument in scene.instruments],
         "recorded": [
             {
@@ -195,10 +196,11 @@ def _one_of(name: Any, tissues: Sequence[str]) -> str:
 
 def _described(instrument: Instrument) -> dict[str, Any]:
     """For the header; `_instrument` reads it."""
-    described: dict[str, Any] = {"name": instrument.name, "joints": dict(instrument.joints)}
+    described: dict[str, Any] = {"name": instrument.name, "joints": finite(dict(instrument.joints))}
     tree = instrument.kinematics
     described |= {} if tree is None else {"kinematics": tree.to_json()}
-    return described | ({"unrecorded": list(instrument.unrecorded)} if instrument.unrecorded else {})
+    described |= {"unrecorded": list(instrument.unrecorded)} if instrument.unrecorded else {}
+    return described | ({"left_out": list(instrument.left_out)} if instrument.left_out else {})
 
 
 def _instrument(entry: dict[str, Any]) -> Instrument:
@@ -209,7 +211,7 @@ def _instrument(entry: dict[str, Any]) -> Instrument:
     unrecorded = tuple(entry.get("unrecorded", ()))
     if not set(unrecorded) <= set(joints):
         raise ValueError("its unrecorded joints are no joints of it")
-    return Instrument(entry["name"], joints, tree, unrecorded)
+    return Instrument(entry["name"], joints, tree, unrecorded, left_out=tuple(entry.get("left_out", ())))
 
 
 def _number(value: Any) -> float:
@@ -219,14 +221,11 @@ def _number(value: Any) -> float:
 
 
 def _limits(pair: Any) -> tuple[float, float] | None:
-    """Of a joint; an end may be infinite: none there."""
+    """Of a joint; an end may be null: infinite."""
     if pair is None:
         return None
     lower, upper = pair
-    for end in (lower, upper):
-        if not (isinstance(end, float) and math.isinf(end)):
-            _number(end)
-    return lower, upper
+    return -math.inf if lower is None else _number(lower), math.inf if upper is None else _number(upper)
 
 
 def _pose(pose: Tensor, what: str) -> Tensor:

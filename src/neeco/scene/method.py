@@ -81,6 +81,12 @@ class Method:
         return nullcontext() if cls.large_operations else torch_threads(1)
 
     @classmethod
+    def resolved(cls, settings: Any, begun: Any | None = None) -> Any:
+        """The method's `settings` with what is left open to the machine decided: as this one has it, or as the settings
+        of a run that was `begun` elsewhere have it."""
+        return settings
+
+    @classmethod
     def session(
         cls, capture: Capture, views: TrainingViews, settings: Any, length: RunLength, seed: int, scene: Any | None
     ) -> Session:

@@ -208,7 +208,11 @@ class Scene(nn.Module):
         return Shadow(self.canonical.of_instruments, self.shadow_offsets, strengths, self.shadow_width)
 
     def registered(self, state: State) -> State:
-        """`state` with the learned tracker-to-world correction applied to its poses."""
+        """`state` with the learned tracker-to-world correction applied to its poses.
+
+        Raises NeecoError for poses that are not rigid and joints far beyond their limits (see `State.check`).
+        """
+        state.check(self.instruments, fitted=True)
         registration = self.registration
         # a tensor on the device "meta" holds no numbers to ask
         corrects = registration.requires_grad or registration.is_meta or self._corrects(registration)

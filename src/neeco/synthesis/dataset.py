@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import neeco
 from neeco import cluster
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_bytes, read_json, require_inside, write_json
+from neeco.files import own_folder, read_begun, read_bytes, require_same, write_json
 from neeco.labels.annotation import keypoint_names
 from neeco.labels.drawing import REACH
 from neeco.labels.labellers import CLEAR_SHARES, Labeller, ThresholdLabels, instruments_of
@@ -106,7 +106,7 @@ def synthesize(
     settings.check()
     if workers < 1:
         raise NeecoError(f"--workers: {workers} is none at all; give at least 1")
-    if workers > 1 and cluster.address():
+    if cluster.address():
         cluster.require_ray()
     output = Path(output)
     runs = (run, *instrument_runs)
@@ -155,7 +155,7 @@ def _draw_all(
     generator: SampleGenerator, spec: GeneratorSpec, output: Path, missing: list[int], workers: int
 ) -> Iterator[Record]:
     """The records of the missing images, as they are drawn."""
-    if workers > 1 and cluster.address():
+    if cluster.address():
         return draw_on_cluster(spec, output, missing, workers)
     if workers > 1:
         return draw_in_processes(spec, output, missing, workers, max(1, threads() // workers))
@@ -187,16 +187,10 @@ def _digest(run: Run) -> str:
 
 def check_output(output: Path, description: dict[str, Any], resume: bool) -> bool:
     """Whether a data set was begun in `output` in the same way. Raises NeecoError when it may not be written to."""
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give a folder")
-    if is_vacant(output):
+    begun = read_begun(output, INFO, resume, "a data set")
+    if begun is None:
         return False
-    if not resume:
-        raise NeecoError(f"{output}: not empty; give another folder, or --resume to continue a data set begun there")
-    if not (output / INFO).exists():
-        raise NeecoError(f"{output}: not empty and no {INFO} in it; --resume continues only data sets made by neeco")
-    begun = read_json(require_inside(output / INFO, output))
-    if not isinstance(begun, dict) or not isinstance(begun.get("settings"), dict):
+    if not isinstance(begun.get("settings"), dict):
         raise NeecoError(f"{output / INFO}: not the description of a data set; use a new folder")
     settings = Settings.with_new_names(begun["settings"])
     if begun.get("version") in SAME_IMAGES:
@@ -205,9 +199,7 @@ def check_output(output: Path, description: dict[str, Any], resume: bool) -> boo
     # a version that wrote neither of these folders named neither: all its images are drawn anew
     compared += [(key, begun[key], description[key]) for key in ("soft", "ignore") if begun.get(key) is not None]
     compared += [(f"settings.{key}", settings.get(key), value) for key, value in description["settings"].items()]
-    for key, before, now in compared:
-        if before != now:
-            raise NeecoError(f"{output / INFO}: {key}: begun with {before!r}, now {now!r}; use a new folder")
+    require_same(str(output / INFO), compared)
     return True
 
 
@@ -257,15 +249,16 @@ class DataSetFolder:
         instruments, keypoints = instruments_of(names), keypoint_names(self.scene)
         write_states(output, images)
         writers: dict[Format, Callable[[], None]] = {
-            "coco": lambda: write_coco(output, images, instruments, keypoints, self.scene.skeleton()),
+            "coco": lambda: write_coco(output, images, names, keypoints, self.scene.skeleton()),
             "yolo": lambda: write_yolo(output, images, instruments, keypoints),
             "webdataset": lambda: write_webdataset(output, images),
-            "bop": lambda: write_bop(output, images, names),
+            "bop": lambda: write_bop(output, images, self.scene, self.labeller),
             "imagefolder": lambda: write_imagefolder(output, images, instruments),
         }
-        for name in writers:
-            if name in self.formats:
-                writers[name]()
+        # formats of earlier starts, too: their index files would else lack the images made now
+        formats = [*self.formats, *(name for name in writers if name not in self.formats and (output / name).is_dir())]
+        for name in formats:
+            writers[name]()
         if images:
             write_preview(output, images, names, self.scene.skeleton())
         thresholds = self.labeller.thresholds if isinstance(self.labeller, ThresholdLabels) else None
@@ -273,7 +266,7 @@ class DataSetFolder:
             "complete": complete,
             "images": len(images),
             "splits": dict(Counter(record["split"] for record in images)),
-            "formats": list(self.formats),
+            "formats": formats,
             "ids": part_ids(names),
             "keypoints": list(keypoints),
             "depth": {"mm_per_count": DEPTH_MM_PER_COUNT, "none": 0},

@@ -53,7 +53,7 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
     """
-    capture = run.capture() if capture_path is None else read_capture(capture_path)
+    capture = run.capture() if capture_path is None else run.completed(read_capture(capture_path))
     frames = capture.split(split)
     if not frames:
         known = ", ".join(capture.splits) or "none"
@@ -71,7 +71,8 @@ def state_views(scene: Drawable, path: Path) -> list[View]:
     """The states of a JSON-lines file, each from its own camera, or the first recorded one where it has none."""
     first = scene.recorded.cameras[0]
     views = []
-    for k, line in enumerate(read_states(states_file(str(path)), scene.instruments, scene.recorded.tissues)):
+    instruments = scene.recorded.with_limits(scene.instruments)
+    for k, line in enumerate(read_states(states_file(str(path)), instruments, scene.recorded.tissues)):
         camera = first if line.world_from_camera is None else moved_camera(first, line.world_from_camera)
         views.append(View(f"{k:06d}", line.state, camera))
     return views

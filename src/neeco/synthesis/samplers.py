@@ -230,7 +230,7 @@ def _sampler(scene: Scene, states: str, margin: float, view_sampler: ViewSampler
         return Sampler(scene, ExtrapolatedStates(scene.recorded.states, scene.instruments, margin), view_sampler)
     if states == "grid":
         return Sampler(scene, GridStates(scene.recorded.states, instrument_axes(scene)), view_sampler)
-    lines = read_states(states_file(states), scene.instruments, scene.recorded.tissues)
+    lines = read_states(states_file(states), scene.recorded.with_limits(scene.instruments), scene.recorded.tissues)
     if states.startswith(PATH_PREFIX):
         return Sampler(scene, PathStates([line.state for line in lines], count), view_sampler)
     intrinsics = scene.recorded.cameras[0]

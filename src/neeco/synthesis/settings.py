@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from neeco.errors import NeecoError
 from neeco.settings import warn_renamed
@@ -20,6 +20,7 @@ SAMPLERS = ("interpolate", "extrapolate", "grid")  # what `states` may be beside
 RENAMED_SAMPLERS = {"inside": "interpolate", "beyond": "extrapolate"}
 
 MAX_PIXELS = 2**26  # of an image
+JPEG_QUALITY = 95  # of 100, where none is asked for
 
 MIN_TRUST = 0.8  # of a recorded frame's label, below which `annotate` does not write it
 
@@ -75,7 +76,7 @@ class ImageSettings(SizeSettings):
     """Draw with the recording's own distortion and round border, labels too; else undistorted."""
     image_format: ImageFormat = "png"
     """Of the images; labels and depth are PNG always."""
-    quality: int = 95
+    quality: int = JPEG_QUALITY
     """Of JPEG images, 1 to 100."""
 
     def check(self) -> None:
@@ -83,6 +84,8 @@ class ImageSettings(SizeSettings):
         super().check()
         if not 1 <= self.quality <= 100:
             raise NeecoError(f"--quality: {self.quality} is none of JPEG; give 1 to 100")
+        if self.image_format == "png" and self.quality != JPEG_QUALITY:
+            raise NeecoError("--quality: is of JPEG images, and PNG would be written; give --image-format jpg, too")
 
     @property
     def jpeg_quality(self) -> int | None:
@@ -133,7 +136,7 @@ class Settings(ImageSettings):
     min_component: float = 0.01
     """Drop components of an instrument's mask smaller than this share of its largest."""
     tissue_check: bool = True
-    """Refuse states whose instrument enters the tissue, as far as the view shows it."""
+    """States whose instrument enters the tissue, as far as the view shows it, are refused, unless --no-tissue-check."""
     tissue_tolerance_mm: float | None = None
     """How far behind the tissue surface still counts as touching it; found from the recorded states when not given."""
     min_share: float = 0.005
@@ -153,6 +156,15 @@ class Settings(ImageSettings):
     def check(self) -> None:
         """Raises NeecoError naming the option that makes no sense."""
         super().check()
+        for option, number in (("count", self.count), ("seed", self.seed), ("max-attempts", self.max_attempts)):
+            if not math.isfinite(number) or number != int(number):
+                raise NeecoError(f"--{option}: {number} is not a whole number; give one")
+        if self.views not in get_args(Views):
+            raise NeecoError(f"--views: {self.views!r} is none; give one of {', '.join(get_args(Views))}")
+        if not 0 <= self.margin < math.inf:
+            raise NeecoError(f"--margin: {self.margin} is not a share of the recorded range; give 0 or more")
+        if not 0 <= self.min_share <= 1:
+            raise NeecoError(f"--min-share: {self.min_share} is not a share; give 0 to 1")
         if self.count < 1:
             raise NeecoError(f"--count: {self.count} images is nothing to make; give at least 1")
         if self.seed < 0:

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import itertools
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -260,7 +261,8 @@ class StoredImages(Dataset[Sample]):
     """A map-style data set of the images in a folder that `neeco synthesize` or `neeco annotate` wrote.
 
     Samples have the same keys as those of `LabelledImages`, and the pixels and numbers of the files. split: train, val,
-    or None for both. Raises NeecoError for a folder that is no such data set, and for a file that is damaged.
+    or None for both. Raises NeecoError for a folder that is no such data set, a split without images, and a damaged
+    file.
 
         images = neeco.StoredImages("dataset", split="train")
         loader = torch.utils.data.DataLoader(images, batch_size=2, num_workers=2, collate_fn=images.collate)
@@ -280,6 +282,9 @@ class StoredImages(Dataset[Sample]):
         self._ignored = info["ignore"]["ignored"]
         records = read_public_records(self.folder)
         self._records = [record for record in records if split in (None, record["split"])]
+        if not self._records:
+            found = ", ".join(f"{name!r} ({count})" for name, count in Counter(r["split"] for r in records).items())
+            raise NeecoError(f"{self.folder}: split {split!r} has no images; it has {found or 'none'}")
 
     def __len__(self) -> int:
         return len(self._records)

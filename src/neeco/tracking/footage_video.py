@@ -11,7 +11,7 @@ import torch
 from neeco.capture.model import Capture
 from neeco.capture.reader import read_capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, read_json, write_json
+from neeco.files import is_vacant, read_json, require_content, write_json
 from neeco.ingest.pipeline import ingest
 from neeco.ingest.recordingfile import recording_from_flags
 from neeco.ingest.result import IngestResult
@@ -33,6 +33,7 @@ def read_footage(path: Path, output: Path, scene: Scene, resume: bool, report: R
     path = Path(path)
     if not path.is_file():
         return read_capture(path)
+    require_content(path)
     capture_folder = output / FOOTAGE
     with path.open("rb") as stream:
         source = {"video_sha256": hashlib.file_digest(stream, "sha256").hexdigest()}

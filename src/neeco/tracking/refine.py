@@ -11,15 +11,15 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from neeco.capture.model import Capture, Frame
 from neeco.capture.reader import read_capture
-from neeco.capture.writer import write_capture
+from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import is_vacant, own_folder, read_bytes, read_json
+from neeco.files import own_folder, read_begun, read_bytes, read_json, require_same, write_json
 from neeco.scene import Scene
 from neeco.scene.scene import gaussian_scene, one_tissue
 from neeco.settings import with_fields
@@ -31,7 +31,9 @@ from neeco.training.train import ShowRow, train
 if TYPE_CHECKING:
     from neeco.training.run import Run
 
+SCHEMA = "neeco-refined/1"
 CAPTURE, RUN = "capture", "run"  # folders of the output
+BEGUN = "refined.json"  # in it: what is refined by what
 NEAR = (2.0, 2.0, 4.0)  # deg, mm, deg of joints: how far recorded states may be off
 STAGING = "images"
 
@@ -49,16 +51,24 @@ def refine_run(
     """Train again on the run's own frames and on those of captures that `track` made over its tissue; returns the run.
 
     Writes `CAPTURE`, all these frames, and `RUN`, trained on it as the run was, into the folder `output`. Raises
-    NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`).
+    NeecoError for captures of other instruments or tissue, and an `output` that is not empty (without `resume`) or was
+    begun otherwise.
     """
     folder = output / CAPTURE
-    if not resume and not is_vacant(output):
-        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on in it")
+    content = read_bytes(Path(run.path) / "scene.safetensors", "a learned scene", "no such file; train the run first")
+    info: dict[str, Any] = {
+        "schema": SCHEMA,
+        "scene_sha256": hashlib.sha256(content).hexdigest(),
+        "captures_sha256": [fingerprint(read_capture(path)) for path in tracked],
+    }
+    if (begun := read_begun(output, BEGUN, resume, "a refinement")) is not None:
+        require_same(str(output / BEGUN), ((key, begun.get(key), value) for key, value in info.items()))
     if not (folder / "transforms.json").exists():
         scene, own = gaussian_scene(run.scene, "refine"), run.capture()
         one_tissue(scene, "refine")
         frames = [frame for path in tracked for frame in _tracked_frames(path, scene)]
         with own_folder(output):
+            write_json(output / BEGUN, info)
             own, frames = without_twice(own, frames)
             recorded = fitted(scene, own, on_progress)
             merged = replace(own, frames=(*recorded, *_named_apart(frames, output / STAGING)))

@@ -24,7 +24,7 @@ from neeco.capture.model import Capture, Frame, InstrumentState, State
 from neeco.capture.reader import read_capture
 from neeco.capture.writer import fingerprint, write_capture
 from neeco.errors import NeecoError
-from neeco.files import LOCK, is_vacant, own_folder, read_bytes, read_json, require_inside, require_like, write_json
+from neeco.files import LOCK, own_folder, read_begun, read_bytes, read_json, require_like, require_same, write_json
 from neeco.scene import Recorded
 from neeco.scene.io import load_scene, save_scene
 from neeco.scene.scene import gaussian_scene, one_tissue
@@ -147,7 +147,8 @@ def track_footage(
             info = stored
             if tissue == "footage":
                 scene = gaussian_scene(load_run(output / RUN, scene.center.device).scene, "track")
-        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust)
+        registered = trained_on.registered or tissue == "footage"
+        written = _write(output, footage, scene, trained_on, frames, info["frames"], min_trust, registered)
         if tissue == "footage" and not stored.get("complete"):
             _write_run(output, run, scene)
         write_json(output / INFO, info)
@@ -320,8 +321,9 @@ def _write(
     frames: Sequence[Frame],
     records: Sequence[dict[str, Any]],
     min_trust: float,
+    registered: bool,
 ) -> int:
-    """Write the trusted frames as a capture; how many there are."""
+    """Write the trusted frames as a capture, whose states tell every joint; how many there are."""
     chosen = tuple(
         replace(frame, state=state_of(record))
         for frame, record in zip(frames, records, strict=True)
@@ -329,11 +331,10 @@ def _write(
     )
     if chosen:
         points = footage.points if footage.points.measured else trained_on.points
-        write_capture(
-            Capture(output, chosen, scene.instruments, points, timed=footage.timed, lens=footage.lens),
-            output,
-            overwrite=True,
-        )
+        instruments = tuple(replace(item, unrecorded=()) for item in scene.instruments)
+        # whatever else is known of the footage (its lens, a scope that stands still) holds for what is kept of it
+        made = replace(footage, frames=chosen, instruments=instruments, points=points, registered=registered)
+        write_capture(made, output, overwrite=True)
     return len(chosen)
 
 
@@ -355,20 +356,10 @@ def _first_state(footage: Capture, frame: Frame, scene: Scene) -> State:
 
 def _check_output(output: Path, info: dict[str, Any], resume: bool) -> None:
     """Raises NeecoError when `output` may not be written to."""
-    if output.exists() and not output.is_dir():
-        raise NeecoError(f"{output}: is a file; give a folder")
-    if is_vacant(output) or {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
+    if output.is_dir() and {entry.name for entry in output.iterdir()} <= {FOOTAGE, LOCK}:
         return
-    if not resume:
-        raise NeecoError(f"{output}: not empty; give another folder, or --resume to go on with footage tracked there")
-    file = output / INFO
-    if not file.exists():
-        raise NeecoError(
-            f"{output}: not empty and no {INFO} in it; --resume goes on only with footage that was tracked"
-        )
-    begun = read_json(require_inside(file, output))
-    if not isinstance(begun, dict):
-        raise NeecoError(f"{file}: not as neeco writes it; use a new folder")
-    for key in ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust"):
-        if begun.get(key) != info[key]:
-            raise NeecoError(f"{file}: {key}: begun with {begun.get(key)!r}, now {info[key]!r}; use a new folder")
+    begun = read_begun(output, INFO, resume, "tracked footage")
+    if begun is None:
+        return
+    keys = ("schema", "version", "scene_sha256", "captures_sha256", "start", "tissue", "min_trust")
+    require_same(str(output / INFO), ((key, begun.get(key), info[key]) for key in keys))

@@ -8,6 +8,7 @@ import math
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
@@ -20,6 +21,18 @@ from neeco.training.resolution import ResolutionConfig, size_factor
 from neeco.training.schedule import Part, ScheduleConfig
 
 ADJUSTED = "+dta"  # METHOD+dta: the method with the paper's dynamic training adjustment
+FLAGS = (  # fields that `neeco train` has a flag for; the others are set by --set
+    "iterations",
+    "method",
+    "batch_size",
+    "minutes",
+    "seed",
+    "transforms",
+    "scale",
+    "joints",
+    "max_tissue_gaussians",
+    "max_instrument_gaussians",
+)
 LOG_INTERVAL = 50
 REMOVED_GROUPS = ("search",)  # of settings that config.yaml of version 0.2 and older has; no longer settings
 TISSUE_GAUSSIANS, INSTRUMENT_GAUSSIANS = 20_000, 4_000  # at most, for images of 320x256
@@ -180,16 +193,20 @@ def schedule_parts() -> tuple[str, ...]:
     return tuple(name for name, kind in typing.get_type_hints(ScheduleConfig).items() if kind == Part)
 
 
-def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[str] = ()) -> TrainConfig:
-    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment), changed by
-    `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields). A preset of the method
-    that `assignments` name comes before all of them.
+def training_config(
+    name: str | None, values: Mapping[str, Any], assignments: Sequence[str] = (), begun: TrainConfig | None = None
+) -> TrainConfig:
+    """The defaults of a method or of its variant METHOD+dta (with the paper's dynamic training adjustment; None: the
+    default method), changed by `values` that are not None, then by NAME=VALUE `assignments` (dots reach nested fields).
+    A preset of the method that `assignments` name comes before all of them. begun: the settings of a run to be resumed,
+    which then stand in place of the defaults.
 
     Raises NeecoError naming the option when a name is unknown or a value does not fit, and for an unknown method or
     variant, or one that is the method itself.
     """
     given = {field: value for field, value in values.items() if value is not None}
-    config: TrainConfig = with_fields(_with_preset(_variant_defaults(name), assignments), given)
+    base = _variant_defaults(name or DEFAULT) if begun is None else _resumed(begun, name)
+    config: TrainConfig = with_fields(_with_preset(base, assignments), given)
     _check_length(config)
     changed = config_to_dict(config)
     for assignment in assignments:
@@ -200,6 +217,45 @@ def training_config(name: str, values: Mapping[str, Any], assignments: Sequence[
         raise NeecoError(f"--set: {error}") from None
     check_ranges(config)
     return config
+
+
+def _resumed(begun: TrainConfig, name: str | None) -> TrainConfig:
+    """The settings of a run that was `begun`, or where they contradict the method called `name`, that method's."""
+    if name is None:
+        return begun
+    defaults = _variant_defaults(name)
+    parts = {f"schedule.{part}": getattr(defaults.schedule, part) for part in schedule_parts()}
+    if defaults.method != begun.method:
+        shared = {field: getattr(begun, field) for field in FLAGS if field != "method"}
+        changed: TrainConfig = with_fields(defaults, shared)
+    else:
+        adjusted = all(getattr(begun.schedule, part) == "on" for part in schedule_parts())
+        contradicts = name.endswith(ADJUSTED) or (adjusted and not set(parts.values()) <= {"on"})
+        changed = with_fields(begun, parts if contradicts else {})
+    return changed
+
+
+def require_begun_with(begun: TrainConfig, now: TrainConfig, output: Path) -> None:
+    """Raise NeecoError where settings `now` contradict those that the run in `output` was begun with. None contradicts
+    nothing."""
+    before, after = _flat(config_to_dict(begun)), _flat(config_to_dict(now))
+    names = [*FLAGS, *(name for name in after if name not in FLAGS and begun.method == now.method)]
+    differing = []
+    for name in (name for name in names if after[name] is not None and after[name] != before.get(name)):
+        flag = f"--{name.replace('_', '-')} {after[name]}" if name in FLAGS else f"--set {name}={after[name]}"
+        old = "without" if before.get(name) is None else f"with {before[name]}"
+        differing.append(f"{flag}: the run was begun {old}")
+    if differing:
+        them = "it" if len(differing) == 1 else "them"
+        raise NeecoError(f"{'; '.join(differing)}; leave {them} out to continue {output}, or give another --output")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as one, by dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
 
 
 def _with_preset(config: TrainConfig, assignments: Sequence[str]) -> TrainConfig:

@@ -109,11 +109,13 @@ def _learned_instrument(
             )
         unrecorded = tuple(joint for joint in instrument.unrecorded if joint in tree.readings)
         stated = {reading: instrument.joints[reading] for reading in tree.readings}
-        return replace(instrument, joints=stated, unrecorded=unrecorded)
+        left_out = tuple(sorted(set(instrument.joints) - set(stated)))
+        return replace(instrument, joints=stated, unrecorded=unrecorded, left_out=left_out)
     joints = moving_joints(instrument, frames, config, report)
     if config.joints is None:
         joints = method.learned_joints(instrument, joints, frames, config.deformation, report)
-    return Instrument(instrument.name, {joint: instrument.joints[joint] for joint in joints})
+    learned = {joint: instrument.joints[joint] for joint in joints}
+    return Instrument(instrument.name, learned, left_out=tuple(sorted(set(instrument.joints) - set(learned))))
 
 
 def moving_joints(

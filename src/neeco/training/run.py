@@ -19,7 +19,7 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, write_text
+from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, require_utf8, write_text
 from neeco.scene.drawable import Learned
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.training_session import Session, StepResult, members
@@ -40,12 +40,16 @@ class Run:
     config: dict[str, Any]
 
     def capture(self) -> Capture:
-        """The capture it was trained on. Raises NeecoError when it has moved."""
+        """The capture it was trained on, `completed`. Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / "config.yaml"
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
-        return read_capture(root, self.config["transforms"])
+        return self.completed(read_capture(root, self.config["transforms"]))
+
+    def completed(self, capture: Capture) -> Capture:
+        """`capture` with joints that nobody recorded as training found them: what is drawn of its frames."""
+        return self.scene.recorded.completed(capture, self.scene.instruments)
 
 
 def load_run(path: Path, device: torch.device | None = None) -> Run:
@@ -70,6 +74,7 @@ def open_run(path: Path, device: torch.device | None = None) -> Iterator[Run]:
 def read_config(path: Path) -> dict[str, Any]:
     """config.yaml of run folder `path`, checked."""
     path = Path(path)
+    require_utf8(path)
     file = path / "config.yaml"
     if not path.is_dir():
         raise NeecoError(f"{path}: no such run folder; make one with `neeco train CAPTURE --output {path}`")
@@ -104,6 +109,11 @@ def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
             f"{file}: capture: {root} has changed since this run was begun; put its files back as they were, or give "
             "another --output"
         )
+
+
+def begun_config(path: Path) -> TrainConfig | None:
+    """The settings of the run that was begun in `path`, finished or not; None where none was. Raises NeecoError."""
+    return stored_config(path, read_config(path)) if (path / "config.yaml").exists() else None
 
 
 def stored_config(path: Path, stored: Mapping[str, Any]) -> TrainConfig:
@@ -142,7 +152,7 @@ def save_checkpoint(session: Session, run: Path) -> None:
         "seconds": session.seconds,
         "window": [[step.loss, step.psnr] for step in session.window],
     }
-    metadata = {"neeco": json.dumps(header | fields)}
+    metadata = {"neeco": json.dumps(header | fields, allow_nan=False)}
     save_tensors(
         {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata, checkpoint_path(run)
     )

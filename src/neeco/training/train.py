@@ -25,7 +25,7 @@ from neeco.scene.io import pack_scene, save_scene
 from neeco.scene.method_registry import method_class, unmet_need
 from neeco.scene.training_session import Session, StepResult
 from neeco.scene.training_views import TrainingViews, mean_pixels
-from neeco.training.config import TrainConfig
+from neeco.training.config import TrainConfig, require_begun_with
 from neeco.training.initial import begin_session
 from neeco.training.run import (
     checkpoint_path,
@@ -78,26 +78,30 @@ def train(
 
     `capture`: what `read_checked` returned for the path, where it was read already. A run must be resumed on the kind
     of device it was begun on. Writes config.yaml, metrics.jsonl, checkpoint/ while running and scene.safetensors at the
-    end. `resume` continues an interrupted run under the settings it was started with. The same seed gives the same
-    scene on a CPU, interrupted or not, unless `minutes` is set: minutes of `clock` (s; time.process_time counts CPU
-    time), without the time of `watch`. Raises NeecoError for a capture that `neeco check` refuses, a non-empty
-    `output` without `resume`, or a loss that is not finite.
+    end. `resume` continues an interrupted run under the settings it was started with, which `config` must not
+    contradict. The same seed gives the same scene on a CPU, interrupted or not, unless `minutes` is set: minutes of
+    `clock` (s; time.process_time counts CPU time), without the time of `watch`. Raises NeecoError for a capture that
+    `neeco check` refuses, a non-empty `output` without `resume`, other settings or another capture than the run was
+    begun with, or a loss that is not finite.
 
     SIGINT or SIGTERM ends the run between two steps with a checkpoint, a second one at once; either way the message of
     KeyboardInterrupt says how to resume. A failure before the first step leaves no run folder behind.
     """
     capture_path, output = Path(capture_path), Path(output)
     if resume and (output / "config.yaml").exists():
-        config = _stored_config(output, capture_path)
-        if (output / "scene.safetensors").exists():
-            with own_folder(output):  # removes temporary files of a process killed after its last step
-                return output
+        begun = _stored_config(output, capture_path)
+        require_begun_with(begun, config, output)
+        config = begun
     elif not is_vacant(output):
         raise NeecoError(f"{output}: not empty; give another --output, or --resume to continue the run in it")
+    config = replace(config, deformation=method_class(config.method).resolved(config.deformation))
     capture = read_checked(capture_path, config.transforms) if capture is None else capture
     digest = fingerprint(capture)
     if resume:
         require_same_capture(output, capture.root, digest)
+        if (output / "scene.safetensors").exists():
+            with own_folder(output):  # removes temporary files of a process killed after its last step
+                return output
     frames = _training_frames(capture, capture_path, config)
     log = _Log(output / "metrics.jsonl", progress, watch, clock)
     go_on = f"go on with: neeco train {shlex.quote(str(capture_path))} --output {shlex.quote(str(output))} --resume"
@@ -286,7 +290,7 @@ class _Log:
         entry = {key: value for key, value in vars(self.last).items() if key != "note"}
         try:
             with self.path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(entry) + "\n")
+                stream.write(json.dumps(entry, allow_nan=False) + "\n")
         except OSError as error:
             raise NeecoError(f"{self.path}: cannot write: {error.strerror or error}") from error
         if self.progress:

@@ -141,6 +141,8 @@ class WatchedRun:
         if self.device is not None:
             scene = scene.to(self.device)
         capture, trouble = _read_capture_of(config)
+        if capture is not None:
+            capture = scene.recorded.completed(capture, scene.instruments)
         tissues, scene = scene.recorded.tissues, cast(Learned, over_one(scene, self.tissue))
         if capture is not None and len(tissues) > 1:
             capture = capture.over(scene.recorded.tissues[0])

@@ -23,7 +23,7 @@ from neeco.errors import NeecoError
 from neeco.experiments.downstream import models
 from neeco.experiments.downstream.samples import BatchSampler, Example, Sample
 from neeco.experiments.downstream.scores import Prediction, validation_score
-from neeco.files import write_atomically
+from neeco.files import placeholder, write_atomically
 from neeco.registry import named_classes
 
 WEIGHTS_FILE = "weights.safetensors"
@@ -219,6 +219,8 @@ def to_input(images: Sequence[np.ndarray], task: TrainingTask) -> Tensor:
 def load_weights(module: nn.Module, path: Path) -> None:
     """Take what fits from a safetensors file: tensors of a name and shape that the module has. Raises NeecoError for a
     file that cannot be read, or of which less than half of the module's tensors are found."""
+    if problem := placeholder(path):
+        raise NeecoError(f"--weights: {path}: {problem}")
     try:
         stored = load_file(path)
     except (OSError, SafetensorError) as error:

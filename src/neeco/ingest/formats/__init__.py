@@ -12,7 +12,7 @@ import importlib.util
 import sys
 from abc import ABC
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import ClassVar
@@ -22,12 +22,14 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
+from neeco.ingest.frames import NamedFrame
 from neeco.registry import named_classes
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "missing", "oov", "-", "--"}
 # NDI trackers write -3.697314e28 where there is no measurement; nothing a recording holds is this large
 HUGE = 1e20
 MAX_LISTED = 3  # lines named in a message
+MAX_UNLIKE = 0.1  # share by which a video may be longer or shorter than the states of its images
 DELIMITED = (".csv", ".tsv", ".txt")
 
 
@@ -35,9 +37,10 @@ DELIMITED = (".csv", ".tsv", ".txt")
 class Table:
     """What a log file, or one stream of it, holds. header: column names, all different; rows: cells, stripped, of which
     a row may have more or fewer than the header, or numbers [R, C], NaN where missing; lines: int64 [R] the file's line
-    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; frame: what poses are
-    stated in, CAMERA or BASE, where the file says it, stated_in: by the file's own name; notes: what reading it changed
-    or left out, in words; asks_frame: must the recording say the frame where the file does not?"""
+    (or record) of each row, from 1; stream: which of the file's; record: what a row is called; stated_in: the
+    file's own name of the frame that poses are stated in, meaning: what that says (None: nothing, taken as a base);
+    notes: what reading it changed or left out, in words; image_hz: images a second of the video, where every row is the
+    state of one of its images; None: rows have times of their own."""
 
     path: Path
     header: tuple[str, ...]
@@ -46,10 +49,15 @@ class Table:
     decimal_comma: bool = False
     stream: str | None = None
     record: str = "line"
-    frame: str | None = None
     stated_in: str | None = None
+    meaning: NamedFrame | None = None
     notes: tuple[str, ...] = ()
-    asks_frame: bool = False
+    image_hz: float | None = None
+
+    @property
+    def frame(self) -> str | None:
+        """What poses are stated in, BASE or a camera's frame (`frames.CAMERA_FRAMES`), where the file says it."""
+        return None if self.meaning is None else self.meaning.frame
 
     @property
     def where(self) -> str:
@@ -94,13 +102,14 @@ class Stream:
 
 @dataclass(frozen=True)
 class VideoSource:
-    """Frames with their times. size: (width, height) px; notes: what could not be read, in words; times [N] s,
-    increasing, of a video from its first frame."""
+    """Frames with their times. size: (width, height) px, as stored; notes: what could not be read, in words; times [N]
+    s, increasing, of a video from its first frame; pixel_aspect: width of a stored pixel by its height."""
 
     path: Path
     size: tuple[int, int]
     notes: tuple[str, ...]
     times: np.ndarray
+    pixel_aspect: float = field(default=1.0, kw_only=True)
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
@@ -196,6 +205,29 @@ def choose_stream(path: Path, streams: Sequence[Stream], wanted: str | None, kin
         kind = f"{found.type}, not {' or '.join(kinds)}"
         raise NeecoError(f"{path}: stream: {printable(wanted)} is {kind}; name one of {listed}")
     return found
+
+
+def compare_counts(
+    file: Path, images: int, rows: int, noun: str, unlike: float = 0.0, remedy: str = "give the whole video of this log"
+) -> tuple[str, ...]:
+    """A note where images and the rows of a log that belong to them one by one are not equally many.
+
+    file: of the images; noun: what a row is; unlike: share by which the numbers may differ, beside one. Raises
+    NeecoError, with the remedy, when they differ by more.
+    """
+    found = f"has {images} images for {rows} {noun}"
+    if abs(images - rows) > unlike * rows + 1:
+        raise NeecoError(f"{file}: {found}; they do not belong together: {remedy}")
+    return () if images == rows else (f"{file.name}: {found}; both are taken to begin together",)
+
+
+def compare_lengths(file: Path, video: VideoSource, rows: int, image_hz: float) -> tuple[str, ...]:
+    """`compare_counts` of states that are one for every image of a video of `image_hz` images a second, whatever rate
+    it has now."""
+    shown = round(float(video.times[-1] - video.times[0]) * image_hz) + 1
+    is_rate = shown != rows and abs(len(video.times) - rows) <= 1
+    remedy = f"as it has {len(video.times)}, say `fps: {image_hz:g}` of it" if is_rate else "give the video of this log"
+    return compare_counts(file, shown, rows, f"states at {image_hz:g} a second", MAX_UNLIKE, remedy)
 
 
 def numbers(table: Table, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[tuple[int, str]]]:

@@ -29,7 +29,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
+from neeco.files import parse_yaml, read_text, require_content, visible_entries
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -123,6 +123,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """A bag for the block: a ROS 1 `.bag`, a ROS 2 folder, or one `.mcap` or `.db3` of it. Raises NeecoError when it
     cannot be read, as `Bag.messages` does."""
     suffix = path.suffix.lower()
+    for file in visible_entries(path) if path.is_dir() else [path]:
+        require_content(file)
     with ExitStack() as stack:
         with _damage_named(path):
             compressed = False

@@ -13,7 +13,7 @@ import numpy as np
 
 from neeco.capture.documents import as_float, printable
 from neeco.errors import NeecoError
-from neeco.files import read_json, require_inside
+from neeco.files import read_json, require_content, require_inside, visible_entries
 
 INFO = "meta/info.json"
 EPISODES_2 = "meta/episodes.jsonl"
@@ -153,7 +153,7 @@ class DataSet:
         file = self.path / EPISODES_2
         if not file.is_file():
             raise NeecoError(f"{file}: no such file; download it, too")
-        require_inside(file, _boundary(self.path))
+        require_content(require_inside(file, _boundary(self.path)))
         with file.open("rb") as stream:
             line = 0
             while text := stream.readline(MOST_LINE):
@@ -173,7 +173,7 @@ class DataSet:
 
     def _rows(self, number: int | None) -> Iterator[dict[str, Any]]:
         folder = self.path / EPISODES_3
-        files = sorted(folder.glob("chunk-*/*.parquet"))
+        files = visible_entries(folder, "chunk-*/*.parquet")
         if not files:
             raise NeecoError(f"{folder}: holds no Parquet file of episodes; download it, too")
         columns = ["episode_index", "length"]
@@ -221,6 +221,7 @@ class ParquetFile:
     def __init__(self, path: Path) -> None:
         import pyarrow.parquet
 
+        require_content(path)
         self.path = path
         with self._reading():
             # a buffer: else all of a column is taken into memory, and images can stand in it

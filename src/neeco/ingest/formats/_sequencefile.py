@@ -17,6 +17,7 @@ import numpy as np
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
+from neeco.files import require_content
 from neeco.ingest.formats import VideoSource
 
 META, NRRD = (".mha", ".mhd"), (".nrrd", ".nhdr")
@@ -198,6 +199,7 @@ def _checked(header: _Header, sequence: FrameSequence) -> FrameSequence:
     if sequence.channels not in (1, 3):
         raise NeecoError(f"{sequence.path}: has {sequence.channels} channels; export grey or RGB images")
     file, start = sequence.data
+    require_content(file)
     try:
         held = file.stat().st_size - start
     except OSError as error:

@@ -9,17 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA, PoseColumns
+from neeco.ingest.columns import BASE, PoseColumns
 from neeco.ingest.formats import Table
 from neeco.ingest.formats._bagsurvey import Survey
+from neeco.ingest.frames import meaning_of, of_dvrk
 from neeco.ingest.interpolate import poses_at
 from neeco.ingest.logs import NORM_TOLERANCE, read_pose_log
 
 CHAIN_HEADER = ("t_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 
 
-def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
-    """Poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves."""
+def chained(survey: Survey, stream: str, images: set[str]) -> Table:
+    """Poses of `tf:CHILD in FRAME`, at the times of the child's nearest transform that moves. images: frames of the
+    bag's images."""
     child, word, frame = stream.removeprefix("tf:").partition(" in ")
     where = f"{survey.path}: {stream}"
     known = {name.removeprefix("tf:") for name in survey.poses if name.startswith("tf:")}
@@ -49,8 +51,24 @@ def chained(survey: Survey, stream: str, cameras: set[str]) -> Table:
     rows = np.column_stack([seconds, frame_from_child[:, :3, 3], quats])
     return Table(
         survey.path, CHAIN_HEADER, rows, np.arange(1, len(rows) + 1), stream=stream, record="message",
-        frame=CAMERA if frame in cameras else None, stated_in=frame,
+        stated_in=frame, meaning=meaning_of(frame, images, dvrk=of_dvrk(child)),
     )  # fmt: skip
+
+
+def fixed_transform(survey: Survey, child: str, frame: str) -> np.ndarray | None:
+    """[4, 4] mm frame_from_child where static transforms join the two; None elsewhere."""
+    try:
+        ups, downs = (_to_root(survey, str(survey.path), name) for name in (child, frame))
+        while ups and downs and ups[-1] == downs[-1]:
+            ups.pop()
+            downs.pop()
+        ends = [_parent(survey, "", edges[-1]) if edges else name for edges, name in ((ups, child), (downs, frame))]
+    except NeecoError:
+        return None
+    if ends[0] != ends[1] or not all(survey.poses[f"tf:{edge}"].static for edge in (*ups, *downs)):
+        return None
+    once = np.zeros(1)
+    return np.asarray((np.linalg.inv(_composed(survey, downs, once)) @ _composed(survey, ups, once))[0])
 
 
 def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.ndarray:
@@ -66,7 +84,9 @@ def _composed(survey: Survey, edges: Sequence[str], seconds: np.ndarray) -> np.n
             pose[:3, 3] = 1000 * values[:3]
             poses = np.tile(pose, (len(seconds), 1, 1))
         else:
-            poses, _ = poses_at(read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}")), seconds, 0.0)
+            # as it stands, whatever its parent's axes: those of the last frame alone matter
+            log_of_edge = read_pose_log(PoseColumns(survey.path, stream=f"tf:{edge}", frame=BASE))
+            poses, _ = poses_at(log_of_edge, seconds, 0.0)
         total = poses @ total
     return total
 

@@ -17,8 +17,7 @@ import numpy as np
 from neeco.capture.documents import printable
 from neeco.capture.images import open_image
 from neeco.errors import NeecoError
-from neeco.files import read_json
-from neeco.ingest.columns import CAMERA
+from neeco.files import read_json, visible_entries
 from neeco.ingest.formats import (
     IMAGES,
     POSES,
@@ -28,10 +27,12 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_counts,
     numbers,
 )
 from neeco.ingest.formats.delimited import DelimitedText
-from neeco.ingest.formats.rosbag import DVRK_CAMERA, POSE_HEADER, RosBag
+from neeco.ingest.formats.rosbag import POSE_HEADER, RosBag
+from neeco.ingest.frames import meaning_of
 from neeco.ingest.video import open_video
 
 INDEX, TYPES = "index.json", ("dc_index_v1", "dc::index@", "dvrk_data:index@")
@@ -76,7 +77,7 @@ class DvrkSession(RecordingFormat):
 
     def streams(self, path: Path) -> tuple[Stream, ...]:
         films, found = _films(path), []
-        if not films and any(path.glob("*.mp4")):
+        if not films and visible_entries(path, "*.mp4"):
             raise NeecoError(f"{path}: nothing says the times of its videos' frames; give the session's own folder")
         # the left camera's are the frames; others are listed
         for number, name in enumerate(sorted(films, key=lambda name: ("right" in name, "left" not in name, name))):
@@ -122,16 +123,14 @@ class DvrkSession(RecordingFormat):
             return _Files(path, open_image(files[0]).size, tuple(notes), times[keep] - start, files)
         video = open_video(film.files[0])
         count = len(video.times)
-        if abs(count - len(times)) > UNLIKE * len(times) + 1:
-            raise NeecoError(f"{film.files[0]}: has {count} frames, and times of {len(times)}; give the whole video")
-        if count != len(times):
-            notes.append(f"{name}: {count} frames and {len(times)} times; the last ones are left out")
+        notes += compare_counts(film.files[0], count, len(times), "times", UNLIKE)
         usable = np.flatnonzero(keep[:count])
         width, height = video.size
         size = (width if film.half is None else width // 2, height)
         return _Timed(
-            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half
-        )
+            path, size, (*video.notes, *notes), times[usable] - start, video, tuple(usable.tolist()), film.half,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -209,7 +208,7 @@ def _list(document: Any, name: str) -> list[Any]:
 
 def _stamped_files(path: Path) -> dict[str, _Film]:
     found: dict[str, list[tuple[float, Path]]] = {}
-    for file in path.iterdir():
+    for file in visible_entries(path):
         if match := _STAMPED.fullmatch(file.name):
             found.setdefault(match["name"], []).append((float(match["time"]), file))
     films = {}
@@ -239,8 +238,7 @@ def _bag(path: Path) -> Path | None:
 
 def _tables_in(path: Path) -> list[Path]:
     """CSV files of an extract: of this folder, else of the session's first."""
-    here = sorted(path.glob("*.csv"))
-    return here or sorted((path / EXTRACTED / "full_session").glob("*.csv"))
+    return visible_entries(path, "*.csv") or visible_entries(path / EXTRACTED / "full_session", "*.csv")
 
 
 def _topics(path: Path) -> dict[str, Path]:
@@ -275,8 +273,13 @@ def _stream(topic: str, kind: str, columns: list[str], table: Table) -> Stream:
     match = (_POSES if kind == POSES else _JOINTS).fullmatch(topic)
     body = match[1] if match else None
     if kind == POSES:
+        stated_in = _frames(table)
+        meaning = meaning_of(stated_in[0] if len(stated_in) == 1 else "", dvrk=True)
         hints = ("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit",)
-        return Stream(topic, POSES, "poses", len(table.rows), None, match is not None, body, None, hints)
+        return Stream(
+            topic, POSES, "poses", len(table.rows), None, match is not None, body, None, (*meaning.hints, *hints),
+            asks=meaning.asks,
+        )  # fmt: skip
     names = _joint_names(table, columns)
     wrist = [(known, _joint_column(name)) for known in _WRIST for name in names if name.endswith(known)]
     if "/jaw/" in topic and len(names) == 1:
@@ -301,19 +304,8 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     if set(when) <= set(table.header):
         stamps = numbers(table, when)[0] @ [1.0, 1e-9]
         times = np.where(stamps == 0, times, stamps)
-    frame = stated_in = None
     if stream.kind == POSES:
         header: tuple[str, ...] = POSE_HEADER
-        if "header.frame_id" in table.header:
-            index = table.header.index("header.frame_id")
-            names = {row[index].lstrip("/") for row in table.rows if len(row) > index}
-            if len(names) > 1:
-                listed = ", ".join(sorted(names)[:4])
-                raise NeecoError(
-                    f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame"
-                )
-            stated_in = next(iter(names), None)
-            frame = CAMERA if stated_in == DVRK_CAMERA else None
     else:
         header = ("t_s", *(_joint_column(name) for name in _joint_names(table, columns)))
         if len(set(header)) < len(header):
@@ -321,6 +313,19 @@ def _converted(path: Path, stream: Stream, table: Table, columns: list[str], sta
     values, _, bad = numbers(table, columns)
     notes = [f"{path.name}: {stream.name}: {len(bad)} rows cannot be read; left out"] if bad else []
     rows = np.column_stack([times - start, values])
-    return Table(
-        path, header, rows, table.lines, stream=stream.name, frame=frame, stated_in=stated_in, notes=tuple(notes)
-    )
+    found = Table(path, header, rows, table.lines, stream=stream.name, notes=tuple(notes))
+    frames = _frames(table)
+    if stream.kind != POSES or not frames:
+        return found
+    if len(frames) > 1:
+        listed = ", ".join(frames[:4])
+        raise NeecoError(f"{table.path}: header.frame_id: several frames ({listed}); record one arm in one frame")
+    return replace(found, stated_in=frames[0], meaning=meaning_of(frames[0], dvrk=True))
+
+
+def _frames(table: Table) -> list[str]:
+    """Names of the frames that a topic's poses are stated in."""
+    if "header.frame_id" not in table.header:
+        return []
+    index = table.header.index("header.frame_id")
+    return sorted({row[index].lstrip("/") for row in table.rows if len(row) > index})

@@ -17,6 +17,7 @@ from neeco.errors import NeecoError
 from neeco.files import read_bytes
 from neeco.ingest.columns import BASE, VIDEO_CLOCK
 from neeco.ingest.formats import POSES, RecordingFormat, Stream, Table, choose_stream
+from neeco.ingest.frames import NamedFrame
 
 ARMS = ("master left", "master right", "slave left", "slave right")  # in the order of their columns
 COLUMNS = 19  # of an arm
@@ -58,7 +59,8 @@ class JigsawsKinematics(RecordingFormat):
         values = _numbers(path)
         first = COLUMNS * ARMS.index(arm)
         rows = np.column_stack([np.arange(len(values)) / RATE_HZ, values[:, [first + index for index in USED]]])
-        return Table(path, HEADER, rows, np.arange(1, len(rows) + 1), stream=arm, frame=BASE)
+        lines = np.arange(1, len(rows) + 1)
+        return Table(path, HEADER, rows, lines, stream=arm, meaning=NamedFrame(BASE), image_hz=RATE_HZ)
 
 
 def _numbers(path: Path) -> np.ndarray:

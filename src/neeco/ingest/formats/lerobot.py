@@ -24,7 +24,7 @@ from PIL import Image
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
 from neeco.ingest.choices import find_rotations
-from neeco.ingest.columns import BASE, CAMERA, QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
+from neeco.ingest.columns import QUATERNION_WXYZ, ROTATION_MATRIX, pose_bodies, recognise_pose, split_unit
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -35,7 +35,9 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_counts,
 )
+from neeco.ingest.frames import NamedFrame, meaning_in, of_dvrk, unsaid, without_frame
 
 if TYPE_CHECKING:
     from neeco.ingest.formats._lerobotfiles import DataSet, Episode, Feature
@@ -48,10 +50,6 @@ DECODERS = min(8, os.cpu_count() or 1)  # threads that decode them
 _NAME = re.compile(r"\s*episode\s+(\d{1,9})\s*[/:]\s*(\S+)\s*", re.IGNORECASE)
 _OWN = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _JOINT = re.compile(r"(^|[_.\-/])(jaws?|grip(per)?|finger|wrist|joint)([_.\-/0-9]|$)", re.IGNORECASE)
-# a frame, not a body: `pose_in_ecm`, `camera_frame`
-_FRAME = r"(^|[_.\-/])((in|wrt)[_.\-/]({0})|({0})[_.\-/]?frame)([_.\-/]|$)"
-_CAMERA_FRAME = re.compile(_FRAME.format("camera|cam|ecm|endoscope"), re.IGNORECASE)
-_BASE_FRAME = re.compile(_FRAME.format("(robot[_.\\-/]?)?base"), re.IGNORECASE)
 
 
 class LeRobot(RecordingFormat):
@@ -92,10 +90,9 @@ class LeRobot(RecordingFormat):
                 "download the data set again"
             )
         rows = np.column_stack([times, values.reshape(len(values), -1)[order].astype(np.float64)])
-        return Table(
-            path, (TIME, *feature.names), rows, np.arange(len(rows)), stream=name, record="frame",
-            frame=_frame_of(key, feature.names), asks_frame=True, notes=notes,
-        )  # fmt: skip
+        header, lines = (TIME, *feature.names), np.arange(len(rows))
+        meaning = _meaning(key, feature.names)
+        return Table(path, header, rows, lines, stream=name, record="frame", notes=notes, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         data = self._data_set(path)
@@ -108,19 +105,18 @@ class LeRobot(RecordingFormat):
         film = episode.films[key]
         part = None if film.start is None or film.end is None else (film.start, film.end)
         video = open_video(film.file, part=part)
-        where = f"{film.file}: episode {episode.number}"
         numbers = _frame_numbers(video)
         damaged = any(": is damaged" in note or "share a time" in note for note in video.notes)
         usable = numbers < len(times)
-        if numbers[-1] >= len(times) + (len(times) > 1) or (len(numbers) < len(times) - 1 and not damaged):
-            raise NeecoError(
-                f"{where}: has {numbers[-1] + 1} images for {len(times)} states; they do not belong together: download "
-                "the data set again, or name another episode"
-            )
-        if len(numbers) != len(times) and not damaged:
-            notes = (*notes, f"{film.file.name}: has {len(numbers)} images for {len(times)} states; the last is unused")
+        last, states = int(numbers[-1]) + 1, f"states of episode {episode.number}"
+        shown = max(last, len(times)) if damaged else max(last, len(numbers)) if last > len(times) else len(numbers)
+        remedy = "download the data set again, or name another episode"
+        notes = (*notes, *compare_counts(film.file, shown, len(times), states, remedy=remedy))
         frames = tuple(np.flatnonzero(usable).tolist())
-        return _Episode(video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames)
+        return _Episode(
+            video.path, video.size, (*notes, *video.notes), times[numbers[usable]], video, frames,
+            pixel_aspect=video.pixel_aspect,
+        )  # fmt: skip
 
     def clock(self, path: Path, stream: str | None) -> str:
         match = None if stream is None else _NAME.fullmatch(stream)
@@ -185,7 +181,8 @@ class LeRobot(RecordingFormat):
             return [plain]
         bodies = pose_bodies(feature.names)
         found = []
-        for body, columns in bodies.items():
+        for prefix, columns in bodies.items():
+            body = without_frame(prefix)
             rest = [column for column in feature.names if _JOINT.search(column) and column not in columns]
             own = [column for column in rest if len(bodies) == 1 or body in re.split(r"[_.\-/]", column)]
             joints = tuple((_joint_name(column, body), column) for column in own)
@@ -193,14 +190,16 @@ class LeRobot(RecordingFormat):
             if poses.position is None:
                 continue
             asks = () if poses.rotation else _rotation_asks(self._columns(episode, feature, columns), columns)
+            meaning = _meaning(feature.key, columns)
             found.append(replace(plain, kind=POSES, offered=True, body=body or UNNAMED, joints=joints, columns=columns,
-                                 asks=(*_frame_asks(feature.key, columns), *asks)))  # fmt: skip
+                                 hints=meaning.hints, asks=(*meaning.asks, *asks)))  # fmt: skip
         if found:
             return found
         asks = _rotation_asks(self._columns(episode, feature, feature.names), feature.names)
         if asks:
-            asks = (*_frame_asks(feature.key, feature.names), *asks)
-            return [replace(plain, kind=POSES, offered=True, body=UNNAMED, asks=asks, joints=(), columns=())]
+            meaning = _meaning(feature.key, feature.names)
+            return [replace(plain, kind=POSES, offered=True, body=UNNAMED, hints=meaning.hints,
+                            asks=(*meaning.asks, *asks), joints=(), columns=())]  # fmt: skip
         return [plain]
 
     def _columns(self, episode: Episode, feature: Feature, columns: Sequence[str]) -> np.ndarray:
@@ -332,16 +331,10 @@ def _kind(feature: Feature) -> str:
     return READINGS if feature.names and feature.key not in _OWN else OTHER
 
 
-def _frame_of(key: str, columns: Sequence[str]) -> str | None:
-    """The frame that a feature's name, or those of all its columns, says."""
-    for frame, pattern in ((CAMERA, _CAMERA_FRAME), (BASE, _BASE_FRAME)):
-        if pattern.search(key) or all(pattern.search(column) for column in columns):
-            return frame
-    return None
-
-
-def _frame_asks(key: str, columns: Sequence[str]) -> tuple[str, ...]:
-    return () if _frame_of(key, columns) else (f"frame: {CAMERA}   # or {BASE}: nothing says what they are stated in",)
+def _meaning(key: str, columns: Sequence[str]) -> NamedFrame:
+    """What a feature's name, or those of all its columns, says of the frame."""
+    dvrk = of_dvrk(key, *columns)
+    return meaning_in([key], dvrk=dvrk) or meaning_in(columns, dvrk=dvrk) or unsaid(dvrk=dvrk)
 
 
 def _rotation_asks(values: np.ndarray, columns: Sequence[str]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from neeco.capture.documents import printable
 from neeco.errors import NeecoError
+from neeco.files import require_content
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -24,6 +25,7 @@ from neeco.ingest.formats import (
     parse_number,
 )
 from neeco.ingest.formats._sequencefile import META, NRRD, FrameSequence, SequenceImages, read_sequence
+from neeco.ingest.frames import NamedFrame, meaning_of, of_dvrk
 
 TRANSFORM, STATUS, TIME = "Transform", "Status", "Timestamp"
 IMAGE_STATUSES = ("ImageStatus", "Status")  # of MetaImage and NRRD files
@@ -60,7 +62,13 @@ class PlusSequence(RecordingFormat):
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             title = "fixed transform" if fixed else "transform"
             body, kind = _ends(name)[0], OTHER if fixed else POSES
-            found.append(Stream(name, kind, title, len(texts), _rate(times, len(texts)), body=body))
+            meaning = _meaning(name)
+            found.append(
+                Stream(
+                    name, kind, title, len(texts), _rate(times, len(texts)), body=body, hints=meaning.hints,
+                    asks=meaning.asks,
+                )
+            )  # fmt: skip
         return tuple(found)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
@@ -89,7 +97,9 @@ class PlusSequence(RecordingFormat):
                 frames.append(frame)
         values, numbers = np.array(rows).reshape(-1, 17), np.array(frames, np.int64)
         _, stated_in = _ends(name)
-        table = Table(path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in)
+        table = Table(
+            path, HEADER, values, numbers, stream=name, record="frame", stated_in=stated_in, meaning=_meaning(name)
+        )
         notes = [
             f"{table.title}: {len(left)} frame{'' if len(left) == 1 else 's'} dropped: {why} ({table.list_rows(left)})"
             for why, left in dropped.items()
@@ -113,6 +123,7 @@ class PlusSequence(RecordingFormat):
 
 def _sequence_of(path: Path) -> FrameSequence:
     path = Path(path)
+    require_content(path)
     try:
         state = path.stat()
     except OSError as error:
@@ -135,6 +146,12 @@ def _ends(name: str) -> tuple[str, str]:
     match = _ENDS.fullmatch(name)
     assert match is not None
     return match[1], match[2]
+
+
+def _meaning(name: str) -> NamedFrame:
+    """What the frame is that a transform maps to."""
+    body, frame = _ends(name)
+    return meaning_of(frame, dvrk=of_dvrk(body))
 
 
 def _stamps(sequence: FrameSequence) -> dict[int, float]:

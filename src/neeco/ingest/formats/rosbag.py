@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.ingest.columns import CAMERA
+from neeco.ingest.columns import BASE, CAMERA
 from neeco.ingest.formats import (
     IMAGES,
     OTHER,
@@ -28,12 +29,14 @@ from neeco.ingest.formats import (
     VideoSource,
     choose_stream,
 )
+from neeco.ingest.frames import CAMERA_FRAMES, NamedFrame, meaning_of, of_dvrk
 
 if TYPE_CHECKING:
     from neeco.ingest.formats._bagsurvey import Joints, Samples, Survey
 
 DVRK_CAMERA = "ECM"  # the arm that holds the endoscope, and the frame of its tip
 POSE_HEADER = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+MM_PER_M = 1000.0
 LATE = 1.0  # s between stamps and receipt that tell of another clock
 _DVRK = re.compile(r"(?:^|/)(PSM\d|ECM|MTM[LR]|SUJ)(?:/|$)", re.IGNORECASE)
 _DVRK_POSE = re.compile(r"(^|/)(PSM\d|ECM)/(measured_cp|position_cartesian_current)$", re.IGNORECASE)
@@ -74,7 +77,7 @@ class RosBag(RecordingFormat):
         if stream is not None and stream.startswith("tf:") and stream not in survey.poses:
             from neeco.ingest.formats._transforms import chained
 
-            return chained(survey, stream, _camera_frames(survey))
+            return chained(survey, stream, _image_frames(survey))
         chosen = choose_stream(path, self.streams(path), stream, (POSES, READINGS)).name
         if chosen in survey.joints:
             readings = survey.joints[chosen]
@@ -86,8 +89,13 @@ class RosBag(RecordingFormat):
             listed = ", ".join(sorted(names)[:4])
             raise NeecoError(f"{path}: {chosen}: its poses are stated in several frames ({listed}); use tf instead")
         stated_in = next(iter(names), None) or None
-        frame = CAMERA if stated_in in _camera_frames(survey) else None
-        return replace(_table(survey, chosen, poses, POSE_HEADER, poses.table()), frame=frame, stated_in=stated_in)
+        values, meaning, fixed = poses.table(), _meaning(survey, chosen), _camera_from_stated(survey, chosen)
+        if fixed is not None:
+            known = np.linalg.norm(values[:, 3:], axis=1) > 0
+            turn = Rotation.from_matrix(fixed[:3, :3])
+            values[:, :3] = turn.apply(values[:, :3]) + fixed[:3, 3] / MM_PER_M
+            values[known, 3:] = (turn * Rotation.from_quat(values[known, 3:])).as_quat()
+        return replace(_table(survey, chosen, poses, POSE_HEADER, values), stated_in=stated_in, meaning=meaning)
 
     def open_images(self, path: Path, stream: str | None = None) -> VideoSource:
         from neeco.ingest.formats._rosimages import open_topic
@@ -140,7 +148,7 @@ class RosBag(RecordingFormat):
         return Stream(name, IMAGES if usable else OTHER, kind, len(log.received), rate)
 
     def _pose_stream(self, survey: Survey, name: str) -> Stream:
-        log, cameras = survey.poses[name], _camera_frames(survey)
+        log, meaning = survey.poses[name], _meaning(survey, name)
         frames, dvrk = log.frames, {topic for topic in survey.poses if _DVRK_POSE.search(topic)}
         if dvrk:
             offered = name in dvrk
@@ -150,16 +158,19 @@ class RosBag(RecordingFormat):
             offered = not _WANTED.search(name)
         frame = ", ".join(sorted(frames)) or "no named frame"
         title = f"{log.type} in {frame}{', static' if log.static else ''}"
-        hints = [f"poses are stated in {frame}{', the frame of the camera' if frames <= cameras else ''}"]
+        hints = list(meaning.hints or (f"poses are stated in {frame}",))
         if name in dvrk and _body(name) == DVRK_CAMERA:
-            of_arms = {base for topic in dvrk - {name} for base in survey.poses[topic].frames}
-            if of_arms - frames - cameras:  # these would not register them
+            bases = [topic for topic in dvrk - {name} if _meaning(survey, topic).frame not in CAMERA_FRAMES]
+            of_arms = {base for topic in bases for base in survey.poses[topic].frames}
+            if of_arms - frames:  # these would not register them
                 offered, title = False, f"{title}, the arms' in {', '.join(sorted(of_arms))}"
         elif name in dvrk:
             hints.append("kinematics: {dvrk_tool: TOOL.json}   # of share/tool in the dVRK's sawIntuitiveResearchKit")
         rate = _rate(survey.seconds(log.stamps, log.received))
         kind = OTHER if log.static else POSES
-        return Stream(name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints))
+        return Stream(
+            name, kind, title, len(log.stamps), rate, offered, _body(name), None, tuple(hints), asks=meaning.asks
+        )
 
     def _joint_stream(self, survey: Survey, name: str) -> Stream:
         log, offered, wrist = survey.joints[name], not _WANTED.search(name), None
@@ -207,9 +218,36 @@ def _rate(seconds: np.ndarray) -> float | None:
     return (len(seconds) - 1) / length if length > 0 else None
 
 
-def _camera_frames(survey: Survey) -> set[str]:
-    """Frames of the images' cameras."""
-    return ({DVRK_CAMERA} | {name for log in survey.images.values() for name in log.frames}) - {""}
+def _image_frames(survey: Survey) -> set[str]:
+    """Frames of the first camera's images: another's, as a stereo scope's right one, has its own place."""
+    first = min(survey.images, key=_camera_order, default=None)
+    return set() if first is None else survey.images[first].frames - {""}
+
+
+def _meaning(survey: Survey, name: str) -> NamedFrame:
+    """What the frame of a stream's poses is; of several, which are refused when read, nothing."""
+    frames, images = survey.poses[name].frames, _image_frames(survey)
+    if len(frames) != 1:
+        return NamedFrame(BASE)
+    frame = next(iter(frames))
+    if _camera_from_stated(survey, name) is None:
+        return meaning_of(frame, images, dvrk=of_dvrk(name))
+    return NamedFrame(
+        CAMERA, f"{frame}, and turned by static transforms of the bag to {next(iter(images))}, the images'"
+    )
+
+
+def _camera_from_stated(survey: Survey, name: str) -> np.ndarray | None:
+    """[4, 4] mm from the frame of a stream's poses to the images' own, where the first's axes are not certain by its
+    name but static transforms tell them; else None."""
+    from neeco.ingest.formats._transforms import fixed_transform
+
+    frame, images = next(iter(survey.poses[name].frames), ""), _image_frames(survey)
+    if len(survey.poses[name].frames) != 1 or len(images) != 1 or frame in images:
+        return None
+    own = next(iter(images))
+    certain = meaning_of(frame, images, dvrk=of_dvrk(name)).frame is not None
+    return None if certain or meaning_of(own, images).frame is None else fixed_transform(survey, frame, own)
 
 
 def _camera_order(topic: str) -> tuple[bool, bool, bool, str]:

@@ -7,7 +7,7 @@ each arm's own base frame, a few mm and degrees off the camera's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import yaml
 from neeco.capture.documents import as_float, printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
+from neeco.files import parse_yaml, read_text, visible_entries
 from neeco.ingest.formats import (
     HUGE,
     IMAGES,
@@ -30,6 +30,7 @@ from neeco.ingest.formats import (
     Table,
     VideoSource,
     choose_stream,
+    compare_lengths,
 )
 from neeco.ingest.stereofile import read_stereo
 from neeco.ingest.video import open_images, open_video
@@ -42,7 +43,6 @@ JOINT_NAMES = ("yaw_rad", "pitch_rad", "insertion_m", "roll_rad", "wrist_pitch_r
 WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("jaw", "jaw_rad"))
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
-MOST_UNLIKE = 0.1  # share by which a video may be longer or shorter than its states
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # 20 times faster where PyYAML was built with it
 
 
@@ -99,15 +99,12 @@ class SurgPose(RecordingFormat):
         file = path / name
         video = open_images(file, FRAMES_PER_SECOND) if file.is_dir() else open_video(file)
         states = max(int(frames[-1]) + 1 for frames, _ in _read(path).poses.values())
-        shown = (video.times[-1] - video.times[0]) * FRAMES_PER_SECOND + 1
-        if abs(shown - states) > MOST_UNLIKE * states + 1:
-            seconds = f"{shown / FRAMES_PER_SECOND:.1f} s long, its states {states / FRAMES_PER_SECOND:.1f} s"
-            raise NeecoError(f"{file}: is {seconds} at 30 a second; give the video of this trajectory")
-        return video
+        notes = compare_lengths(file, video, states, FRAMES_PER_SECOND)
+        return replace(video, notes=(*video.notes, *notes))
 
     def lens(self, path: Path, stream: str | None = None) -> Lens | None:
         name = choose_stream(path, self.streams(path), stream, (IMAGES,)).name
-        calibrations = sorted(path.glob("*.ini"))
+        calibrations = visible_entries(path, "*.ini")
         if len(calibrations) != 1:
             return None
         left, right, _ = read_stereo(calibrations[0])

@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from neeco.capture.images import open_image
 from neeco.capture.model import Capture
 from neeco.errors import NeecoError
-from neeco.files import require_like, write_atomically
+from neeco.files import require_content, require_like, write_atomically
 from neeco.ingest.posing.along_shaft import Load, Shafts
 from neeco.ingest.posing.roll_pairs import RollPairs, roll_pairs, unrolled_textures
 from neeco.ingest.posing.silhouette_shapes import Shapes, silhouette_shapes
@@ -72,7 +72,7 @@ def write_measurements(capture: Capture, measured: Mapping[str, Measurements]) -
             "seen": found.seen,
         }
         tensors |= {f"{number}/{name}": np.ascontiguousarray(value) for name, value in stored.items()}
-    joints = json.dumps({name: found.joints for name, found in measured.items()})
+    joints = json.dumps({name: found.joints for name, found in measured.items()}, allow_nan=False)
     notes = {"format": FORMAT, "frames": _frames(capture), "joints": joints}
     write_atomically(capture.root / FILE, lambda path: save_file(tensors, path, metadata=notes))
 
@@ -83,6 +83,7 @@ def read_measurements(capture: Capture) -> dict[str, Measurements]:
     again = "make the capture again with `neeco ingest`"
     if not path.is_file():
         raise NeecoError(f"{path}: no such file: nothing was measured for posing by hand; {again}")
+    require_content(path)
     try:
         with safe_open(path, framework="numpy") as file:
             notes = file.metadata() or {}

@@ -2,34 +2,45 @@
 
 https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md. Objects are the instruments, numbered
 from 1 in their order (`bop/objects.json`); lengths in mm, OpenCV axes, an instrument's frame being its tracked one.
-There are no meshes (models/): a scene knows how an instrument looks, not its surface.
+`cam_K` counts px from the image's corner, as the renderers of bop_toolkit do. There are no meshes (models/): a scene
+knows how an instrument looks, not its surface.
+
+Numbers follow scripts/calc_gt_info.py of bop_toolkit: `px_count_all`, `visib_fract` and `bbox_obj` are of the whole
+silhouette, beyond the image's border too, in a canvas three times as wide and high as the image; boxes are the first
+column and row and the distance to the last ones, and -1 where no pixel is visible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import torch
 
 from neeco.capture.images import read_labels, write_labels
-from neeco.capture.model import swap_camera_axes
+from neeco.capture.lens import INTRINSICS
+from neeco.capture.model import InstrumentState, State, swap_camera_axes
 from neeco.files import write_json
 from neeco.labels.annotation import bounding_box
+from neeco.labels.drawing import extended_silhouettes
+from neeco.labels.labellers import Labeller, instruments_of
+from neeco.raster.types import Camera
 from neeco.synthesis.writers.folder import DEPTH_MM_PER_COUNT, Record, link, stem
+
+if TYPE_CHECKING:
+    from neeco.scene import Scene
 
 FOLDER, SCENE = "bop", "000000"
 NOWHERE = [-1, -1, -1, -1]
 
 
-def write_bop(root: Path, records: Sequence[Record], names: Sequence[tuple[str, str]]) -> None:
-    """(Re)write everything. names: (instrument, part) of part id 1, 2, ... Raises NeecoError."""
-    instruments = list(dict.fromkeys(instrument for instrument, _ in names))
-    ids = {k: [i + 1 for i, (owner, _) in enumerate(names) if owner == name] for k, name in enumerate(instruments)}
-    write_json(root / FOLDER / "objects.json", {str(k + 1): name for k, name in enumerate(instruments)})
+def write_bop(root: Path, records: Sequence[Record], scene: Scene, labeller: Labeller) -> None:
+    """(Re)write everything; `scene` and `labeller` are those that the images were drawn with. Raises NeecoError."""
+    instruments = instruments_of(labeller.names)
+    write_json(root / FOLDER / "objects.json", {str(k): name for k, name in enumerate(instruments, 1)})
     for split in sorted({record["split"] for record in records}):
         folder = root / FOLDER / split / SCENE
         cameras, poses, infos = {}, {}, {}
@@ -41,7 +52,7 @@ def write_bop(root: Path, records: Sequence[Record], names: Sequence[tuple[str, 
             link(root / "depth" / f"{name}.png", folder / "depth" / f"{name}.png")
             cameras[key] = _camera(record)
             poses[key] = [_pose(label, instruments.index(label["name"]) + 1) for label in record["labels"]]
-            infos[key] = _masks(root, folder, record, instruments, ids)
+            infos[key] = _masks(root, folder, record, scene, labeller)
         write_json(folder / "scene_camera.json", cameras)
         write_json(folder / "scene_gt.json", poses)
         write_json(folder / "scene_gt_info.json", infos)
@@ -65,31 +76,42 @@ def _pose(label: dict[str, Any], number: int) -> dict[str, Any]:
     return {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": number}
 
 
-def _masks(
-    root: Path, folder: Path, record: Record, instruments: Sequence[str], ids: dict[int, list[int]]
-) -> list[dict[str, Any]]:
+def _masks(root: Path, folder: Path, record: Record, scene: Scene, labeller: Labeller) -> list[dict[str, Any]]:
     """Write whole and visible mask of every instrument; returns their scene_gt_info entries."""
-    name = stem(record["index"])
+    name, width, height = stem(record["index"]), record["width"], record["height"]
     parts = read_labels(root / "parts" / f"{name}.png").numpy()
     bits = read_labels(root / "silhouettes" / f"{name}.png").numpy()
     depth = cv2.imread(str(root / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
     assert depth is not None
+    given = {item["name"]: InstrumentState(item["pose"], item["joints"]) for item in record["instruments"]}
+    fx, fy, cx, cy = (record["intrinsics"][key] for key in INTRINSICS)
+    camera = Camera(swap_camera_axes(np.array(record["camera"])), fx, fy, cx, cy, width, height)
+    extended = extended_silhouettes(scene, labeller, State(given, record["time"], record.get("tissue")), camera)
     infos = []
     for place, label in enumerate(record["labels"]):
-        k = instruments.index(label["name"])
-        visible = np.isin(parts, ids[k])
-        whole = visible | (bits >> place & 1 > 0)
-        for kind, mask in (("mask", whole), ("mask_visib", visible)):
-            pixels = torch.from_numpy(mask.astype(np.uint8) * 255)
-            write_labels(folder / kind / f"{name}_{place:06d}.png", pixels)
+        ids = [k for k, (owner, _) in enumerate(labeller.names, 1) if owner == label["name"]]
+        visible = np.isin(parts, ids)
+        mask = visible | (bits >> place & 1 > 0)
+        whole = extended[label["name"]]
+        whole[height : 2 * height, width : 2 * width] = mask
+        for kind, pixels in (("mask", mask), ("mask_visib", visible)):
+            path = folder / kind / f"{name}_{place:06d}.png"
+            write_labels(path, torch.from_numpy(pixels.astype(np.uint8) * 255))
+        seen, every = int(visible.sum()), int(whole.sum())
         infos.append(
             {
-                "bbox_obj": list(bounding_box(whole)) if whole.any() else NOWHERE,
-                "bbox_visib": list(bounding_box(visible)) if visible.any() else NOWHERE,
-                "px_count_all": int(whole.sum()),
-                "px_count_valid": int((whole & (depth > 0)).sum()),
-                "px_count_visib": int(visible.sum()),
-                "visib_fract": round(float(visible.sum() / max(1, whole.sum())), 6),
+                "bbox_obj": _box(whole, width, height) if seen else NOWHERE,
+                "bbox_visib": _box(visible) if seen else NOWHERE,
+                "px_count_all": every,
+                "px_count_valid": int((mask & (depth > 0)).sum()),
+                "px_count_visib": seen,
+                "visib_fract": seen / max(1, every),
             }
         )
     return infos
+
+
+def _box(mask: np.ndarray, left: int = 0, top: int = 0) -> list[int]:
+    """First column and row, counted from `left` and `top`, and the distance to the last ones, px (bop_toolkit)."""
+    x, y, width, height = bounding_box(mask)
+    return [x - left, y - top, width - 1, height - 1]

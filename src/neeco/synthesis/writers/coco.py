@@ -1,4 +1,11 @@
-"""COCO: `coco/instances.json` (one annotation per instrument) and `coco/parts.json` (one per part)."""
+"""COCO: one annotation per instrument (instances) and one per part (parts), of all images and of each split.
+
+    coco/images/                                images (hard links); every `file_name` is relative to it
+    coco/{instances,parts}.json                 all images
+    coco/annotations/{instances,parts}_{train,val}.json    one split each, where readers of COCO look for them
+
+Category ids of parts are the part ids of dataset.json and of parts/, whether an image shows the part or not.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from neeco.files import write_json
-from neeco.synthesis.writers.folder import Record
+from neeco.labels.labellers import instruments_of
+from neeco.synthesis.writers.folder import Record, link
 
 FOLDER = "coco"
 
@@ -17,42 +25,44 @@ FOLDER = "coco"
 def write_coco(
     root: Path,
     records: Sequence[Record],
-    instruments: Sequence[str],
+    names: tuple[tuple[str, str], ...],
     keypoints: Sequence[str],
     bones: Sequence[tuple[str, str]],
 ) -> None:
-    """Write both COCO files. `file_name` is relative to the data set's images/ folder.
+    """(Re)write all COCO files. names: (instrument, part) of part id 1, 2, ...; bones: pairs of keypoints that a line
+    joins.
 
-    `bones` are pairs of keypoints that a line joins. Instruments have keypoints in the order of `keypoints` (all of
-    them, absent ones as 0 0 0) and, beyond COCO's own fields, `visibility`, `rectangle` (minimum-area, 4 corners) and
-    `camera_from_instrument` (4x4, mm, OpenCV axes).
+    Instruments have keypoints in the order of `keypoints` (all of them, absent ones as 0 0 0) and, beyond COCO's own
+    fields, `visibility`, `rectangle` (minimum-area, 4 corners) and `camera_from_instrument` (4x4, mm, OpenCV axes).
+    Raises NeecoError.
     """
     skeleton = [[keypoints.index(a) + 1, keypoints.index(b) + 1] for a, b in bones if {a, b} <= set(keypoints)]
-    categories: list[dict[str, Any]] = [
-        {"id": k + 1, "name": name, "supercategory": "instrument"} for k, name in enumerate(instruments)
+    instruments: list[dict[str, Any]] = [
+        {"id": k, "name": name, "supercategory": "instrument"} for k, name in enumerate(instruments_of(names), 1)
     ]
-    for category in categories if keypoints else []:
+    for category in instruments if keypoints else []:
         category |= {"keypoints": list(keypoints), "skeleton": skeleton}
-    numbers = {category["name"]: category["id"] for category in categories}
-    write_json(
-        root / FOLDER / "instances.json",
-        _document(records, categories, (_instrument(r, label, numbers, keypoints) for r, label in _labels(records))),
-    )
-
-    found = [(record, label, part) for record, label in _labels(records) for part in label["parts"]]
-    kinds = sorted({(label["name"], part) for _, label, part in found})
-    part_numbers = {kind: k + 1 for k, kind in enumerate(kinds)}
-    part_categories = [
-        {"id": number, "name": f"{name}/{part}", "supercategory": name} for (name, part), number in part_numbers.items()
+    parts = [
+        {"id": k, "name": f"{instrument}/{part}", "supercategory": instrument}
+        for k, (instrument, part) in enumerate(names, 1)
     ]
-    annotations = (
-        _annotation(record, label["parts"][part], part_numbers[label["name"], part]) for record, label, part in found
-    )
-    write_json(root / FOLDER / "parts.json", _document(records, part_categories, annotations))
-
-
-def _labels(records: Sequence[Record]) -> Iterable[tuple[Record, dict[str, Any]]]:
-    return ((record, label) for record in records for label in record["labels"] if label["area"] > 0)
+    numbers = {category["name"]: category["id"] for category in instruments}
+    part_numbers = {name: k for k, name in enumerate(names, 1)}
+    folder = root / FOLDER
+    for record in records:
+        link(root / record["image"], folder / "images" / Path(record["image"]).name)
+    for split in (None, *sorted({record["split"] for record in records})):
+        chosen = [record for record in records if split in (None, record["split"])]
+        found = [(record, label) for record in chosen for label in record["labels"] if label["area"] > 0]
+        by_instrument = (_instrument(record, label, numbers, keypoints) for record, label in found)
+        by_part = (
+            _annotation(record, shape, part_numbers[label["name"], part])
+            for record, label in found
+            for part, shape in label["parts"].items()
+        )
+        for kind, categories, made in (("instances", instruments, by_instrument), ("parts", parts, by_part)):
+            path = folder / (f"{kind}.json" if split is None else f"annotations/{kind}_{split}.json")
+            write_json(path, _document(chosen, categories, made))
 
 
 def _document(

@@ -80,7 +80,8 @@ By neeco {version}, of a scene with SHA-256 `{scene}`:
     {command}
 """
 FORMATS = {
-    "coco": "- `coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`",
+    "coco": "- `coco/instances.json` (boxes, polygons, keypoints, 6-DoF poses) and `coco/parts.json`; each split in "
+    "`coco/annotations/`, images in `coco/images/`",
     "yolo": "- `yolo/` to detect, `yolo/segment/`, `yolo/pose/` and `yolo/obb/`",
     "webdataset": "- `webdataset/{train,val}-*.tar`",
     "bop": "- `bop/{train,val}/`, for 6-DoF pose",
@@ -175,7 +176,7 @@ def write_imagefolder(root: Path, records: Sequence[Record], instruments: Sequen
                 "name": [label["name"] for label in seen],
             },
         }
-        lines.setdefault(split, []).append(json.dumps(line))
+        lines.setdefault(split, []).append(json.dumps(line, allow_nan=False))
     for split, of_split in lines.items():
         write_text(root / IMAGEFOLDER / split / "metadata.jsonl", "".join(f"{line}\n" for line in of_split))
 

@@ -1,0 +1,109 @@
+"""What no camera, joint, time or mask can be: one list of limits for all readers of files and the Python API.
+
+Each function returns what is wrong and what to do, or None. What no pose can be, `neeco.raster.rotations.rigid_fault`
+says.
+"""
+
+from __future__ import annotations
+
+import math
+
+Fault = tuple[str, str]  # what is wrong, what to do
+
+LARGEST_SIZE = 65_535  # px along a side of an image
+WIDEST, LONGEST = 0.1, 50.0  # focal length of any lens, in lengths of the image's longer side
+MOST_ANAMORPHIC = 2.5  # ratio of the two focal lengths: single fields of interlaced video have 2
+FULL_TURN = 2 * math.pi  # rad; a joint without stated limits turns no farther
+LONGEST_SLIDE = 1000.0  # mm; nor slides farther
+LIMIT_TOLERANCE = 1e-3  # rad (mm of sliding joints) by which rounding and noise may exceed a limit
+LONGEST_TIME = 1e10  # s, beyond the seconds since 1970 that clocks give
+MOST_HIDDEN = 0.5  # share of the lit pixels of most images that a loss mask may hide
+MOST_POINTS_HIDDEN = 0.8  # share of the projected sparse points that loss masks may hide
+
+
+def size_fault(width: float, height: float) -> Fault | None:
+    """Of an image of width x height px."""
+    sides = (width, height)
+    if not all(math.isfinite(side) and side % 1 == 0 and 1 <= side <= LARGEST_SIZE for side in sides):
+        return f"image size {width:g} x {height:g} is not usable", "give whole numbers of pixels"
+    return None
+
+
+def focal_fault(fx: float, fy: float, width: float, height: float) -> Fault | None:
+    """Of focal lengths in px on an image of width x height px."""
+    if not all(math.isfinite(focal) and focal > 0 for focal in (fx, fy)):
+        return f"focal lengths {fx:g} and {fy:g} px are not positive numbers", "give them in pixels"
+    fits = all(WIDEST < focal / max(width, height) < LONGEST for focal in (fx, fy))
+    if not fits or max(fx, fy) > MOST_ANAMORPHIC * min(fx, fy):
+        message = f"focal lengths {fx:g} and {fy:g} px fit no lens on a {width:g}x{height:g} image"
+        return message, "give them in pixels of this image (not in mm, nor as shares of its size)"
+    return None
+
+
+def camera_fault(fx: float, fy: float, cx: float, cy: float, width: float, height: float, near: float) -> Fault | None:
+    """Of a camera's numbers, px and mm; its image may be cut out of a larger one, or enlarged."""
+    if (fault := size_fault(width, height)) is not None:
+        return fault
+    if not all(math.isfinite(number) and number > 0 for number in (fx, fy, near)):
+        return f"fx, fy, near: {fx:g} px, {fy:g} px, {near:g} mm are not all positive and finite", "correct them"
+    if not all(math.isfinite(number) for number in (cx, cy)):
+        return f"cx, cy: {cx:g} and {cy:g} px are not finite", "correct them"
+    return None
+
+
+def center_fault(cx: float, cy: float, width: float, height: float) -> Fault | None:
+    """Of a principal point in px on an image of width x height px."""
+    if 0 < cx < width and 0 < cy < height:  # NaN compares false
+        return None
+    return f"principal point ({cx:g}, {cy:g}) lies outside the {width:g}x{height:g} image", "give it in pixels of it"
+
+
+def time_fault(time: float) -> Fault | None:
+    """Of a time in s."""
+    if abs(time) <= LONGEST_TIME:  # NaN compares false
+        return None
+    return f"is {time:g} s", "give seconds (not milli- or nanoseconds)"
+
+
+def passes_limits(value: float, limits: tuple[float, float] | None) -> bool:
+    """Whether a joint's value exceeds its limits by more than rounding explains."""
+    return limits is not None and not limits[0] - LIMIT_TOLERANCE <= value <= limits[1] + LIMIT_TOLERANCE
+
+
+def joint_fault(value: float, limits: tuple[float, float] | None, slides: bool, slack: float = 0.0) -> Fault | None:
+    """Of a joint's value, rad, or of a joint that slides mm. slack: share of its range by which it may exceed that."""
+    unit = "mm" if slides else "rad"
+    if not math.isfinite(value):
+        return f"is {value:g}, not a finite number", f"give it in {unit}"
+    if limits is not None:
+        room = slack * (limits[1] - limits[0]) if slack else 0.0
+        limits = limits[0] - room, limits[1] + room
+        message = f"is {value:g} {unit}, outside its limits {limits[0]:g} .. {limits[1]:g}"
+        remedy = "repair the reading or the limits" if slides else "repair the reading (radians?) or the limits"
+        return (message, remedy) if passes_limits(value, limits) else None
+    if abs(value) > (LONGEST_SLIDE if slides else FULL_TURN) * (1 + slack):
+        if slides:
+            return f"is {value:g} mm, farther than any instrument slides", "give mm, or state the joint's limits"
+        remedy = "give radians; state the joint's limits in the header if it does turn that far"
+        return f"is {value:g} rad, more than a full turn: degrees?", remedy
+    return None
+
+
+def limits_fault(limits: tuple[float, float], slides: bool) -> Fault | None:
+    """Of a joint's stated limits, rad or mm."""
+    if slides or max(map(abs, limits)) <= 2 * FULL_TURN:
+        return None
+    return f"{limits[0]:g} .. {limits[1]:g} rad: degrees?", "give radians"
+
+
+def mask_fault(pixels: float, points: float | None) -> Fault | None:
+    """Of loss masks that hide these shares of the lit pixels in most images and of the projected sparse points (None:
+    there are none)."""
+    hides = []
+    if pixels > MOST_HIDDEN:
+        hides.append(f"{pixels:.0%} of most images")
+    if points is not None and points > MOST_POINTS_HIDDEN:
+        hides.append(f"{points:.0%} of the sparse points in view")
+    if not hides:
+        return None
+    return f"loss masks hide {' and '.join(hides)}: inverted polarity?", "black is ignored by the loss: invert them"
