@@ -212,6 +212,17 @@ def test_transforms_of_a_bag_are_turned_once_at_their_end(tmp_path):
     np.testing.assert_allclose(away.positions[0], np.add(ECM, [100, 200, 300]), atol=1e-6)
 
 
+def test_the_frame_of_another_camera_is_not_that_of_the_video(tmp_path):
+    bag_world = pytest.importorskip("bag_world")
+    with bag_world.BagWriter(tmp_path, "recording.bag") as bag:
+        for time in TIMES:
+            for side in ("left", "right"):
+                bag.pose(f"/needle/{side}", time, np.array(SEEN) / 1000, [1, 0, 0, 0], f"{side}_eye")
+                bag.image(f"/{side}/image_raw", time, np.zeros((8, 8, 3), np.uint8), "rgb8", f"{side}_eye")
+    assert_seen(read_pose_log(PoseColumns(bag.path, stream="/needle/left")))
+    assert read_pose_log(PoseColumns(bag.path, stream="/needle/right")).frame == BASE
+
+
 def test_static_transforms_tell_the_axes_that_a_frames_name_leaves_open(tmp_path):
     bag_world = pytest.importorskip("bag_world")
     optical, offset = "camera_optical_frame", np.array([0.0, 0.015, 0.0])  # m, in the link's axes

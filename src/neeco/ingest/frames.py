@@ -16,9 +16,8 @@ from neeco.ingest.columns import BASE, CAMERA
 
 CAMERA_FRAMES: dict[str, AxisConvention] = {CAMERA: OPENCV, **CONVENTIONS}  # what `frame` in recording.yaml may say
 FRAMES = (*CAMERA_FRAMES, BASE)
-UNSAID = "nothing says what its poses are stated in"
 _ECM = re.compile(r"(^|[/_.\-])ecm([/_.\-]|$)")
-_BASE = re.compile(r"(^|[/_.\-])(base|world|map|odom|cart|tracker|rcm|remote_center)([/_.\-]|\d|$)")
+_BASE = re.compile(r"(^|[/_.\-])(base|setup|rcm|remote_center|tracker)([/_.\-]|\d|$)")
 _OPTICAL = re.compile(r"(^|[/_.\-])optical([/_.\-]|$)")
 _BODY = re.compile(r"[/_.\-](link|body)$")
 _WORDS = "camera|cam|endoscope|laparoscope|scope|ecm"
@@ -126,7 +125,9 @@ def without_frame(name: str) -> str:
 
 def unsaid(*, dvrk: bool = False) -> NamedFrame:
     """The question where nothing names a frame."""
-    return NamedFrame(None, UNSAID, (CAMERA, BASE, *((DVRK_ECM.name,) if dvrk else ())))
+    return NamedFrame(
+        None, "nothing says what its poses are stated in", (CAMERA, BASE, *((DVRK_ECM.name,) if dvrk else ()))
+    )
 
 
 def of_dvrk(*names: str) -> bool:
