@@ -96,6 +96,7 @@ def test_names_without_a_frame_say_nothing():
     assert meaning_in(["camera_pose.x", "tip_in_ecm.x"]) is None
     assert without_frame("psm1_in_ecm") == "psm1"
     assert without_frame("psm1_in_ecm_pose") == "psm1_pose"
+    assert without_frame("camera_frame") == "camera_frame"
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ class NamedFrame:
         if self.frame is not None:
             return ""
         *others, last = [f"frame: {name} ({_describe(name)})" for name in self.choices]
-        return f"{self.why}; say so in the recording: {', '.join(others)}, or {last}"
+        return f"{self.why}; say so in the recording, under poses: {', '.join(others)}, or {last}"
 
     @property
     def hints(self) -> tuple[str, ...]:
@@ -80,7 +80,7 @@ def meaning_of(name: str, images: Collection[str] = (), *, dvrk: bool = False) -
         return NamedFrame(CAMERA, f"{name}, the frame of the camera: axes as ROS's images have them ({OPENCV.words})")
     if _OPTICAL.search(plain):
         if own:
-            why = f"{name} is an optical frame, but the images are stated in {', '.join(sorted(images)[:4])}"
+            why = f"{name} is an optical frame, but the images are stated in {printable(', '.join(sorted(images)))}"
             return NamedFrame(None, why, (CAMERA, BASE))
         return NamedFrame(CAMERA, f"{name}, the optical frame of the camera: axes {OPENCV.words}")
     if last == "ecm":
@@ -118,9 +118,10 @@ def meaning_in(names: Sequence[str], *, dvrk: bool = False) -> NamedFrame | None
 
 def without_frame(name: str) -> str:
     """A name without the frame in it: `psm1` of `psm1_in_ecm`."""
+    left = name
     for pattern in (_CAMERA_IN, _BASE_IN):
-        name = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", name)
-    return name
+        left = pattern.sub(lambda match: "_" if match.end() < len(match.string) else "", left)
+    return name if left == name else left.strip("_") or name
 
 
 def unsaid(*, dvrk: bool = False) -> NamedFrame:
