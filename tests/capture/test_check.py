@@ -529,3 +529,9 @@ def test_a_reading_that_the_others_tell_is_said(folder):
     folder.edit(edit)
     assert_found(folder, "instruments", "joint 'elbow' of", "warning")
     assert_found(folder, "instruments", "follows from the others (99", "warning")
+
+
+def test_one_time_for_all_frames_is_a_warning_where_states_differ(folder):
+    for index in range(8):
+        folder.edit(_frame(index, "time", 0.0))
+    assert_found(folder, "frames", "every frame has the time 0, though states differ", "warning")

@@ -170,6 +170,9 @@ def _check_frames(parsed: Parsed) -> None:
         latest[place.file, frame.state.tissue] = time
     if not parsed.timed:
         frames.warning("not every frame has a time; the order stands in", "add `time` in seconds")
+    elif len(instants) > 1 and len({frame.state.time for frame in parsed.frames}) == 1:
+        time = parsed.frames[0].state.time
+        frames.warning(f"every frame has the time {time:g}, though states differ", "write seconds, or leave `time` out")
     elif back:
         more = f" (and {len(back) - 1} more times)" if len(back) > 1 else ""
         remedy = "right if the capture joins recordings or cameras; else sort the frames"
