@@ -22,7 +22,7 @@ import torch
 from neeco.capture.check_geometry import check_geometry
 from neeco.capture.check_motion import check_motion
 from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
-from neeco.capture.images import to_bytes
+from neeco.capture.images import is_repeated, to_bytes
 from neeco.capture.kinematics import KinematicTree
 from neeco.capture.model import STILL, Capture, Frame, Instrument, InstrumentState
 from neeco.capture.reader import capture_of, parse_capture
@@ -35,11 +35,8 @@ FEW_TRAIN_FRAMES = 20  # below, expect little
 STILL_CAMERAS = 2  # of a scope that stands still
 ROLL_UNKNOWN_DEG = 45.0  # standard deviation from which a roll is as good as not known
 FULL_TURN = 2 * math.pi
-# Levels of 255, mean and largest, by which a picture that is coded again differs: 0.1 and 20 by H.264 and JPEG; 0.4 and
-# 40 or more where a camera or an instrument moves.
-REPEATED_MEAN, REPEATED_MAX = 0.2, 24
 COMPARED_WIDTH = 320  # px of the reduced pictures that are compared
-FROZEN_MM, FROZEN_ROTATION = 1.0, 0.03  # by which a pose changes visibly: its place, and entries of its rotation
+FROZEN_MM, FROZEN_ROTATION = 1.0, 0.03  # by which a state changes visibly: a place, and rotations' entries or rad
 COUPLED = 0.98  # share of a reading's variance that the others of its kinematics may tell
 MIN_COUPLED_STATES = 12  # fewer tell each other anyway
 
@@ -190,7 +187,7 @@ class _Decoded:
     """What decoding one frame's files found."""
 
     digest: bytes | None  # of the pixels; None when not readable
-    grey: torch.Tensor | None  # uint8 [h, w], every few pixels
+    grey: np.ndarray | None  # uint8 [h, w], every few pixels
     uniform: bool  # one colour
     image_error: str
     mask_error: str
@@ -227,7 +224,7 @@ def _decode(frame: Frame) -> _Decoded:
         digest = hashlib.blake2b(image.numpy().tobytes(), digest_size=16).digest()
         uniform = bool((image == image[0, 0]).all())
         step = max(1, image.shape[1] // COMPARED_WIDTH)
-        grey = to_bytes(image[::step, ::step].mean(-1))
+        grey = to_bytes(image[::step, ::step].mean(-1)).numpy()
     except NeecoError as error:
         image_error = str(error).replace(str(frame.image_path), frame.image_path.name)
     try:
@@ -242,18 +239,15 @@ def _decode(frame: Frame) -> _Decoded:
 def _check_frozen(parsed: Parsed, decoded: Sequence[_Decoded]) -> None:
     """Warn of frames that show the picture before them, coded again, though the camera or an instrument moved. Those
     with the same pixels are reported as duplicates."""
-    order = sorted(
-        range(len(decoded)), key=lambda index: (str(parsed.places[index].file), parsed.frames[index].state.time)
-    )
-    frozen = []
-    source = order[0]
+    when = [(str(place.file), frame.state.time) for frame, place in zip(parsed.frames, parsed.places, strict=True)]
+    order = sorted(range(len(decoded)), key=when.__getitem__)
+    frozen, source = [], order[0]
     for index in order[1:]:
         one, two = decoded[source], decoded[index]
         if one.grey is None or two.grey is None or one.grey.shape != two.grey.shape or one.uniform:
             source = index
             continue
-        change = (one.grey.short() - two.grey.short()).abs()
-        if change.float().mean() > REPEATED_MEAN or change.max() > REPEATED_MAX:
+        if not is_repeated(one.grey, two.grey):
             source = index
         elif one.digest != two.digest and _moved(parsed.frames[source], parsed.frames[index]):
             frozen.append(index)
@@ -266,15 +260,12 @@ def _check_frozen(parsed: Parsed, decoded: Sequence[_Decoded]) -> None:
 def _moved(one: Frame, two: Frame) -> bool:
     """Whether the camera or an instrument moved by what an image shows."""
     shared = one.state.instruments.keys() & two.state.instruments.keys()
+    joints = [(one.state.instruments[name].joints, two.state.instruments[name].joints) for name in shared]
+    readings = [(value, second.get(name, value)) for first, second in joints for name, value in first.items()]
+    if any(abs(after - before) > FROZEN_ROTATION for before, after in readings):
+        return True
     pairs = [(one.camera.world_from_camera, two.camera.world_from_camera)]
     pairs += [(one.state.instruments[name].pose, two.state.instruments[name].pose) for name in shared]
-    joints = [(one.state.instruments[name].joints, two.state.instruments[name].joints) for name in shared]
-    if any(
-        abs(second.get(name, value) - value) > FROZEN_ROTATION
-        for first, second in joints
-        for name, value in first.items()
-    ):
-        return True
     changes = [(second - first).abs() for first, second in pairs]
     return any(bool(change[:3, 3].norm() > FROZEN_MM or change[:3, :3].max() > FROZEN_ROTATION) for change in changes)
 
