@@ -336,11 +336,11 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
 def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
     """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
     long, and a jump at an end. What comes to rest slows down before."""
-    kept = np.flatnonzero(rows.keep)
-    if len(kept) < MIN_SAMPLES:
+    used = np.flatnonzero(rows.keep)
+    if len(used) < MIN_SAMPLES:
         return
-    steps = np.linalg.norm(np.diff(poses[kept, :3], axis=0), axis=1)
-    same = np.concatenate([[False], (np.diff(poses[kept], axis=0) == 0).all(axis=1), [False]])
+    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
+    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
     edges = np.diff(same.astype(int))
     moving = steps[steps > 0]
     if not len(moving):
@@ -349,9 +349,9 @@ def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
         # the pose of row `first` is repeated until `last`
         around = [steps[first - 1]] if first > 0 else []
         around += [steps[last]] if last < len(steps) else []
-        lasted = times[kept[last]] - times[kept[first]]
+        lasted = times[used[last]] - times[used[first]]
         if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
-            rows.drop(kept[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
 
 
 def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
