@@ -29,6 +29,8 @@ WRONG_ROWS = 0.05  # share of rows that may be wrong (not missing) before the fi
 _FORMS = ", ".join(f"{form} (with euler_convention)" if form == EULER else form for form in named.FORMS)
 _FRAME_COLUMN = re.compile(r"(?!.*child)(.*[._/])?(reference[._ ]?)?frame([._ ]?id)?")
 LISTED_STATES = 8  # states that drop rows and are named in the notes
+MAX_SAME_TIME = 0.5  # share of rows at the time of another: more, and times are too coarse
+STUCK_S, STUCK_SAMPLES = 0.5, 10  # that a tracker's noise never leaves a pose unchanged for
 GAP_STEPS, GAP_SECONDS = 4.0, 0.15  # a step in time longer than both is a gap
 FARTHEST_MM = 20_000.0  # no tracker of instruments sees that far: the unit is wrong
 TWO_TURNS = 4 * np.pi  # rad, more than any joint turns: the unit is wrong
@@ -116,7 +118,10 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
     _keep_measured(rows, source, found.state)
     times = _times(rows, source, found)
     positions, quats = _poses(rows, source, found)
+    _drop_stuck(rows, times, np.column_stack([positions, quats]))
     times, order = _in_order(rows, times)
+    if np.ptp(quats[order], axis=0).max() == 0 and np.ptp(positions[order], axis=0).max() > 0:
+        rows.repairs.append("its rotation never changes: does it hold positions alone?")
     quats, flips = continuous(quats[order])
     if flips:
         rows.repairs.append(f"the quaternion's sign flipped {flips} times; undone")
@@ -390,12 +395,38 @@ def _parts(table: Table, form: str, cells: np.ndarray) -> tuple[np.ndarray, np.n
     return rows[:, :, 3], rows[:, :, :3].reshape(-1, 9)
 
 
+def _drop_stuck(rows: Rows, times: np.ndarray, poses: np.ndarray) -> None:
+    """Drop the rows of a tracker that repeats its last pose [R, 7] after it lost its tool: exactly the same pose for
+    long, and a jump at an end. What comes to rest slows down before."""
+    used = np.flatnonzero(rows.keep)
+    if len(used) < MIN_SAMPLES:
+        return
+    steps = np.linalg.norm(np.diff(poses[used, :3], axis=0), axis=1)
+    same = np.concatenate([[False], (np.diff(poses[used], axis=0) == 0).all(axis=1), [False]])
+    edges = np.diff(same.astype(int))
+    moving = steps[steps > 0]
+    if not len(moving):
+        return
+    for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        # the pose of row `first` is repeated until `last`
+        around = [steps[first - 1]] if first > 0 else []
+        around += [steps[last]] if last < len(steps) else []
+        lasted = times[used[last]] - times[used[first]]
+        if last - first >= STUCK_SAMPLES and lasted > STUCK_S and max(around, default=0.0) > np.median(moving):
+            rows.drop(used[first + 1 : last + 1], "the pose of the row before, repeated (a tracker that lost its tool)")
+
+
 def _in_order(rows: Rows, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Increasing times [T] and which rows [T] they come from. Raises NeecoError when too few are left."""
     table, usable = rows.table, np.flatnonzero(rows.keep)
     order = usable[np.argsort(times[usable], kind="stable")]
     late = usable[1:][times[usable][1:] < np.maximum.accumulate(times[usable])[:-1]]
     doubled = np.concatenate([[False], np.diff(times[order]) <= 0])
+    if doubled.sum() > max(MIN_SAMPLES, MAX_SAME_TIME * len(order)):
+        raise NeecoError(
+            f"{table.where}: {count_rows(int(doubled.sum()))} of {len(order)} have the time of another; its times are "
+            "too coarse, or of several tools: name a finer column as columns.time"
+        )
     rows.drop(np.sort(order[doubled]), "a second row at one time")
     order = order[~doubled]
     if len(order) < MIN_SAMPLES:
