@@ -85,7 +85,7 @@ def test_masks_that_hide_most_of_most_images_are_doubted(folder):
     field = np.hypot(columns - 15.5, rows - 11.5) < 12
     mask_frames(folder, ~field)
     (line,) = [line for line in told(folder) if "polarity" in line]
-    assert "frames[*].mask_path: loss masks hide 59% of most images and " in line
+    assert "frames[*].mask_path: loss masks hide 58% of most images and " in line
     assert "of the sparse points in view: inverted polarity?" in line
 
 
