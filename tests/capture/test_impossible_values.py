@@ -75,6 +75,14 @@ def test_states_of_a_file_for_each_split_are_read(folder):
     assert [frame.split for frame in capture.frames] == ["train"] * 7 + ["test"]
 
 
+@pytest.mark.parametrize("key", ["tools", "joints", "instrument"])
+def test_states_under_another_name_are_not_dropped_in_silence(folder, key):
+    folder.edit(lambda document: document.pop("instruments"))
+    folder.edit(lambda document: [frame.update({key: frame.pop("instruments")}) for frame in document["frames"]])
+    (line,) = [line for line in told(folder) if "not read" in line]
+    assert f"frames[0].{key}: is not read: instrument states belong into `instruments`" in line
+
+
 def mask_frames(folder, shown: np.ndarray) -> None:
     Image.fromarray(shown.astype(np.uint8) * 255).save(folder.root / "mask.png")
     folder.edit(lambda document: [frame.update(mask_path="mask.png") for frame in document["frames"]])
