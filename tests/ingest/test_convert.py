@@ -95,7 +95,7 @@ def test_tool_masks_of_the_other_polarity_are_told_by_what_they_show(endonerf, t
     for path in (endonerf / "masks").iterdir():
         Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
     told = " ".join(convert_folder(endonerf, tmp_path / "inverted"))
-    assert "inverted polarity: white is 68% of most images, so black is read as the tool" in told
+    assert "inverted polarity: white is 69% of most images, so black is read as the tool" in told
     masks = [[frame.load_mask() for frame in read_capture(tmp_path / name).frames] for name in ("capture", "inverted")]
     assert all(torch.equal(one, other) for one, other in zip(*masks, strict=True))
 
