@@ -138,6 +138,7 @@ def test_a_similar_file_is_never_looked_for_outside(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     assert similar_file(tmp_path / "inner", "..\\a.png") is None
     assert similar_file(tmp_path, "A.jpg") == "a.png"
+    assert similar_file(tmp_path / "nowhere", "a.png") is None
 
 
 def test_problems_of_one_kind_are_counted_and_a_few_are_listed():
