@@ -123,8 +123,8 @@ def image_size(path: Path | str, width: Any, height: Any) -> tuple[int, int] | N
     """(width, height) px; None where one is not given. Raises NeecoError."""
     if width is None or height is None:
         return None
-    sides = [as_float(value) for value in (width, height)]
-    if None in sides or size_fault(*sides) is not None:
+    sides = [number for value in (width, height) if (number := as_float(value)) is not None]
+    if len(sides) < 2 or size_fault(*sides) is not None:
         raise NeecoError(f"{path}: image size: {printable(width)} x {printable(height)} is not one; correct it")
     return int(width), int(height)
 
