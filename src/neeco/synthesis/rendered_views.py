@@ -53,7 +53,8 @@ def split_views(run: Run, split: str, capture_path: Path | None = None) -> list[
 
     Stems that several frames share are made unique by the names of the folders above them. Raises NeecoError.
     """
-    capture = run.capture() if capture_path is None else run.completed(read_capture(capture_path))
+    capture = run.capture() if capture_path is None else read_capture(capture_path)
+    capture = run.scene.recorded.completed(capture, run.scene.instruments)
     frames = capture.split(split)
     if not frames:
         known = ", ".join(capture.splits) or "none"
