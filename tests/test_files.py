@@ -76,6 +76,16 @@ def test_a_killed_process_holds_no_folder_and_what_it_left_is_swept(tmp_path: Pa
     assert not (tmp_path / LOCK).exists()
 
 
+def test_half_a_character_is_no_json_and_a_pair_of_halves_is_one_letter(tmp_path: Path) -> None:
+    file = tmp_path / "file.json"
+    file.write_text(r'{"name": "\ud83d\ude00"}')
+    assert read_json(file) == {"name": "\N{GRINNING FACE}"}
+    for text in (r'{"name": ["\udcff.jpg"]}', r'{"\uD83D": 1}'):
+        file.write_text(text)
+        with pytest.raises(NeecoError, match="half a character; write its names"):
+            read_json(file)
+
+
 @pytest.mark.parametrize(("umask", "file", "folder"), [(0o077, 0o600, 0o700), (0o002, 0o664, 0o775)])
 def test_the_umask_decides_who_may_read(tmp_path: Path, umask: int, file: int, folder: int) -> None:
     path = tmp_path / "made" / "file.txt"

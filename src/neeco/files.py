@@ -302,7 +302,11 @@ def read_json(path: Path) -> Any:
     """Parse a JSON file. Raises NeecoError naming the file (and the line) when absent, unreadable or malformed."""
     text = read_text(Path(path), "JSON")
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        # halves of characters, as of names that are not in UTF-8: no other file could hold them
+        if "\\ud" in text.lower() and (half := HALVES.search(json.dumps(value, ensure_ascii=False))):
+            raise NeecoError(f"{path}: holds {half[0]!r}, half a character; write its names and the files' in UTF-8")
+        return value
     except json.JSONDecodeError as error:
         raise NeecoError(f"{path}: not valid JSON, line {error.lineno}: {error.msg}; mend or write it anew") from None
     except (ValueError, RecursionError):  # numbers of thousands of digits, nesting of thousands of levels

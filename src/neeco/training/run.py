@@ -40,16 +40,13 @@ class Run:
     config: dict[str, Any]
 
     def capture(self) -> Capture:
-        """The capture it was trained on, `completed`. Raises NeecoError when it has moved."""
+        """The capture it was trained on; joints that nobody recorded are as training found them (`Recorded.completed`).
+        Raises NeecoError when it has moved."""
         root = Path(self.config["capture"])
         if not root.exists():
             config = self.path / "config.yaml"
             raise NeecoError(f"{config}: capture: {root} no longer exists; put it back, or write there where it is")
-        return self.completed(read_capture(root, self.config["transforms"]))
-
-    def completed(self, capture: Capture) -> Capture:
-        """`capture` with joints that nobody recorded as training found them: what is drawn of its frames."""
-        return self.scene.recorded.completed(capture, self.scene.instruments)
+        return self.scene.recorded.completed(read_capture(root, self.config["transforms"]), self.scene.instruments)
 
 
 def load_run(path: Path, device: torch.device | None = None) -> Run:
