@@ -157,7 +157,7 @@ def _find_files(source: Path) -> _FolderFiles:
                 _classify_table(found, _Log(name), file)
         elif suffix == ".json" and _is_sync(file):
             found.syncs.append(name)
-        elif suffix in (".yaml", ".yml", ".json") and _is_lens(file):
+        elif suffix in (".yaml", ".yml", ".xml", ".json") and _is_lens(file):
             found.lenses.append(name)
     return found
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from neeco.capture.documents import as_float, printable
 from neeco.capture.lens import Lens
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text
+from neeco.files import FastYamlLoader, parse_yaml, read_text
 from neeco.ingest.formats import (
     HUGE,
     IMAGES,
@@ -43,7 +42,6 @@ WRIST = (("wrist_pitch", "wrist_pitch_rad"), ("wrist_yaw", "wrist_yaw_rad"), ("j
 POSE_HEADER = ("t_s", *(f"m{row}{column}{'_m' if column == 3 else ''}" for row in range(3) for column in range(4)))
 LIGHTS = ("regular", "", "green")  # folders of the videos; what is green shows the ultraviolet paint
 MOST_UNLIKE = 0.1  # share by which a video may be longer or shorter than its states
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # 20 times faster where PyYAML was built with it
 
 
 @dataclass(frozen=True, eq=False)  # it holds arrays
@@ -149,7 +147,7 @@ def _cached(path: Path, state: tuple[int, ...]) -> _Arms:
 
 def _by_arm(file: Path, parse: Any, expected: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Frames [T] and rows [T, C] of each arm, from {frame: {arm: values}}."""
-    document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", _Loader)
+    document = parse_yaml(file, read_text(file, "states by frame"), "copy it again", FastYamlLoader)
     if not isinstance(document, dict) or not document:
         raise NeecoError(f"{file}: expected states by frame, as in '0': {{PSM1: ...}}; copy it again")
     found: dict[str, list[tuple[int, Sequence[float]]]] = {}
