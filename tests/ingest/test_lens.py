@@ -107,7 +107,7 @@ SIDES = "".join(
         ("opencv.xml", f'<?xml version="1.0"?>\n{XML}'),
         ("orb.yaml", ORB),
         ("orb.yaml", "%YAML:1.0\nViewer.PointSize:2\n" + ORB),
-        ("orb3.yaml", ORB.replace("Camera.", "Camera1.").replace("Camera1.w", "Camera.w").replace("Camera1.h", "Camera.h")),
+        ("orb3.yaml", ORB.replace("ra.", "ra1.").replace("ra1.w", "ra.w").replace("ra1.h", "ra.h")),
         ("stella.yaml", "Camera:\n" + ORB.replace("Camera.", "  ").replace("width", "cols").replace("height", "rows")),
         ("camchain.yaml", KALIBR),
         ("sensor.yaml", EUROC),
@@ -117,8 +117,8 @@ SIDES = "".join(
         ("hand.yaml", "mtx: [[300.5, 0, 159.5], [0, 301.5, 119.5], [0, 0, 1]]\ndist: [[-.3, .1, 1e-3, -2e-3, 0]]\n"
          "image_size: [320, 240]"),
         ("opencv.json", json.dumps({"camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "data":
-         [300.5, 0, 159.5, 0, 301.5, 119.5, 0, 0, 1]}, "distortion_coefficients": {"data": [-0.3, 0.1, 0.001, -0.002, 0]},
-         "image_width": 320, "image_height": 240})),
+         [300.5, 0, 159.5, 0, 301.5, 119.5, 0, 0, 1]}, "image_width": 320, "image_height": 240,
+         "distortion_coefficients": {"data": [-0.3, 0.1, 0.001, -0.002, 0]}})),
     ],
 )  # fmt: skip
 def test_the_same_lens_from_every_calibrator(world, name, text):

@@ -173,9 +173,11 @@ def orb_slam_3(folder):
 
 @pytest.mark.parametrize(
     "write",
-    [opencv_yaml, opencv_two_files, opencv_xml, ini, intuitive_json, scared_json, ros_pair, ros_left_file, kalibr, orb_slam,
-     orb_slam_3],
-)  # fmt: skip
+    [
+        *(opencv_yaml, opencv_two_files, opencv_xml, ini, intuitive_json, scared_json),
+        *(ros_pair, ros_left_file, kalibr, orb_slam, orb_slam_3),
+    ],
+)
 def test_the_same_rig_from_every_file(tmp_path, write):
     left, right, right_from_left = read_stereo(write(tmp_path))
     for lens, matrix, bends in ((left, LEFT, LEFT_BENDS), (right, RIGHT, RIGHT_BENDS)):

@@ -37,10 +37,10 @@ def read_stereo(path: Path) -> tuple[Lens, Lens, np.ndarray]:
     right one's (OpenCV axes).
 
     Read are OpenCV's stereo YAML or XML (`M1 D1 M2 D2 R T`, or `K1 ...`; R and T may stand in `extrinsics.yml` beside
-    `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of two
-    cameras (a folder with a left and a right file, or the left file, the right one beside it), the da Vinci's `.ini`
-    ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m: which, its
-    length says, and is refused where both could be. Raises NeecoError naming file, field and remedy.
+    `intrinsics.yml`), Kalibr's camchain, settings of ORB-SLAM (`LEFT.K ...`, `Camera1.fx ...`), ROS's camera_info of
+    two cameras (a folder with a left and a right file, or the left file, the right one beside it), the da Vinci's
+    `.ini` ([StereoLeft], [StereoRight]) and JSON (`intrinsics`, `extrinsics`, or `KL DL KR DR R T`). T is in mm or m:
+    which, its length says, and is refused where both could be. Raises NeecoError naming file, field and remedy.
     """
     path = Path(path)
     if path.is_dir():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,7 +71,7 @@ class _Log:
 
 @dataclass
 class _FolderFiles:
-    """What the files of a folder seem to be, as paths relative to it."""
+    """What the files of a folder seem to be, as paths relative to it. others: what there is, too, in words."""
 
     videos: list[_Log] = field(default_factory=list)
     images: list[str] = field(default_factory=list)
@@ -81,12 +81,21 @@ class _FolderFiles:
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
+    problems: list[tuple[str, str]] = field(default_factory=list)  # of others that cannot be read: the line, and why
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
+    def leave_out(self, what: str, why: str = "") -> None:
+        """List something as not used. why: what is wrong with it, where anything is."""
+        line = " ".join((f"{what}: {why}" if why else what).split())
+        line = "".join(sign if sign.isprintable() else "?" for sign in line)
+        self.others.append(line)
+        self.problems += [(line, " ".join(why.split()))] if why else []
 
-def write_template(source: Path) -> str:
+
+def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
     """The text of a recording.yaml for the files in a folder and its subfolders, or for one file or folder that holds
-    several streams, to stand beside it; `read_recording` accepts it.
+    several streams, to stand beside it; `read_recording` accepts it. report: is told of what cannot be read, which is
+    left out.
 
     Raises NeecoError when there are no images.
     """
@@ -100,7 +109,12 @@ def write_template(source: Path) -> str:
         raise NeecoError(f"{source}: not there; give the recording's folder")
     found = _find_files(source)
     if not found.videos and not found.images:
+        if found.problems:
+            more = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
+            raise NeecoError(f"{source}: holds no images that can be read: {found.problems[0][1]}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
+    for problem, _ in found.problems:
+        report(problem)
     frames = [_frames_line(log) for log in found.videos]
     frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
     if not found.videos:
@@ -171,18 +185,21 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         known.require_package(path)
         streams = known.streams(path)
     except NeecoError as error:
-        found.others.append(" ".join(str(error).replace(str(path), name).split()))
+        found.leave_out(name, _without_place(str(error), path, name))
         return path.is_dir()
     for stream in streams:
         log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
-        used = stream.offered and stream.count > 0
+        used = stream.offered and stream.count > 0 and stream.problem is None
         if used and stream.kind == IMAGE_STREAMS:
             found.videos.append(log)
         elif used and stream.kind in (POSES, READINGS):
-            _classify_stream(found, log, stream, path)
+            try:
+                _classify_stream(found, log, stream, path)
+            except NeecoError as error:
+                found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
-            found.others.append(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
+            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}", stream.problem or "")
             if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
                 found.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
@@ -201,6 +218,11 @@ def _classify_stream(found: _FolderFiles, log: _Log, stream: Stream, path: Path)
     found.joints += [(log, when, column, joint) for joint, column in named]
 
 
+def _without_place(message: str, path: Path, name: str) -> str:
+    """A message without the file and the stream that it begins with."""
+    return message.removeprefix(f"{path}: ").removeprefix(f"{name}: ").replace(str(path), path.name)
+
+
 def _frames_line(log: _Log) -> str:
     return f"video: {_scalar(log.file)}" if log.stream is None else f"video: {{{', '.join(log.lines())}}}"
 
@@ -210,11 +232,15 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     try:
         table = read_table(file)
     except NeecoError as error:
-        found.others.append(" ".join(str(error).replace(str(file), name).split()))
+        found.leave_out(name, _without_place(str(error), file, name))
         return
     if tools := tool_names(table):
         for tool in tools:
-            own = tool_columns(table, PoseColumns(file, tool=tool))
+            try:
+                own = tool_columns(table, PoseColumns(file, tool=tool))
+            except NeecoError as error:
+                found.leave_out(f"{name}: {tool}", _without_place(str(error), file, name))
+                continue
             found.poses.append((_Log(name, tool=tool), recognise_pose(own.header)))
         return
     pose = recognise_pose(table.header)
@@ -228,7 +254,7 @@ def _classify_table(found: _FolderFiles, log: _Log, file: Path) -> None:
     elif len(columns) == 2 and angles and not when.time and len(table.rows) <= MAX_CALIBRATION_ROWS:
         found.calibrations.append((name, table.header))
     elif not (when.time and len(columns) <= 2):
-        found.others.append(f"{name}: columns {', '.join(columns[:10])[:100]}")
+        found.leave_out(f"{name}: columns {', '.join(columns[:10])[:100]}")
 
 
 def _is_sync(file: Path) -> bool:

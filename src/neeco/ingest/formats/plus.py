@@ -60,7 +60,13 @@ class PlusSequence(RecordingFormat):
             fixed = len(texts) > 1 and len(set(texts.values())) == 1
             title = "fixed transform" if fixed else "transform"
             body, kind = _ends(name)[0], OTHER if fixed else POSES
-            found.append(Stream(name, kind, title, len(texts), _rate(times, len(texts)), body=body))
+            statuses = sequence.fields.get(name + TRANSFORM + STATUS, {})
+            problem = None
+            if not any(statuses.get(frame, GOOD).lower() == GOOD for frame in texts):
+                status = f"{name}{TRANSFORM}{STATUS} is {printable(next(iter(statuses.values())), 20)}"
+                problem = f"no frame can be used: {status} in all; record again, or name another transform"
+            rate = _rate(times, len(texts))
+            found.append(Stream(name, kind, title, len(texts), rate, body=body, problem=problem))
         return tuple(found)
 
     def read(self, path: Path, stream: str | None = None) -> Table:
