@@ -81,7 +81,7 @@ class _FolderFiles:
     joints: list[tuple[_Log, RecognisedColumns, str, str | None]] = field(default_factory=list)
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
-    problems: list[tuple[str, str]] = field(default_factory=list)  # of others that cannot be read: the line, and why
+    problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
     def leave_out(self, what: str, why: str = "") -> None:
@@ -89,7 +89,7 @@ class _FolderFiles:
         line = " ".join((f"{what}: {why}" if why else what).split())
         line = "".join(sign if sign.isprintable() else "?" for sign in line)
         self.others.append(line)
-        self.problems += [(line, " ".join(why.split()))] if why else []
+        self.problems += [line] if why else []
 
 
 def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
@@ -111,9 +111,10 @@ def write_template(source: Path, report: Callable[[str], None] = lambda problem:
     if not found.videos and not found.images:
         if found.problems:
             more = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
-            raise NeecoError(f"{source}: holds no images that can be read: {found.problems[0][1]}{more}")
+            first = found.problems[0].removeprefix(f"{source.name}: ")
+            raise NeecoError(f"{source}: holds no images that can be read: {first}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
-    for problem, _ in found.problems:
+    for problem in found.problems:
         report(problem)
     frames = [_frames_line(log) for log in found.videos]
     frames += [f"images: {{folder: {_scalar(folder)}, fps: 25}}" for folder in found.images]
@@ -197,9 +198,11 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
                 _classify_stream(found, log, stream, path)
             except NeecoError as error:
                 found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
+        elif stream.problem is not None:
+            found.leave_out(f"{name}: {stream.name}", _without_place(stream.problem, path, stream.name))
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
-            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}", stream.problem or "")
+            found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
             if (several := _EPISODES.fullmatch(stream.name)) and known.of_episode(stream.name, 0) is not None:
                 found.episodes = f"{several[1]}-{several[2]}"
     return bool(streams)
