@@ -106,7 +106,8 @@ def read_pose_log(source: PoseColumns) -> PoseLog:
             f"{table.where}: frame: nothing says what its poses are stated in; say so in the recording: frame: "
             f"{named.CAMERA}, or frame: {named.BASE} (a robot's base or a tracker)"
         )
-    found = named.recognise_pose(table.header, _named_columns(table, source.time, source.position, source.rotation))
+    given = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    found = named.recognise_pose(table.header, given)
     rows = Rows(table)
     _keep_measured(rows, source, found.state)
     times = _times(rows, source, found)
@@ -126,7 +127,7 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
     value = None if source.value is None else (source.value,)
-    recognised, found = named.recognise_value(table.header, _named_columns(table, source.time, value))
+    recognised, found = named.recognise_value(table.header, _given(table, time=source.time, value=value))
     value = source.value or recognised
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
@@ -147,14 +148,19 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     return ReadingLog(table.path, source.clock, times, values[order], gaps, (*rows.notes(), *clamped, *gap_notes))
 
 
-def _named_columns(table: Table, *columns: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The columns that a recording names, as the file spells them. Raises NeecoError for one that is not there, or is
-    named for two things."""
-    names = [table.header[column_index(table, name)] for group in columns for name in group or ()]
+def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
+    there, or is named for two things."""
+    given = {
+        meaning: tuple(table.header[column_index(table, name)] for name in names)
+        for meaning, names in columns.items()
+        if names is not None
+    }
+    names = [name for group in given.values() for name in group]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
-    return tuple(names)
+    return given
 
 
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:

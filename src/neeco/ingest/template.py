@@ -339,6 +339,8 @@ def _unit_lines(columns: RecognisedColumns, wanted: dict[str, tuple[str, ...] | 
     lines = []
     if columns.counts_frames:
         lines.append("rate_hz: 40   # time counts frames, and this rate is a guess: correct it")
+    elif columns.time is None:
+        lines.append("rate_hz: 40   # nothing says when its rows were taken, and this rate is a guess: correct it")
     elif columns.time and len(columns.time) == 1 and not (columns.time_unit or split_unit(columns.time[0], "time")[1]):
         wanted = {"time": columns.time} | wanted
     implied = {"length": columns.length_unit}
