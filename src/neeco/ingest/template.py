@@ -304,7 +304,8 @@ def _pose_lines(log: _Log, columns: RecognisedColumns) -> list[str]:
     clock = "em" if log.stream is None else log.clock
     lines = [*log.lines(), *([f"clock: {clock}"] if clock else [])]
     lines += [f"# {ask}" for ask in log.asks if not ask.startswith(" ")]
-    if log.stream is not None and log.is_whole and columns.time and of_length and columns.rotation:
+    known_again = log.tool is not None or (log.stream is not None and log.is_whole)
+    if known_again and columns.time and of_length and columns.rotation:
         return [*lines, *_unit_lines(columns, {"length": of_length})]  # recognised again when read
     given = [
         ("time", columns.time),

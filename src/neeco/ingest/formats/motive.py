@@ -43,7 +43,7 @@ class MotiveExport(RecordingFormat):
         if stream is not None:
             raise NeecoError(f"{path}: stream: an export is one table; name a rigid body as `tool` instead")
         lines = read_lines(path)
-        said = dict(zip(lines[0].cells[::2], lines[0].cells[1::2], strict=False))
+        preamble = dict(zip(lines[0].cells[::2], lines[0].cells[1::2], strict=False))
         types = next((n for n, line in enumerate(lines) if BODY_TYPE in map(str.lower, line.cells)), None)
         start = next((n for n, line in enumerate(lines) if line.cells[0].lower() == "frame"), 0)
         if types is None or start < types + 3:
@@ -55,13 +55,13 @@ class MotiveExport(RecordingFormat):
         cells, places = [line.cells for line in rows], np.array([line.number for line in rows])
         raw = Table(path, tuple(map(str, range(len(axes)))), cells, places, lines[0].decimal_comma)
         kinds, names, parts = ([*lines[n].cells, *[""] * len(axes)] for n in (types, types + 1, start - 1))
-        unit = canonical_unit(said.get("Length Units", ""))
+        unit = canonical_unit(preamble.get("Length Units", ""))
         suffix = f"_{unit}" if unit in UNITS["length"] else ""
-        header, columns, bodies = ["t_s"], [_times(raw, axes, said)], []
+        header, columns, bodies = ["t_s"], [_times(raw, axes, preamble)], []
         owned = [i for i in range(len(axes)) if kinds[i].lower() == BODY_TYPE]
         for name, group in groupby(owned, key=lambda i: names[i].strip('"')):
             own = {(parts[i].lower(), axes[i].lower()): i for i in group}
-            turns = _quats(raw, own, said.get("Rotation Type", QUATERNION).lower())
+            turns = _quats(raw, own, preamble.get("Rotation Type", QUATERNION).lower())
             positions = _values(raw, own, "position", "xyz")
             bodies.append(Body(name, tuple(range(len(header), len(header) + 7))))
             header += [*(axis + suffix for axis in "xyz"), *QUATS]
@@ -69,13 +69,13 @@ class MotiveExport(RecordingFormat):
         return Table(path, unique_names(header), np.column_stack(columns), places, bodies=tuple(bodies))
 
 
-def _times(raw: Table, axes: Sequence[str], said: dict[str, str]) -> np.ndarray:
+def _times(raw: Table, axes: Sequence[str], preamble: dict[str, str]) -> np.ndarray:
     """[R] s: as they stand there, else of the frames at the export's rate."""
     column = next((i for i, name in enumerate(axes) if name.lower().startswith("time (sec")), None)
     if column is not None:
         return numbers(raw, [str(column)])[0][:, 0]
     try:
-        rate = float(said.get("Export Frame Rate", said.get("Capture Frame Rate", "")))
+        rate = float(preamble.get("Export Frame Rate", preamble.get("Capture Frame Rate", "")))
     except ValueError:
         rate = 0.0
     if not 0 < rate < 1e6:  # NaN compares false
