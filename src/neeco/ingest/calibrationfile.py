@@ -83,8 +83,9 @@ def read_calibration(path: Path) -> Any:
         return found
     # `%YAML:1.0` is OpenCV's own spelling, which YAML itself does not allow
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
-    ends = [number for number, line in enumerate(lines) if line.rstrip() == "---" and any(lines[:number])]
-    lines = lines[: ends[0]] if ends else lines  # `rostopic echo` ends each message so
+    begun = next((number for number, line in enumerate(lines) if re.match(r"\s*[^\s#-]", line)), 0)
+    if "---" in lines[begun:]:  # as `rostopic echo` ends each message
+        lines = lines[: lines.index("---", begun)]
     try:
         document = parse_yaml(path, "\n".join(lines), "save the calibration again", _Loader)
     except NeecoError:

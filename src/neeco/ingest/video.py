@@ -100,7 +100,7 @@ def _numbered(folder: Path, files: Sequence[Path], notes: list[str]) -> np.ndarr
     numbers = np.array([int(part[2]) for part in parts if part])
     steps = np.diff(numbers)
     step = max(Counter(steps.tolist()).items(), key=lambda item: item[1])[0]
-    if step <= 0 or (steps % step).any() or not _are_few(int((steps != step).sum()), len(steps)):
+    if step <= 0 or steps.min() < step or (steps % step).any() or not _are_few(int((steps != step).sum()), len(steps)):
         return places
     places = (numbers - numbers[0]) // step
     missing = int(places[-1]) + 1 - len(files)

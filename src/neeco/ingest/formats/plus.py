@@ -50,10 +50,12 @@ class PlusSequence(RecordingFormat):
         times = _times(sequence)
         found = []
         if sequence.has_images:
-            count = len(_image_frames(sequence)[0])
+            frames, notes = _image_frames(sequence)
+            problem = None if len(frames) >= MIN_IMAGES else _too_few(sequence, frames, notes)
             color = "grey" if sequence.channels == 1 else "RGB"
             title = f"{color} images of {sequence.size[0]}x{sequence.size[1]}"
-            found.append(Stream(IMAGE_STREAM, IMAGES, title, count, _rate(times, sequence.count)))
+            rate = _rate(times, sequence.count)
+            found.append(Stream(IMAGE_STREAM, IMAGES, title, len(frames), rate, problem=problem))
         for name in _transforms(sequence):
             texts = sequence.fields[name + TRANSFORM]
             # what is the same in every frame is a calibration (ImageToProbe), no motion
@@ -109,9 +111,6 @@ class PlusSequence(RecordingFormat):
         sequence = _sequence_of(path)
         choose_stream(path, self.streams(path), stream, (IMAGES,))
         frames, notes = _image_frames(sequence)
-        if len(frames) < MIN_IMAGES:
-            why = f" ({notes[0].partition(': ')[2]})" if notes else ""
-            raise NeecoError(f"{path}: {len(frames)} of {sequence.count} images can be used{why}; record again")
         times = _times(sequence)
         seconds = np.array([times[frame] for frame in frames])
         return SequenceImages(path, sequence.size, tuple(notes), seconds, sequence, tuple(frames))
@@ -173,6 +172,12 @@ def _image_frames(sequence: FrameSequence) -> tuple[list[int], list[str]]:
     if unstamped:
         notes.append(f"{name}: {unstamped} images have no {TIME} later than the one before; left out")
     return frames, notes
+
+
+def _too_few(sequence: FrameSequence, frames: Sequence[int], notes: Sequence[str]) -> str:
+    """Why the images cannot be used, of which only these frames are good."""
+    why = f" ({notes[0].partition(': ')[2]})" if notes else ""
+    return f"{len(frames)} of {sequence.count} images can be used{why}; record again"
 
 
 def _times(sequence: FrameSequence) -> dict[int, float]:
