@@ -126,8 +126,8 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    value = None if source.value is None else (source.value,)
-    recognised, found = named.recognise_value(table.header, _given(table, time=source.time, value=value))
+    given = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    recognised, found = named.recognise_value(table.header, given)
     value = source.value or recognised
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")

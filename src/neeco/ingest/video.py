@@ -20,6 +20,7 @@ from neeco.ingest.formats import VideoSource, numbers, read_table
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MIN_IMAGES = 2
+MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
 MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
 
 
@@ -244,7 +245,7 @@ class _Scan:
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
             return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads, self.part)
         rate = fps or self.rate
-        if not rate:
+        if not rate or rate > MAX_RATE:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
         if fps is None:
             notes.append(f"{self.path.name}: its frames have no times; taken as {rate:g} a second")
