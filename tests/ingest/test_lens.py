@@ -155,6 +155,7 @@ def test_a_field_of_view_is_a_focal_length(world):
         ("a.yaml", "", "expected camera_matrix"),
         ("a.yaml", "x: [1, 2", "line 1: not valid YAML"),
         ("a.yaml", "<?xml version='1.0'?>", "is XML"),
+        ("a.yaml", "video: a.mp4\nintrinsics: [300, 300, 160, 120]", "camera_matrix: missing"),
         ("a.xml", "<opencv_storage><camera_matrix></opencv_storage>", "is XML that OpenCV cannot read"),
         ("a.yaml", "%YAML:1.0\na: " + "[" * 100_000, "nesting is beyond all measure"),
         ("a.xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000, "is XML that OpenCV cannot read"),

@@ -196,8 +196,8 @@ def _has_camera(keys: Mapping[str, Any]) -> bool:
     if isinstance(matrix, dict | list):
         return True
     listed = first_of(keys, _INTRINSICS)
-    if isinstance(listed, list):
-        return len(listed) == 4
+    if isinstance(listed, list):  # with more than that: `intrinsics` of a recording.yaml count from the image's corner
+        return len(listed) == 4 and first_of(keys, (*_MODELS, *_DISTORTION, *_SIZE_LISTS)) is not None
     named = _plain(listed) if isinstance(listed, dict) else keys
     return any(set(names) <= set(named) for names in _FOCAL)
 

@@ -56,6 +56,7 @@ def tool_columns(table: Table, source: PoseColumns) -> Table:
             f"holds {len(tools)} tools" if wanted is None else f"{len(chosen)} tools go by {printable(source.tool)}"
         )
         raise NeecoError(f"{table.path}: {problem}; say which as `tool` in the recording: {listed}")
+    table = replace(table, stream=chosen[0].name or chosen[0].port or None)  # which messages and notes name
     first = min(tool.columns[0] for tool in tools)
     columns = [*range(first), *chosen[0].columns]
     header = tuple(_NUMBERED.sub("", table.header[index]) for index in columns)

@@ -82,14 +82,16 @@ class _FolderFiles:
     calibrations: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     others: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)  # of others, those that cannot be read
+    image_problems: list[str] = field(default_factory=list)  # of these, those that may be of images
     episodes: str | None = None  # of a data set that holds several, "0-9"
 
-    def leave_out(self, what: str, why: str = "") -> None:
-        """List something as not used. why: what is wrong with it, where anything is."""
+    def leave_out(self, what: str, why: str = "", images: bool = False) -> None:
+        """List something as not used. why: what is wrong with it, where anything is; images: may they be in it?"""
         line = " ".join((f"{what}: {why}" if why else what).split())
         line = "".join(sign if sign.isprintable() else "?" for sign in line)
         self.others.append(line)
         self.problems += [line] if why else []
+        self.image_problems += [line] if why and images else []
 
 
 def write_template(source: Path, report: Callable[[str], None] = lambda problem: None) -> str:
@@ -109,9 +111,9 @@ def write_template(source: Path, report: Callable[[str], None] = lambda problem:
         raise NeecoError(f"{source}: not there; give the recording's folder")
     found = _find_files(source)
     if not found.videos and not found.images:
-        if found.problems:
-            more = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
-            first = found.problems[0].removeprefix(f"{source.name}: ")
+        if found.image_problems:
+            first, *rest = found.image_problems
+            first, more = first.removeprefix(f"{source.name}: "), f" (and {len(rest)} more)" if rest else ""
             raise NeecoError(f"{source}: holds no images that can be read: {first}{more}")
         raise NeecoError(f"{source}: holds no video and no folder of images; put the recording's video there")
     for problem in found.problems:
@@ -186,7 +188,7 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
         known.require_package(path)
         streams = known.streams(path)
     except NeecoError as error:
-        found.leave_out(name, _without_place(str(error), path, name))
+        found.leave_out(name, _without_place(str(error), path, name), images=True)
         return path.is_dir()
     for stream in streams:
         log = _Log(name, stream.name, stream.body, stream.hints, stream.asks, stream.clock, stream.columns is None)
@@ -199,7 +201,8 @@ def _add_streams(found: _FolderFiles, path: Path, name: str) -> bool:
             except NeecoError as error:
                 found.leave_out(f"{name}: {stream.name}", _without_place(str(error), path, stream.name))
         elif stream.problem is not None:
-            found.leave_out(f"{name}: {stream.name}", _without_place(stream.problem, path, stream.name))
+            why, images = _without_place(stream.problem, path, stream.name), stream.kind == IMAGE_STREAMS
+            found.leave_out(f"{name}: {stream.name}", why, images)
         else:
             rate = "" if stream.rate_hz is None else f" at {stream.rate_hz:.3g} a second"
             found.leave_out(f"{name}: {stream.name}: {stream.type}, {stream.count}{rate}")
