@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from neeco.capture.images import open_image
 from neeco.capture.points import read_ply
@@ -20,6 +21,9 @@ from neeco.files import (
     LOCK,
     MOST_VALUES,
     TEMPORARY,
+    FastYamlLoader,
+    YamlDumper,
+    YamlLoader,
     is_vacant,
     own_folder,
     parse_yaml,
@@ -187,6 +191,16 @@ def test_yaml_without_measure_is_refused_in_one_line(text: str, told: str, tmp_p
         parse_yaml(Path("file.yaml"), text, "repair it")
     assert "\n" not in str(error.value)
     assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("loader", [YamlLoader, FastYamlLoader])
+def test_numbers_are_those_of_yaml_1_2(loader: type[yaml.SafeLoader]) -> None:
+    texts = ["-.5", "+.5", ".5", "1e-3", "-2E3", "1.5e3", "5.", "7", "-.inf"]
+    values = parse_yaml(Path("x"), f"[{', '.join(texts)}]", "", loader)
+    assert values == [float(text.replace(".inf", "inf")) for text in texts]
+    words = ["e3", "1e", "1e3x", "-", ".", "1.2.3", "v1.5", "0x02"]
+    assert parse_yaml(Path("x"), f"[{', '.join(words)}]", "", loader) == [*words[:-1], 2]
+    assert parse_yaml(Path("x"), yaml.dump({"1e5": ".5"}, Dumper=YamlDumper), "", loader) == {"1e5": ".5"}
 
 
 def test_aliases_within_measure_are_read() -> None:

@@ -125,9 +125,13 @@ def _init(folder: Path) -> int:
     path = (folder.parent if holds_streams(folder) else folder) / RECORDING
     if path.exists():
         raise NeecoError(f"{path}: already exists; edit it, or move it away first")
-    write_text(path, write_template(folder))
-    if holds_streams(folder) and write_choice_picture(folder, path.with_name(CHOICES)):
-        print(f"wrote {path.with_name(CHOICES)}: what its poses would be under each choice that the file leaves open")
+    write_text(path, write_template(folder, lambda problem: print(f"left out: {problem}")))
+    picture = path.with_name(CHOICES)
+    try:
+        if holds_streams(folder) and write_choice_picture(folder, picture):
+            print(f"wrote {picture}: what its poses would be under each choice that the file leaves open")
+    except NeecoError as error:  # recording.yaml, which names the choices, is written all the same
+        print(f"no picture of the choices that the file leaves open: {error}")
     print(f"wrote {path}: look through it, then: neeco ingest {path} --output CAPTURE")
     return 0
 

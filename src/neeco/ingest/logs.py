@@ -111,7 +111,8 @@ class Rows:
 def read_pose_log(source: PoseColumns) -> PoseLog:
     """Read a tracker's log. Raises NeecoError naming file, row or column, and remedy."""
     table = tool_columns(read_table(source.path, source.stream), source)
-    found = named.recognise_pose(table.header)
+    given = _given(table, time=source.time, position=source.position, rotation=source.rotation)
+    found = named.recognise_pose(table.header, given)
     table = with_named_frame(table, (*(source.position or found.position or ()), *(source.rotation or ())))
     frame = _frame_of(table, source)
     rows = Rows(table)
@@ -196,8 +197,9 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     """Read a joint sensor's log, through its calibration table when there is one. Raises NeecoError naming file,
     row or column, and remedy."""
     table = read_table(source.path, source.stream)
-    value, found = named.recognise_value(table.header)
-    value = source.value or value
+    given = _given(table, time=source.time, value=None if source.value is None else (source.value,))
+    recognised, found = named.recognise_value(table.header, given)
+    value = source.value or recognised
     if value is None:
         raise NeecoError(f"{source.path}: header: which column is the joint's reading? Name it as columns.value")
     rows = Rows(table)
@@ -218,6 +220,21 @@ def read_reading_log(source: JointColumns) -> ReadingLog:
     return ReadingLog(table.path, source.clock, times, values[order], gaps, notes, table.image_hz)
 
 
+def _given(table: Table, **columns: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    """The columns that a recording names, by meaning, as the file spells them. Raises NeecoError for one that is not
+    there, or is named for two things."""
+    given = {
+        meaning: tuple(table.header[column_index(table, name)] for name in names)
+        for meaning, names in columns.items()
+        if names is not None
+    }
+    names = [name for group in given.values() for name in group]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise NeecoError(f"{table.where}: columns: {twice} is named for two things; name a column for each")
+    return given
+
+
 def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[np.ndarray, np.ndarray]:
     """Positions [R, 3] mm and unit quaternions wxyz [R, 4]; rows without either are dropped."""
     table = rows.table
@@ -229,7 +246,8 @@ def _poses(rows: Rows, source: PoseColumns, found: RecognisedColumns) -> tuple[n
         raise _unclear(table, found, "position", "x, y, z columns")
     else:
         read = (*position, *rotation)
-    implied = (found if position == found.position else named.recognise_pose((*position, *rotation))).length_unit
+    known = (found, named.recognise_pose(table.header), named.recognise_pose((*position, *rotation)))
+    implied = next((kind.length_unit for kind in known if kind.position == position), None)
     scale = named.scale_of(table.where, position, "length", source.units.length, implied, "")
     angle = 1.0
     if form in (EULER, ROTATION_VECTOR):
@@ -315,15 +333,25 @@ def _keep_measured(rows: Rows, source: PoseColumns, found: str | None) -> None:
 
 def _times(rows: Rows, source: PoseColumns | JointColumns, found: RecognisedColumns) -> np.ndarray:
     """Times [R] in s; rows without one are dropped."""
-    table, names = rows.table, source.time or found.time
+    table, names, rate = rows.table, source.time or found.time, source.rate_hz
+    if names is None and rate is not None:
+        return np.arange(len(table.rows)) / rate
     if names is None:
-        raise NeecoError(f"{table.where}: header: no column of times found; name it as columns.time (or add t_s)")
+        raise NeecoError(
+            f"{table.where}: header: no column of times found; name it as columns.time (or add t_s), or say rate_hz "
+            "where its rows come at a fixed rate"
+        )
     cells = _cells(rows, names)
     known = named.recognise_time(names)
+    if rate is not None and (len(names) == 2 or known.time_unit or named.split_unit(names[0], "time")[1]):
+        raise NeecoError(
+            f"{table.where}: rate_hz: {', '.join(names)} holds times and counts no frames; leave rate_hz out, or name "
+            "the column that counts as columns.time"
+        )
     if len(names) == 2:
         return cells[:, 0] + cells[:, 1] * 1e-9
-    if source.rate_hz is not None:
-        return cells[:, 0] / source.rate_hz
+    if rate is not None:
+        return cells[:, 0] / rate
     if known.counts_frames:
         raise NeecoError(
             f"{table.where}: {names[0]}: counts frames, and nothing says how many a second; say rate_hz in the "

@@ -19,7 +19,16 @@ from torch import Tensor
 from neeco import __version__
 from neeco.capture import Capture, read_capture
 from neeco.errors import NeecoError
-from neeco.files import parse_yaml, read_text, require_file, require_inside, require_like, require_utf8, write_text
+from neeco.files import (
+    YamlDumper,
+    parse_yaml,
+    read_text,
+    require_file,
+    require_inside,
+    require_like,
+    require_utf8,
+    write_text,
+)
 from neeco.scene.drawable import Learned
 from neeco.scene.io import DAMAGED, load_scene, pack_scene, save_tensors, unpack_scene
 from neeco.scene.training_session import Session, StepResult, members
@@ -93,7 +102,7 @@ def write_config(path: Path, capture: Path, config: TrainConfig, fingerprint: st
     values = {"schema": SCHEMA, "version": __version__, "capture": os.path.abspath(capture)}
     values |= {CAPTURE_DIGEST: fingerprint}
     values |= config_to_dict(config)
-    write_text(path / "config.yaml", yaml.safe_dump(values, sort_keys=False))
+    write_text(path / "config.yaml", yaml.dump(values, Dumper=YamlDumper, sort_keys=False))
 
 
 def require_same_capture(path: Path, root: Path, fingerprint: str) -> None:
