@@ -10,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neeco.errors import NeecoError
+from neeco.ingest.clock_search import GIVEN, ClockOffset, clock_from_instrument, correlate
 from neeco.ingest.logs import PoseLog
-from neeco.ingest.registration import correlate, offset_from_instrument, register_with_laparoscope
+from neeco.ingest.registration import register_with_laparoscope
 
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_euler("xyz", [20, -10, 35], degrees=True).as_matrix()
@@ -78,7 +79,7 @@ def test_a_clock_that_counts_from_1970_is_found_too() -> None:
 
 def test_a_given_offset_is_kept() -> None:
     times, log = recorded(offset=0.05)
-    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, 0.048)
+    found = register_with_laparoscope(in_sfm(scope_path(times)), times, log, ClockOffset(0.048, 0.0, GIVEN))
     assert found.clock.seconds == 0.048
     assert found.clock.source == "given"
 
@@ -86,7 +87,7 @@ def test_a_given_offset_is_kept() -> None:
 def test_a_scope_that_does_not_turn_cannot_be_calibrated() -> None:
     times, log = recorded(offset=0.0, turn=0.02)
     with pytest.raises(NeecoError, match=r"scope\.csv: .*turned"):
-        register_with_laparoscope(in_sfm(scope_path(times, turn=0.02)), times, log, 0.0)
+        register_with_laparoscope(in_sfm(scope_path(times, turn=0.02)), times, log, ClockOffset(0.0, 0.0, GIVEN))
 
 
 def test_a_log_of_another_recording_is_refused() -> None:
@@ -127,7 +128,7 @@ def motion_seen(times: np.ndarray) -> np.ndarray:
 
 def test_the_instruments_clock_is_told_by_how_fast_it_moves_in_the_images() -> None:
     times = np.arange(0.4, 12, 0.04)
-    found = offset_from_instrument(motion_seen(times), times, instrument_log(0.237))
+    found = clock_from_instrument(motion_seen(times), times, instrument_log(0.237))
     assert found.seconds == pytest.approx(0.237, abs=0.015)
     assert 0 < found.sd < 0.1
     assert found.source == "instrument motion"
@@ -137,4 +138,4 @@ def test_motion_of_something_else_tells_no_clock() -> None:
     times = np.arange(0, 11, 0.04)
     other = np.random.default_rng(5).gamma(2.0, 1.0, len(times) - 1)
     with pytest.raises(NeecoError, match=r"tool\.csv: its clock cannot be told"):
-        offset_from_instrument(other, times, instrument_log(0.0))
+        clock_from_instrument(other, times, instrument_log(0.0))

@@ -20,14 +20,15 @@ from neeco.capture import read_capture
 from neeco.capture.images import write_image
 from neeco.capture.model import Frame, State
 from neeco.errors import NeecoError
+from neeco.ingest.assessment import assess_ingest
+from neeco.ingest.clock_search import ClockOffset
 from neeco.ingest.motion import RoughShape
-from neeco.ingest.registration import ClockOffset, Registration
+from neeco.ingest.registration import Registration
 from neeco.ingest.result import IngestResult
 from neeco.raster.types import Camera
+from neeco.report import ingest_page
 from neeco.report.coverage import degrees_of_freedom, extrapolations, unvisited
-from neeco.report.ingest_assessment import assess_ingest
 from neeco.report.ingest_figures import in_view, main_axes, posed_picture, read_tracks, round_length
-from neeco.report.ingest_page import write_ingest_page
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "liver-mini"
 VOID = {"meta", "img", "br", "path", "rect"}
@@ -66,6 +67,12 @@ def made(folder: Path, **changes) -> IngestResult:
         ("with the lens given: ends after 2 of 80 keyframes", "taken: all frames at once"),
     )  # fmt: skip
     return replace(result, **changes)
+
+
+def write_ingest_page(result: IngestResult, path: Path) -> None:
+    """The page with the verdict that goes with it."""
+    capture = read_capture(result.capture)
+    ingest_page.write_ingest_page(result, assess_ingest(result, capture), path, capture)
 
 
 def edited(folder: Path, change) -> Path:

@@ -19,6 +19,7 @@ from neeco.ingest.formats import VideoSource, numbers, read_table
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MIN_IMAGES = 2
+SAME_RATE = 2e-4  # relative difference of frame rates that is none
 
 
 def require_installed(name: str) -> None:
@@ -95,6 +96,11 @@ class _Video(VideoSource):
     numbered: bool
     threads: str
     part: tuple[float, float] | None = None
+    stated_fps: float | None = None
+
+    @property
+    def own_fps(self) -> float | None:
+        return self.stated_fps
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
@@ -202,11 +208,15 @@ class _Scan:
         order = sorted(set(stamps))
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            own = None
             if fps is not None:
+                own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
+            if own is not None:
+                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads, self.part)
+            return _Video(self.path, self.size, tuple(notes), times, tuple(order), False, self.threads, self.part, own)
         rate = fps or self.rate
         if not rate:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
@@ -229,6 +239,11 @@ class _Scan:
         if self.turned:
             notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
         return notes
+
+
+def _another_rate(own: float, fps: float) -> float | None:
+    """A file's own frame rate where it is another than the one stated."""
+    return None if abs(own / fps - 1) < SAME_RATE else own
 
 
 def _rgb(frame: Any) -> np.ndarray:
