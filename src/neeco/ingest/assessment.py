@@ -85,9 +85,10 @@ def assess_ingest(result: IngestResult, capture: Capture, problems: Sequence[Pro
         if not severe:
             return Assessment("careful", "Cameras only: there is no instrument to pose.", tuple(doubts))
     elif not capture.registered:
-        severe.append("The instrument's poses are not in the cameras' frame, so it cannot be drawn where it was.")
-        headline = "Doubtful: cameras and instrument do not meet, instrument poses are in a frame of their own."
-        return Assessment("bad", headline, (*severe, *doubts))
+        severe.append(
+            "Cameras and instrument do not meet: instrument poses are in a frame of their own, so that it cannot be "
+            "drawn where it was."
+        )
     if severe:
         return Assessment("bad", "Doubtful: " + _lower(severe[0]), (*severe, *doubts))
     if doubts:

@@ -19,6 +19,7 @@ from neeco.ingest.logs import PoseLog
 STEP = 0.02  # s, of the coarse search for an offset
 STRIDE = 0.12  # s, over which a turn is measured: long enough to stand out of the tracker's noise
 MIN_CORRELATION = 0.6  # below which two motions are not the same
+SAME_MOTION = 0.95  # from which on no other rate is tried: ends are off by less than a lobe
 MIN_LEAD = 0.08  # by how much the best offset must beat every other, apart from its own lobe
 LOBE = 0.3  # s
 MIN_OVERLAP = 0.6  # of the video that must lie on the log
@@ -26,6 +27,7 @@ LONGEST = 24 * 3600.0  # s that a recording may last: a longer log or video has 
 MAX_RATE = 2.5  # s of a log in one second of the video: 60 frames a second taken for 25
 SEGMENT = 40.0  # s of the video on which all rates are tried; around the best one the rest of it is added
 RATE_MISMATCH = 0.1  # s by which the ends of a segment are off between two rates tried
+RATE_CORRELATION = 0.85  # below which two motions do not tell a rate: of hundreds tried one fits by chance
 RATE_LEAD = 0.04  # by how much the correlation at another rate must beat that at rate 1
 SURE = 1.5  # standard deviations from 1 from which on correcting a rate gains more than it costs (as by AIC)
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
@@ -135,6 +137,8 @@ def _best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, n
     """The rate at which two motions [V] and [L], sampled every STEP s, fit best, with all lags and their correlation at
     it. All rates are tried on the liveliest segment; it grows to the whole video while the rates narrow down."""
     lags, scores = correlate(video, log)
+    if scores.max(initial=-1.0) > SAME_MOTION:
+        return 1.0, lags, scores
     size = min(len(video), round(SEGMENT / STEP))
     variances = [float(np.var(video[start : start + size])) for start in range(0, len(video) - size + 1, size)]
     centre = int(np.argmax(variances)) * size + size // 2
@@ -150,7 +154,7 @@ def _best_rate(video: np.ndarray, log: np.ndarray) -> tuple[float, np.ndarray, n
             break
         size = min(2 * size, len(video))
     other = correlate(_stretched(video, rate), log)
-    if other[1].max(initial=-1.0) < scores.max() + RATE_LEAD:
+    if other[1].max(initial=-1.0) < max(scores.max(initial=-1.0) + RATE_LEAD, RATE_CORRELATION):
         return 1.0, lags, scores
     return rate, *other
 

@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from neeco.errors import NeecoError
-from neeco.ingest.clock_search import ASSUMED, GIVEN, INSTRUMENT_MOTION, ClockOffset, clock_from_instrument
+from neeco.ingest.clock_search import (
+    ASSUMED,
+    GIVEN,
+    INSTRUMENT_MOTION,
+    SCOPE_MOTION,
+    ClockOffset,
+    clock_from_instrument,
+)
 from neeco.ingest.episodes import Episodes
 from neeco.ingest.logs import PoseLog
 from neeco.ingest.motion import ResidualFlow
@@ -155,6 +162,20 @@ def _is_open(part: SynchronizedRecording, log: PoseLog) -> bool:
     if part.scope is not None and part.scope.clock == log.clock:
         return log.clock not in part.clocks
     return log.clock not in part.clocks or part.clocks[log.clock].source == GIVEN
+
+
+def doubt_frame_rates(data: Episodes) -> None:
+    """Doubt frame rates that videos contradict themselves, where no clock found from motion settles it."""
+    for episode, part in enumerate(data.parts):
+        settled = any(clock.source in (SCOPE_MOTION, INSTRUMENT_MOTION) for clock in part.clocks.values())
+        own, sentence = part.video.own_fps, ""
+        if own is not None and not settled and part.poses:
+            fps = 1 / float(np.median(np.diff(part.times)))
+            sentence = (
+                f"fps: the recording says {fps:.4g} frames a second, {part.video.path.name} itself {own:.4g}, and no "
+                "clock found from motion settles it: leave fps out unless you know better"
+            )
+        data.doubt("fps", sentence, severe=False, episode=episode)
 
 
 def open_clocks(data: Episodes) -> bool:

@@ -98,8 +98,9 @@ class Episodes:
     def doubt(self, subject: str, sentence: str, *, severe: bool, episode: int | None = None) -> None:
         """Set the doubt on a subject, of all of it or of one episode, in place of an earlier one; none where the
         sentence is empty."""
-        self._doubts.pop((subject, episode), None)
-        if sentence:
+        if not sentence:
+            self._doubts.pop((subject, episode), None)
+        else:
             named = sentence if self.single or episode is None else f"{self.names[episode]}: {sentence}"
             self._doubts[subject, episode] = Doubt(named, severe)
 

@@ -25,7 +25,7 @@ from neeco.capture.writer import write_capture
 from neeco.errors import NeecoError
 from neeco.ingest.base import BaseRegistration
 from neeco.ingest.chosen_images import ChosenImages
-from neeco.ingest.clocks import find_instrument_clocks, open_clocks, register
+from neeco.ingest.clocks import doubt_frame_rates, find_instrument_clocks, open_clocks, register
 from neeco.ingest.columns import CAMERA
 from neeco.ingest.convert import staged
 from neeco.ingest.episodes import Episodes, separate
@@ -385,6 +385,7 @@ class WorldIngest:
         by instrument and joint, where there are several."""
         data, sfm, registration, tissue = self.data, placed.sfm, placed.registration, placed.tissue
         states, usable = placed.states, placed.usable
+        doubt_frame_rates(data)
         for index in set(range(len(self.selected))) - set(sfm.indices.tolist()):
             self.dropped[int(self.selected[index])] = "no camera: too few of its features match other frames"
         frames, times = self.selected[sfm.indices], self._times(sfm)
