@@ -186,6 +186,14 @@ def test_the_output_is_a_capture_that_says_its_trust(tracked: Tracked) -> None:
     assert "jaw_angle, deg" in page
 
 
+@pytest.mark.parametrize(("written", "begins"), [(10, "good: "), (6, "usable: "), (4, "DOUBTFUL: ")])
+def test_footage_of_which_few_frames_are_trusted_is_doubtful(footage: Capture, written: int, begins: str) -> None:
+    records = [{"how": "lost" if k >= written else "followed", "trust": {"value": 0.9}} for k in range(10)]
+    found = Tracked(Path("out"), footage, records, written, 0.5, None)  # type: ignore[arg-type]
+    assert found.verdict.startswith(begins)
+    assert f"in {10 - written} of 10 frames nothing was found" in found.verdict
+
+
 def test_an_instrument_is_found_where_nothing_is_known(
     tracked_run: RecordedRun, footage: Capture, tmp_path: Path
 ) -> None:
