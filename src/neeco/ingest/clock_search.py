@@ -29,7 +29,7 @@ SEGMENT = 40.0  # s of the video on which all rates are tried; around the best o
 RATE_MISMATCH = 0.1  # s by which the ends of a segment are off between two rates tried
 RATE_CORRELATION = 0.85  # below which two motions do not tell a rate: of hundreds tried one fits by chance
 RATE_LEAD = 0.04  # by how much the correlation at another rate must beat that at rate 1
-SURE = 1.5  # standard deviations from 1 from which on correcting a rate gains more than it costs (as by AIC)
+SURE = 2.0  # standard deviations from 1 at which a rate counts as another
 GIVEN, SCOPE_MOTION, INSTRUMENT_MOTION = "given", "scope motion", "instrument motion"  # sources of clocks
 ASSUMED = "assumed equal to the video's"
 
