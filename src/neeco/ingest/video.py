@@ -24,6 +24,7 @@ MIN_IMAGES = 2
 SQUARE = 0.005  # by which a square pixel's width and height may differ: 1 px of 200
 MAX_RATE = 1000.0  # frames a second, beyond which a file's own number is no rate
 MAX_LEFT_OUT = 0.1  # of a folder's images (or one): more that are missing or of another size are no slip
+SAME_RATE = 2e-4  # relative difference of frame rates that is none
 
 
 def require_installed(name: str) -> None:
@@ -135,6 +136,11 @@ class _Video(VideoSource):
     numbered: bool
     threads: str
     part: tuple[float, float] | None = None
+    stated_fps: float | None = None
+
+    @property
+    def own_fps(self) -> float | None:
+        return self.stated_fps
 
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         wanted = {self.stamps[int(index)]: int(index) for index in indices}
@@ -250,11 +256,15 @@ class _Scan:
         order = sorted(set(stamps))
         if len(stamps) == len(self.stamps) and self.time_base and len(order) > 0.9 * len(stamps):
             times = (np.array(order, dtype=np.float64) - order[0]) * self.time_base
+            own = None
             if fps is not None:
+                own = _another_rate(1 / float(np.median(np.diff(times))), fps)
                 times = np.arange(len(order)) / fps
+            if own is not None:
+                notes.append(f"{self.path.name}: says itself {own:.4g} frames a second, the recording {fps:g}")
             if len(order) < len(stamps):
                 notes.append(f"{self.path.name}: {len(stamps) - len(order)} frames share a time with another; left out")
-            return self._video(notes, times, tuple(order), False)
+            return self._video(notes, times, tuple(order), False, own)
         rate = fps or self.rate
         if not rate or rate > MAX_RATE:
             raise NeecoError(f"{self.path}: its frames have no times; give fps in the recording")
@@ -264,10 +274,17 @@ class _Scan:
         times = np.arange(count) / rate
         return self._video(notes, times, tuple(range(count)), True)
 
-    def _video(self, notes: list[str], times: np.ndarray, stamps: tuple[int, ...], numbered: bool) -> _Video:
+    def _video(
+        self,
+        notes: list[str],
+        times: np.ndarray,
+        stamps: tuple[int, ...],
+        numbered: bool,
+        stated_fps: float | None = None,
+    ) -> _Video:
         assert self.size is not None
         return _Video(
-            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part,
+            self.path, self.size, tuple(notes), times, stamps, numbered, self.threads, self.part, stated_fps,
             pixel_aspect=self.pixel_aspect,
         )  # fmt: skip
 
@@ -291,6 +308,11 @@ class _Scan:
         if self.turned:
             notes.append(f"{self.path.name}: says to be turned by {self.turned} degrees; its frames are used as stored")
         return notes
+
+
+def _another_rate(own: float, fps: float) -> float | None:
+    """A file's own frame rate where it is another than the one stated."""
+    return None if abs(own / fps - 1) < SAME_RATE else own
 
 
 def _rgb(frame: Any) -> np.ndarray:

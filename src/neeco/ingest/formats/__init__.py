@@ -125,6 +125,11 @@ class VideoSource:
     times: np.ndarray
     pixel_aspect: float = field(default=1.0, kw_only=True)
 
+    @property
+    def own_fps(self) -> float | None:
+        """Frames a second that the file itself says where others were asked for; None where it says none, or these."""
+        return None
+
     def read(self, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """(index, uint8 [H, W, 3] RGB) of the frames asked for, in increasing order. Raises NeecoError."""
         raise NotImplementedError
