@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
+from neeco.capture.check_images import check_images
 from neeco.capture.check_motion import check_motion
 from neeco.capture.documents import Node, Parsed, Problem, ProblemReport, errors_only, key_name, printable
 from neeco.capture.kinematics import KinematicTree
@@ -95,7 +96,8 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
             check_geometry(part)
         if motion and not errors_only(report.problems):
             for part in parsed.by_tissue():
-                check_motion(part)
+                if check_images(part):  # else nothing is told by them
+                    check_motion(part)
     return Checked(report.problems, _summary(parsed), capture)
 
 
