@@ -13,7 +13,7 @@ from neeco.capture.model import swap_camera_axes
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes from OpenGL's, or back
 ECM = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV's camera axes from those of the dVRK's ECM (x left, y up), or back
-UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}  # mm
+UNITS = {"centimetres": 10.0, "inches": 25.4, "metres": 1000.0}  # mm
 SCALES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0)
 
 
@@ -59,12 +59,12 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
     )
     camera_from_instrument = np.linalg.inv(world_from_camera) @ poses
     yield Mistake(
-        f"poses {{of}} are half a turn about the camera's view off: {ecm}?",
+        f"poses {{of}} are turned by 180 degrees about the camera's view: they have {ecm}",
         "turn them by diag(-1, -1, 1) in the camera's frame",
         world_from_camera @ ECM @ camera_from_instrument,
     )
     yield Mistake(
-        "poses {of} have y and z flipped in the camera's frame: OpenGL axes?",
+        "poses {of} have y and z flipped in the camera's frame (OpenGL axes)",
         "turn them by diag(1, -1, -1) in the camera's frame",
         world_from_camera @ OPENGL @ camera_from_instrument,
     )
@@ -81,8 +81,8 @@ def placement_mistakes(poses: np.ndarray, world_from_camera: np.ndarray) -> Iter
     yield from unit_mistakes(poses)
     for scale in SCALES:
         yield Mistake(
-            f"positions {{of}} fit the images better multiplied by about {scale:g}",
-            "give them in mm and in the cameras' world, whose scale must be known",
+            f"positions {{of}} are about {1 / scale:.2g} times as large as in the cameras' world",
+            "give both in mm: structure from motion alone does not tell the scale",
             with_positions(poses, scale),
         )
 
