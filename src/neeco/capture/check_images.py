@@ -9,7 +9,7 @@ correlate less, the known causes are applied; one is named only if the correlati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -194,10 +194,7 @@ def check_images(parsed: Parsed) -> bool:
     Says nothing without measured points that have colours. Returns False where images and cameras contradict each
     other, so that nothing else can be told from the images. `parsed` must be free of errors.
     """
-    points = parsed.points
-    if points is None or not points.measured or len(points.positions) < MIN_POINTS:
-        return True
-    if (points.colors * 255 @ LUMA).std() < MIN_BRIGHTNESS_SD or len(parsed.frames) < MIN_IMAGES:
+    if not _has_colors(parsed):
         return True
     colors, frames = _Colors(parsed), parsed.header("frames")
     given = colors.agreement()
@@ -223,6 +220,22 @@ def check_images(parsed: Parsed) -> bool:
             "write both as RGB (OpenCV reads and writes BGR)",
         )
     return True
+
+
+def agreements(parsed: Parsed, poses: Sequence[np.ndarray]) -> list[float] | None:
+    """Mean correlation of the points' colours with the images', with each of other camera poses [N, 4, 4] of all
+    frames; None where colours tell nothing."""
+    colors = _Colors(parsed) if _has_colors(parsed) else None
+    return None if colors is None else [_quick(colors, _Cause(poses=one)) for one in poses]
+
+
+def _has_colors(parsed: Parsed) -> bool:
+    points = parsed.points
+    if points is None or not points.measured or len(points.positions) < MIN_POINTS:
+        return False
+    if len(parsed.frames) < MIN_IMAGES:
+        return False
+    return bool((points.colors * 255 @ LUMA).std() > MIN_BRIGHTNESS_SD)
 
 
 def _causes(parsed: Parsed, colors: _Colors) -> Iterator[_Cause]:

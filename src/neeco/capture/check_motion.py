@@ -30,8 +30,12 @@ TURNED, SHIFTED, ELSEWHERE = (1.1, 3.0, 0.1), (1.15, 5.0, 0.1), (1.5, 5.0, 0.15)
 TURNING = 25.0  # deg, root mean square: who turns less is explained by transposed rotations nearly as well, or better
 CONTRADICTED = 0.15  # mean evidence below which poses explain too little
 BY_CHANCE = 3.0  # factor by which poses without a mistake explain more than the same in another order
-CONTRADICTED_BY_CHANCE = 4.0  # the same, of the poses given, below which they explain too little
+# The same, of the poses given, below which they explain too little: where that is less than evident, where it is more,
+# and in few frames, where chance explains much.
+CONTRADICTED_BY_CHANCE, HARDLY_EVIDENT_BY_CHANCE, FEW_FRAMES_BY_CHANCE = 4.0, 2.5, 1.5
+EVIDENT = 0.1
 SHUFFLES = 6
+MIN_FRAMES_ELSEWHERE = 36  # of many alternatives one explains the motion in fewer frames
 AS_LIKELY = 0.9  # share of the most evidence from which another mistake is as likely
 NEAR_SHIFTS = 5  # steps to either side of the likeliest shift, which are compared on the same frames
 TRAVEL = 0.055  # of the image's width: who moves less is explained by the poses of any frame
@@ -59,6 +63,7 @@ class MotionFault:
     field: str
     message: str
     remedy: str
+    named: bool = False  # by a mistake that explains it
 
 
 def check_motion(parsed: Parsed) -> None:
@@ -83,14 +88,14 @@ def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFa
     poses = _of_root(instrument, np.stack([state.pose.numpy() for state in states]), states)
     found = _likeliest_mistake(parsed, instrument, states, poses, rays)
     if found is not None:
-        return MotionFault(
-            "frames[*].instruments[*]" + (".pose" if found.steps == 0 else ""), found.message, found.remedy
-        )
+        field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
+        return MotionFault(field, found.message, found.remedy, named=True)
     given = rays.mean(poses[rows])
     if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
         return None
     by_chance = _by_chance(rays, poses[rows])
-    if given > CONTRADICTED_BY_CHANCE * by_chance:
+    least = CONTRADICTED_BY_CHANCE if given < EVIDENT else HARDLY_EVIDENT_BY_CHANCE
+    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < MIN_FRAMES_ELSEWHERE else least) * by_chance:
         return None
     message = (
         f"the images contradict the poses of {name}: what moves in them does not lie where the poses say (evidence "
@@ -113,6 +118,8 @@ def _likeliest_mistake(
     clear = []
     for one in tried:
         found = rays.compare(given, one.poses, one.inside)
+        if one.needed == ELSEWHERE and len(rows) < MIN_FRAMES_ELSEWHERE:
+            continue
         enough = all(value > least for value, least in zip(found, one.needed, strict=True))
         if enough and found[2] > BY_CHANCE * _by_chance(few, one.poses, one.inside):
             clear.append((found[2], one))
