@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from neeco.capture.check_geometry import check_geometry
+from neeco.capture.check_images import check_images
 from neeco.capture.check_masks import Hidden, masks_fault, measure_hidden, sample_points
 from neeco.capture.check_motion import check_motion
 from neeco.capture.documents import (
@@ -106,7 +107,8 @@ def inspect_capture(path: Path | str, transforms: str = "transforms.json", *, mo
             check_geometry(part)
         if motion and not errors_only(report.problems):
             for part in parsed.by_tissue():
-                check_motion(part)
+                if check_images(part):  # else nothing is told by them
+                    check_motion(part)
     return Checked(condensed(report.problems), _summary(parsed), capture)
 
 
