@@ -103,11 +103,20 @@ def cameras(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Document], 
 
 
 def intrinsics(**factors: float) -> Callable[[Document], None]:
-    return lambda document: document.update({key: document[key] * factor for key, factor in factors.items()})
+    def edit(document: Document) -> None:
+        for holder in (document, *document["frames"]):
+            holder.update({key: holder[key] * factor for key, factor in factors.items() if key in holder})
+
+    return edit
 
 
 def swapped(one: str, other: str) -> Callable[[Document], None]:
-    return lambda document: document.update({one: document[other], other: document[one]})
+    def edit(document: Document) -> None:
+        for holder in (document, *document["frames"]):
+            if one in holder:
+                holder[one], holder[other] = holder[other], holder[one]
+
+    return edit
 
 
 IN_CAMERA = "in the camera's frame"
@@ -136,7 +145,7 @@ STATES: dict[str, tuple[Callable[[Document], None], str]] = {  # name: the edit,
 CAMERAS: dict[str, tuple[Callable[[Document], None], str]] = {
     "images +1": (shifted(1, "file_path"), "1 frame later"),
     "images +10": (shifted(10, "file_path"), "10 frames later"),
-    "images +30": (shifted(30, "file_path"), "frames later"),
+    "images +30": (shifted(30, "file_path"), "fit"),
     "images shuffled": (shuffled("file_path"), "another order"),
     "intrinsics of larger images": (intrinsics(fl_x=4 / 3, fl_y=4 / 3, cx=4 / 3, cy=4 / 3), "1.33 times"),
     "focal length 0.8": (intrinsics(fl_x=0.8, fl_y=0.8), "focal length"),

@@ -240,7 +240,7 @@ class _Shifts:
         poses, inside = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
         message = f"states {_of(self.instrument)} fit the images better on a clock that runs {rate:.3g} times as fast"
         remedy = "correct their times, or the images' (24, 25 or 30 frames a second?)"
-        return _Alternative(message, remedy, poses, inside, ELSEWHERE, "rate")
+        return _Alternative(message, remedy, poses, inside, SHIFTED, "rate")
 
     def _alternative(self, steps: int, amount: str, poses: np.ndarray, inside: np.ndarray) -> _Alternative:
         direction = "earlier" if steps > 0 else "later"  # than the images they are listed with
