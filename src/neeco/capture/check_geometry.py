@@ -224,11 +224,14 @@ def _check_placement(
     name, all_poses = printable(instrument.name), parsed.header(POSES)
     seen = cameras.sees(poses[:, None, :3, 3])[:, 0]  # [I]
     outside = "every image" if not seen.any() else f"{len(seen) - int(seen.sum())} of {len(seen)} images"
-    mistake = None if seen.mean() >= SEEN_RARELY else _instrument_mistake(cameras, poses, float(seen.mean()))
-    if mistake is not None and (rays := _rays(parsed, instrument)) is not None:  # the images decide
-        fault = motion_fault(parsed, instrument, rays)
-        placed = fault is not None and fault.named and fault.field == POSES
-        mistake = (fault.message, fault.remedy) if fault is not None and placed else None
+    mistake = None
+    if seen.mean() < SEEN_RARELY:
+        rays = _rays(parsed, instrument)
+        fault = None if rays is None else motion_fault(parsed, instrument, rays)  # the images decide where they can
+        if rays is None:
+            mistake = _instrument_mistake(cameras, poses, float(seen.mean()))
+        elif fault is not None and fault.named and fault.field == POSES:
+            mistake = fault.message, fault.remedy
     if mistake is not None:
         all_poses.error(f"instrument {name} is outside {outside}: {mistake[0]}", mistake[1])
         return

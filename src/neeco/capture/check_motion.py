@@ -26,7 +26,8 @@ BEST = 3  # of each kind are compared with all rays
 # An alternative is named when it explains more than the poses given do by a factor, with a certainty in standard errors
 # over the blocks, and has this mean evidence. A shift changes much at once; transposed rotations only as much as the
 # instrument turns; where all else is wrong, nearly nothing is explained. Of many one may fit by chance.
-TURNED, SHIFTED, ELSEWHERE = (1.1, 3.0, 0.1), (1.15, 5.0, 0.1), (1.5, 5.0, 0.15)
+TURNED, SHIFTED, ELSEWHERE = (1.1, 3.0, 0.15), (1.15, 5.0, 0.2), (1.5, 5.0, 0.2)
+CHANGED_TURNED = 1.25  # the factor for rotations, where they change the evidence most
 TURNING = 25.0  # deg, root mean square: who turns less is explained by transposed rotations nearly as well, or better
 CONTRADICTED = 0.15  # mean evidence below which poses explain too little
 BY_CHANCE = 3.0  # factor by which poses without a mistake explain more than the same in another order
@@ -90,6 +91,11 @@ def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFa
     if found is not None:
         field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
         return MotionFault(field, found.message, found.remedy, named=True)
+    if _turns_better(instrument, states, poses[rows], rays):
+        message = f"rotations of {name} do not turn as the instrument does in the images"
+        return MotionFault(
+            POSES, message, "are they transposed, or are quaternions in another order (w x y z, x y z w)?"
+        )
     given = rays.mean(poses[rows])
     if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
         return None
@@ -169,6 +175,16 @@ def _turned(
         yield _Alternative(message, mistake.remedy, turned, np.ones(len(rows), dtype=bool), TURNED, "rotations")
 
 
+def _turns_better(instrument: Instrument, states: list[InstrumentState], poses: np.ndarray, rays: Rays) -> bool:
+    """Whether other rotations explain more where they explain most otherwise, without telling which."""
+    given = rays.evidence(poses)
+    for other in _turned(instrument, states, poses, rays.views.rows):
+        factor, certainty, _ = rays.compare(given, other.poses, other.inside, most_changed=True)
+        if factor > CHANGED_TURNED and certainty > TURNED[1]:
+            return True
+    return False
+
+
 def _placed(instrument: Instrument, parsed: Parsed, poses: np.ndarray, rows: np.ndarray) -> Iterator[_Alternative]:
     """Poses of other frames, axes and units."""
     cameras = np.stack([parsed.frames[row].camera.world_from_camera.double().numpy() for row in rows])
@@ -224,7 +240,7 @@ class _Shifts:
         poses, inside = self.timeline.by_time(self.poses, self.rows, rate=rate, nearest=True)
         message = f"states {_of(self.instrument)} fit the images better on a clock that runs {rate:.3g} times as fast"
         remedy = "correct their times, or the images' (24, 25 or 30 frames a second?)"
-        return _Alternative(message, remedy, poses, inside, ELSEWHERE, "rate")
+        return _Alternative(message, remedy, poses, inside, SHIFTED, "rate")
 
     def _alternative(self, steps: int, amount: str, poses: np.ndarray, inside: np.ndarray) -> _Alternative:
         direction = "earlier" if steps > 0 else "later"  # than the images they are listed with

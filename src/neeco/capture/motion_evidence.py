@@ -29,6 +29,7 @@ RAYS = 504  # moving pixels that are asked
 QUICK_RAYS, QUICK_DEPTHS = 4, 2  # every so many of the rays and their depths, for a first comparison
 DEPTHS = np.linspace(0.35, 1.0, 12)  # of the tissue's, at which they are
 TELLING = 0.4  # share of the rays that are compared: those which some poses explain best
+EXPLAINED = 0.1  # evidence of a ray that some poses explain
 BLOCKS = 12  # of frames that follow each other, whose answers count as independent
 BEHIND = 1e-3  # mm; what is less deep is not in front of a camera
 
@@ -262,9 +263,12 @@ class Rays:
         u, v = project(local, fx, fy, cx, cy, nearest=1.0)
         return float(np.median(np.hypot(u.std(1), v.std(1)))) / views.width
 
-    def compare(self, given: np.ndarray, poses: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:
+    def compare(
+        self, given: np.ndarray, poses: np.ndarray, inside: np.ndarray, *, most_changed: bool = False
+    ) -> tuple[float, float, float]:
         """Factor by which poses [F, 4, 4], which there are for some frames [F], explain more than those whose
-        `evidence` is given; its certainty in standard errors over blocks; their mean evidence."""
+        `evidence` is given; its certainty in standard errors over blocks; their mean evidence. Over the rays that
+        some poses explain best; or, of those explained at all, the half that they explain most differently."""
         counts = inside[self.frames]
         if len(np.unique(self.frames[counts])) < FEWEST_FRAMES:
             return 0.0, 0.0, 0.0
@@ -272,6 +276,9 @@ class Rays:
         own = self.explained(given, inside)[counts]
         best = np.maximum(other, own)
         telling = best >= np.quantile(best, 1 - TELLING)
+        if most_changed and (best > EXPLAINED).any():
+            change = np.abs(other - own)
+            telling = (best > EXPLAINED) & (change >= np.median(change[best > EXPLAINED]))
         other, own, frames = other[telling], own[telling], self.frames[counts][telling]
         gains = np.array([(other - own)[frames == frame].mean() for frame in np.unique(frames)])
         blocks = np.array([block.mean() for block in np.array_split(gains, min(BLOCKS, len(gains)))])
