@@ -89,12 +89,12 @@ def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFa
     if found is not None:
         field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
         return MotionFault(field, found.message, found.remedy, named=True)
-    if _turns_better(instrument, states, poses[rows], rays):
+    given = rays.mean(poses[rows])
+    if given > CONTRADICTED and _turns_better(instrument, states, poses[rows], rays):
         message = f"rotations of {name} do not turn as the instrument does in the images"
         return MotionFault(
             POSES, message, "are they transposed, or are quaternions in another order (w x y z, x y z w)?"
         )
-    given = rays.mean(poses[rows])
     if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
         return None
     by_chance = _by_chance(rays, poses[rows])
