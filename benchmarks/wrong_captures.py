@@ -169,7 +169,8 @@ PIXELS: dict[str, tuple[Callable[[Image.Image], Image.Image], str]] = {
 def variants(capture: Path, folder: Path, only: list[str]) -> Iterator[tuple[str, str]]:
     """Write the variants of a capture under `folder`, one after another; name and words of each."""
     document = json.loads((capture / "transforms.json").read_text())
-    for name, (edit, words) in {**STATES, **CAMERAS, **PIXELS}.items():
+    edits: dict[str, tuple[Any, str]] = {**STATES, **CAMERAS, **PIXELS}
+    for name, (edit, words) in edits.items():
         if only and name not in only:
             continue
         wrong, target = copy.deepcopy(document), folder / name

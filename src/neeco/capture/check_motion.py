@@ -31,10 +31,8 @@ CHANGED_TURNED = 1.25  # the factor for rotations, where they change the evidenc
 TURNING = 25.0  # deg, root mean square: who turns less is explained by transposed rotations nearly as well, or better
 CONTRADICTED = 0.15  # mean evidence below which poses explain too little
 BY_CHANCE = 3.0  # factor by which poses without a mistake explain more than the same in another order
-# The same, of the poses given, below which they explain too little: where that is less than evident, where it is more,
-# and in few frames, where chance explains much.
-CONTRADICTED_BY_CHANCE, HARDLY_EVIDENT_BY_CHANCE, FEW_FRAMES_BY_CHANCE = 4.0, 2.5, 1.5
-EVIDENT = 0.1
+# the same, of the poses given, below which they explain too little; in few frames chance explains much
+CONTRADICTED_BY_CHANCE, FEW_FRAMES_BY_CHANCE = 4.0, 1.5
 SHUFFLES = 6
 MIN_FRAMES_ELSEWHERE = 36  # of many alternatives one explains the motion in fewer frames
 AS_LIKELY = 0.9  # share of the most evidence from which another mistake is as likely
@@ -91,17 +89,16 @@ def motion_fault(parsed: Parsed, instrument: Instrument, rays: Rays) -> MotionFa
     if found is not None:
         field = POSES if found.kind in ("poses", "positions", "rotations") else STATES
         return MotionFault(field, found.message, found.remedy, named=True)
-    if _turns_better(instrument, states, poses[rows], rays):
+    given = rays.mean(poses[rows])
+    if given > CONTRADICTED and _turns_better(instrument, states, poses[rows], rays):
         message = f"rotations of {name} do not turn as the instrument does in the images"
         return MotionFault(
             POSES, message, "are they transposed, or are quaternions in another order (w x y z, x y z w)?"
         )
-    given = rays.mean(poses[rows])
     if given > CONTRADICTED or rays.travel(poses[rows]) < TRAVEL:
         return None
     by_chance = _by_chance(rays, poses[rows])
-    least = CONTRADICTED_BY_CHANCE if given < EVIDENT else HARDLY_EVIDENT_BY_CHANCE
-    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < MIN_FRAMES_ELSEWHERE else least) * by_chance:
+    if given > (FEW_FRAMES_BY_CHANCE if len(rows) < MIN_FRAMES_ELSEWHERE else CONTRADICTED_BY_CHANCE) * by_chance:
         return None
     message = (
         f"the images contradict the poses of {name}: what moves in them does not lie where the poses say (evidence "
@@ -121,21 +118,22 @@ def _likeliest_mistake(
     tried += _likeliest(_placed(instrument, parsed, poses, rows), few)
     shifts = _Shifts(instrument, poses, Timeline(np.array([frame.state.time for frame in parsed.frames])), rows)
     tried += shifts.likeliest(few)
-    clear = []
+    clear, other = [], []
     for one in tried:
-        found = rays.compare(given, one.poses, one.inside)
         if one.needed == ELSEWHERE and len(rows) < MIN_FRAMES_ELSEWHERE:
             continue
+        found = rays.compare(given, one.poses, one.inside)
+        if found[0] > ELSEWHERE[0]:
+            other.append((found[2], one))
         enough = all(value > least for value, least in zip(found, one.needed, strict=True))
         if enough and found[2] > BY_CHANCE * _by_chance(few, one.poses, one.inside):
             clear.append((found[2], one))
     if not clear:
         return None
     most, best = max(clear, key=lambda found: found[0])
-    if best.needed == ELSEWHERE and any(
-        evidence > AS_LIKELY * most and not _same(one, best) for evidence, one in clear
-    ):
-        return None
+    rivals = [one for evidence, one in other if evidence > AS_LIKELY * most and not _same(one, best)]
+    if rivals and any(one is best for _, one in other):
+        return None  # nothing tells which of them it is
     best = shifts.refined(best, rays) if best.steps else best
     # at the end of what was tried there is no telling whether another shift is the right one
     return None if abs(best.steps) >= shifts.longest > 0 else best
@@ -143,7 +141,8 @@ def _likeliest_mistake(
 
 def _same(one: _Alternative, other: _Alternative) -> bool:
     """Whether two alternatives are one mistake, at most of another amount."""
-    return one.kind == other.kind and (one.kind != "poses" or np.allclose(one.poses, other.poses, atol=0.1))
+    near = abs(one.steps - other.steps) <= 2 * NEAR_SHIFTS
+    return one.kind == other.kind and near and (one.kind != "poses" or np.allclose(one.poses, other.poses, atol=0.1))
 
 
 def _by_chance(rays: Rays, poses: np.ndarray, inside: np.ndarray | None = None) -> float:

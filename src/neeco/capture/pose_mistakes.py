@@ -123,11 +123,11 @@ def turned_axes() -> Iterator[tuple[str, str, np.ndarray]]:
             continue
         new = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         flipped = [name for name, sign in zip("xyz", signs, strict=True) if sign < 0]
-        kept = [axis for axis in range(3) if order[axis] == axis]
-        if len(kept) == 3:
+        unmoved = [axis for axis in range(3) if order[axis] == axis]
+        if len(unmoved) == 3:
             what = f"{flipped[0]} mirrored" if len(flipped) == 1 else f"{' and '.join(flipped)} flipped"
-        elif len(kept) == 1 and not flipped:
-            what = " and ".join("xyz"[axis] for axis in range(3) if axis not in kept) + " swapped"
+        elif len(unmoved) == 1 and not flipped:
+            what = " and ".join("xyz"[axis] for axis in range(3) if axis not in unmoved) + " swapped"
         else:
             what = "permuted"
         yield what, f"replace (x, y, z) by ({new}), in positions and rotations", turn
